@@ -122,6 +122,10 @@ class Camera:
         """Return the group of cameras that share a parameter, given by its index; "" if it is their own."""
         return self.shared[parameter] if self.shared else ""
 
+    def owner_of(self, parameter: int) -> str:
+        """Return whose a parameter is, given by its index: of the cameras that share it, or of this one."""
+        return self.group_of(parameter) or self.name
+
     def with_parameters(self, parameters: FloatArray) -> Camera:
         """Return the same camera with other parameter values, shape (n,)."""
         return replace(self, parameters=np.array(parameters, dtype=float))
@@ -205,7 +209,7 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
         Names of the families, and the family of each camera, shape (a,).
     """
     used = np.bincount(camera, minlength=len(cameras)).tolist()
-    owners = [sorted({one.group_of(s) or one.name for s in range(len(one.names))}) for one in cameras]
+    owners = [sorted({one.owner_of(s) for s in range(len(one.names))}) for one in cameras]
     photographs: Counter[str] = Counter()
     for own, count in zip(owners, used, strict=True):
         photographs.update(dict.fromkeys(own, count))

@@ -318,6 +318,11 @@ class Estimate:
         )
 
 
+def without_given(network: Network) -> Network:
+    """Return the network of the image points alone, with what is known of its cameras."""
+    return replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations())
+
+
 def rows_of(index: IntArray, count: int) -> list[IntArray]:
     """Return the rows of each index value from 0 to count - 1, in order."""
     order = np.argsort(index, kind="stable")

@@ -11,7 +11,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
@@ -26,7 +26,6 @@ from sfm.survey.diagnosis.contradicting_codes import (
     remarks_on_contested,
 )
 from sfm.survey.diagnosis.own_camera import treat_lost
-from sfm.survey.hypotheses.given import without_given
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
+from sfm.remarks.remark import of_kind, remark
 from sfm.remarks.verdict import Verdict
 from sfm.report.findings import camera_remarks
 from sfm.report.findings.findings import findings_of
@@ -78,4 +78,5 @@ def test_a_lens_may_be_decentred_by_a_fiftieth_of_the_diagonal() -> None:
     for off, right in ((0.017, (1500, 2000)), (0.023, None)):
         at = np.array([750 + off * 2500, 1000])
         assert camera_remarks._format_around(at, 2000, 1500) == right
-    assert camera_remarks.FAR_FROM_CENTRE == 0.1
+    for away, severity in ((0.0999, "note"), (0.1001, "warning")):  # of the centre, where others are tried
+        assert remark("principal_point_far", camera="c", share=away).severity == severity

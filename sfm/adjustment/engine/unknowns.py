@@ -245,7 +245,7 @@ def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]
         estimate.cameras, layout.interior_free, layout.interior_column, strict=True
     ):
         for s, column in zip(free, columns, strict=True):
-            owner = camera.group_of(s) or camera.name
+            owner = camera.owner_of(s)
             names[column - layout.exterior_free.size] = (camera.names[s], f"camera {owner}")
     return names
 

@@ -160,7 +160,7 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
             some = camera.free & np.isin(np.arange(len(camera.free)), weighted)
         # the denominator of a fraction says the same as its numerator
         for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
-            owner = owners.setdefault(camera.group_of(s) or camera.name, {})
+            owner = owners.setdefault(camera.owner_of(s), {})
             owner.setdefault(camera.names[s], []).append((index, s))
     return [[tuple(one) for one in owner.values()] for owner in owners.values()]
 

@@ -161,7 +161,7 @@ def shared_columns(
     units: dict[tuple[str, str], float] = {}
     for index, s in parameters:
         camera = a.estimate.cameras[index]
-        key = (camera.group_of(s) or camera.name, camera.names[s])
+        key = (camera.owner_of(s), camera.names[s])
         unit = interior_step(a, index, s)
         found = interior_columns(a, index, [s])[:, :, 0] * (units.setdefault(key, unit) / unit)
         groups[key] = groups[key] + found if key in groups else found

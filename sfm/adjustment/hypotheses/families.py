@@ -270,7 +270,7 @@ class InteriorFamily(Family):
         measure = "" if camera.units[s] == "1" else camera.units[s]
         value = float(camera.parameters[s])
         names = tuple(dict.fromkeys(a.estimate.cameras[i].names[p] for i, p in one.parameters))
-        parts: Parts = {"camera": camera.group_of(s) or camera.name, "parameters": names}
+        parts: Parts = {"camera": camera.owner_of(s), "parameters": names}
         if len(names) == 1:
             found = value + float(beta[0]) * interior_step(a, index, s)
             given = a.network.interior

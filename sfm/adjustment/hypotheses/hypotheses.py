@@ -9,7 +9,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,14 +32,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import (
-    Estimate,
-    ExteriorObservations,
-    Network,
-    ObjectPoints,
-    ScaleBars,
-    rows_of,
-)
+from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
@@ -141,8 +134,12 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
             gained = log_likelihood_gain(one.gain.value, reduced.redundancy)
             if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
                 once.setdefault(one.family.cause(one), one)
-    likely = [one for k, (cause, one) in enumerate(once.items()) if _place(cause, once, k) < MAX_TRIED]
-    tried = [(one, refit(plain, one, current, before)) for one in likely]
+    of_kind: Counter[object] = Counter()
+    tried = []
+    for cause, one in once.items():
+        of_kind[cause[0]] += 1
+        if of_kind[cause[0]] <= MAX_TRIED:
+            tried.append((one, refit(plain, one, current, before)))
     holding = [(found.gain - one.price, one, found) for one, found in tried if found is not None]
     most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
     if best is None or adjusted is None or not most > np.log(1 / ALPHA):
@@ -155,11 +152,6 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
         and (most - level[id(one)] < APART if id(one) in level else abs(best.evidence - one.evidence) < APART)
     )
     return Cause(best, adjusted, near)
-
-
-def _place(cause: tuple[object, ...], once: Iterable[tuple[object, ...]], k: int) -> int:
-    """Return the place of the k-th cause among those of its kind."""
-    return sum(other[0] == cause[0] for other in list(once)[:k])
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
@@ -204,7 +196,7 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     for one in found:
         index, s = one.parameters[0]
         camera = plain.estimate.cameras[index]
-        names.append((camera.group_of(s) or camera.name, camera.names[s]))
+        names.append((camera.owner_of(s), camera.names[s]))
     return tuple(names)
 
 
@@ -218,7 +210,7 @@ def free_network(final: Adjustment) -> Adjustment | None:
     if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
         return final
     part, estimate, rows = _sample(
-        replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations()),
+        without_given(network),
         final,
     )
     try:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.score import gain_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
@@ -55,17 +55,20 @@ def refit(
     every = (*(other for other, _ in before), one)
     ends = np.cumsum([0, *(len(beta) for _, beta in before), len(one.gain.beta)])
     beta = np.concatenate([*(beta for _, beta in before), one.gain.beta])
-    current, step = start, beta - np.concatenate([*(own for _, own in before), np.zeros(len(one.gain.beta))])
+    current, step = start, np.concatenate([np.zeros(int(ends[-2])), one.gain.beta])
+    D = _side_by_side(every, current, columns_of(current))
     for number in range(ROUNDS):
-        found = _stepped(plain, every, current, beta - step, step)
+        found = _stepped(plain, D, current, beta - step, step)
         if found is None:
             return None
         current, beta = found
+        columns = columns_of(current)
+        D = _side_by_side(every, current, columns)
         try:
-            reduced = reduce_adjustment(current, columns_of(current))
+            reduced = reduce_adjustment(current, columns)
         except np.linalg.LinAlgError:
             return None
-        gain = gain_of(*reduced.project(reduced.whiten(_side_by_side(every, current))))
+        gain = gain_of(*reduced.project(reduced.whiten(D)))
         if gain.value < SETTLED or number == ROUNDS - 1:
             break
         step = gain.beta
@@ -78,12 +81,11 @@ def refit(
 
 
 def _stepped(
-    plain: Adjustment, every: Sequence[Alternative], start: Adjustment, beta: FloatArray, step: FloatArray
+    plain: Adjustment, D: FloatArray, start: Adjustment, beta: FloatArray, step: FloatArray
 ) -> tuple[Adjustment, FloatArray] | None:
     """Return the adjustment after a step of the parameters, halved while it makes v'Pv larger, and these."""
     xy, best = plain.network.image_points.xy, None
     for _ in range(HALVINGS):
-        D = _side_by_side(every, start)
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
         try:
             found = adjust(
@@ -105,9 +107,8 @@ def _stepped(
     return best
 
 
-def _side_by_side(every: Sequence[Alternative], a: Adjustment) -> FloatArray:
+def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
     """Return the columns of alternatives, (k, 2, q)."""
-    columns = columns_of(a)
     return np.concatenate([one.columns(a, columns) for one in every], axis=2)
 
 

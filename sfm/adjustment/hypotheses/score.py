@@ -218,7 +218,7 @@ def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
     rows, per_unit, off = [], [], []
     for row, (index, s) in enumerate(zip(given.camera.tolist(), given.parameter.tolist(), strict=True)):
         camera = cameras[index]
-        key = (camera.group_of(s) or camera.name, camera.names[s])
+        key = (camera.owner_of(s), camera.names[s])
         if key in keys and given.sigma[row] > 0:
             rows.append(row)
             per_unit.append(np.where([one == key for one in keys], units, 0.0))
@@ -277,10 +277,21 @@ class Gain:
     beta: FloatArray  # step of its parameters, (q,)
 
 
+def directions_of(H: FloatArray, squares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what normal equations (..., q, q) leave of the squares of their columns (..., q).
+
+    Returns:
+        Share that is left in each direction, (..., q), the directions, (..., q, q), and the scale of the
+        columns in which they are, (..., q).
+    """
+    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(H * scale[..., :, None] * scale[..., None, :])
+    return values, vectors, scale
+
+
 def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> Gain:
     """Return the gain of columns with normal equations H, g and squares before the elimination."""
-    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    values, vectors, scale = directions_of(H, squares)
     good = values > DETERMINED
     projected = vectors[:, good].T @ (scale * g)
     beta = -scale * (vectors[:, good] @ (projected / values[good]))
@@ -295,8 +306,7 @@ def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatAr
         g: right sides, (n, q).
         squares: of the columns before the elimination, (n, q).
     """
-    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None])
+    values, vectors, scale = directions_of(H, squares)
     good = values > DETERMINED
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
     gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)

@@ -25,7 +25,7 @@ from sfm.adjustment.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
-from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, reduce_adjustment
+from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, directions_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
@@ -55,7 +55,7 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
         if isinstance(one.family, InteriorFamily):
             index, s = one.parameters[0]
             camera = a.estimate.cameras[index]
-            held[camera.group_of(s) or camera.name][camera.names[s]] = reach
+            held[camera.owner_of(s)][camera.names[s]] = reach
         else:
             found[one.family.unchecked] = max(reach, found.get(one.family.unchecked, 0.0))
     return (
@@ -98,8 +98,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     """
     D = reduced.whiten(one.columns(a, columns))
     H, _, squares = reduced.project(D)
-    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, ROWS)

@@ -263,7 +263,7 @@ def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tupl
     tests: dict[tuple[str, str], Significance] = {}
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
         for s, sigma in zip(_free(camera, Q), np.sqrt(np.diagonal(Q)), strict=True):
-            name, owner = camera.names[s], camera.group_of(s) or camera.name
+            name, owner = camera.names[s], camera.owner_of(s)
             if not MODELS[camera.model].parameters[s].has_null_hypothesis or not sigma > 0:
                 continue
             value = float(camera.parameters[s])
@@ -283,7 +283,7 @@ def correlations(adjustment: Adjustment, *, limit: float = STRONG) -> tuple[Corr
     found = []
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
         free = _free(camera, Q)
-        names = [f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}" for s in free]
+        names = [f"{camera.names[s]} of camera {camera.owner_of(s)}" for s in free]
         found += _strong(Q, names, limit)
     parts = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
     for image, Q in zip(adjustment.network.images, adjustment.covariance.exterior, strict=True):

@@ -90,7 +90,7 @@ def statistics_of(result: SurveyResult) -> Statistics:
         correlations(adjustment),
     )
     of_cameras = {
-        f"{name} of camera {camera.group_of(s) or camera.name}"
+        f"{name} of camera {camera.owner_of(s)}"
         for camera in adjustment.estimate.cameras
         for s, name in enumerate(camera.names)
     }

@@ -8,7 +8,6 @@ from sfm.conventions import FloatArray
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import SurveyResult
 
-FAR_FROM_CENTRE = 0.1  # of the diagonal, as in the catalogue
 DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 
@@ -24,7 +23,7 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
     for number, camera in enumerate(result.adjustment.estimate.cameras):
         name, c = camera.names[0], float(camera.parameters[0])
         sigma = float(result.adjustment.interior_sigma(number)[0])
-        owner = camera.group_of(0) or camera.name
+        owner = camera.owner_of(0)
         if np.isfinite(sigma):
             partners = strong.get(f"{name} of camera {owner}")
             one = remark(
@@ -50,8 +49,9 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
             at = np.array([x + 0.5, y + 0.5])
         diagonal = float(np.hypot(width, height))
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
-        remarks += unless_note(remark("principal_point_far", camera=camera.name, share=away))
-        other = _format_around(at, width, height) if away >= FAR_FROM_CENTRE else None
+        far = unless_note(remark("principal_point_far", camera=camera.name, share=away))
+        remarks += far
+        other = _format_around(at, width, height) if far else None
         if other is not None:
             remarks.append(
                 remark("format_of_other_size", camera=camera.name, width=other[0], height=other[1])

@@ -182,7 +182,7 @@ def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
         if not rows:
             continue
         own = found.parameter[rows]
-        names += [f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}" for s in own]
+        names += [f"{camera.names[s]} of camera {camera.owner_of(s)}" for s in own]
         units += [camera.units[s] for s in own]
         at = [column[int(s)] for s in own]
         cofactor = Q[np.ix_(at, at)] / adjustment.sigma0**2 if len(Q) else np.full((len(at),) * 2, np.nan)

@@ -101,7 +101,7 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
             value = float(camera.parameters[s])
             if not camera.free[s] and value == 0:
                 continue
-            owner = camera.group_of(s) or camera.name
+            owner = camera.owner_of(s)
             key = (owner, parameter.name, -1 if camera.group_of(s) else a)
             known = found.get(key)
             count = int(used[a]) + (known.photographs if known else 0)

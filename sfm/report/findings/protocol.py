@@ -299,7 +299,7 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
             normed = Q[np.ix_(some, some)] / scale[:, None] / scale
             statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
             p = float(f_sf(statistic, len(some), a.redundancy))
-            owner = camera.group_of(int(free[some[0]])) or camera.name
+            owner = camera.owner_of(int(free[some[0]]))
             which = ", ".join(names[s] for s in some)
             tests[owner, which] = CumulativeTest(owner, which, statistic, p)
     return tuple(tests.values())

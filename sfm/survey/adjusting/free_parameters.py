@@ -21,10 +21,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import KNOWN_WITHOUT, corner_shift
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.hypotheses.given import without_given
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 

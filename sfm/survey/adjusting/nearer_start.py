@@ -54,7 +54,7 @@ def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> t
     for one, held in zip(before, after, strict=True):
         lost = np.flatnonzero(one.free & ~held.free)
         if len(lost):
-            names[one.group_of(int(lost[0])) or one.name] = tuple(one.names[s] for s in lost)
+            names[one.owner_of(int(lost[0]))] = tuple(one.names[s] for s in lost)
     return tuple(
         remark("held_to_converge", camera=camera, parameters=parameters)
         for camera, parameters in names.items()

@@ -230,5 +230,5 @@ def _scaled_resection(
 
 def _sharing(camera: Camera) -> Camera:
     """Return a camera that shares its parameters, in groups, with those that were split off it."""
-    shared = tuple(camera.group_of(s) or camera.name for s in range(len(camera.names)))
+    shared = tuple(camera.owner_of(s) for s in range(len(camera.names)))
     return camera if camera.shared else replace(camera, shared=shared)

@@ -13,19 +13,12 @@ import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import (
-    GivenPoints,
-    judge_points,
-)
-from sfm.adjustment.quality.given_values import (
-    NONCENTRALITY,
-    GivenModel,
-    GivenTest,
-)
+from sfm.adjustment.quality.given_points import GivenPoints, judge_points
+from sfm.adjustment.quality.given_values import NONCENTRALITY, GivenModel, GivenTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, Network, ObjectPoints
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given_groups import Group, Places, Task, remarks_on_unchecked
@@ -42,14 +35,8 @@ class JudgedGiven:
     datum: Datum
     remarks: tuple[Remark, ...] = ()
     tests: tuple[GivenTest, ...] = ()
-    placing: Similarity | None = (
-        None  # object frame from that of the free network; None where nothing says it
-    )
-
-
-def without_given(network: Network) -> Network:
-    """Return the network of the image points alone."""
-    return replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations())
+    placing: Similarity | None = None
+    """object frame from that of the free network; None where nothing says it"""
 
 
 def judge_given(

@@ -61,7 +61,7 @@ def split_cameras(
         owner[images] = first + member
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
-            groups = [camera.group_of(s) or camera.name for camera in made]
+            groups = [camera.owner_of(s) for camera in made]
             first_of = {group: k for k, group in reversed(list(enumerate(groups)))}
             observed += [(first + first_of[group], s, value, sigma) for group in dict.fromkeys(groups)]
         place = made[0].names.index

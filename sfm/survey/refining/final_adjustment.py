@@ -12,10 +12,10 @@ from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
-from sfm.survey.hypotheses.given import judge_given, without_given
+from sfm.survey.hypotheses.given import judge_given
 
 GROUPS = ("key points", "targets")
 

@@ -36,6 +36,19 @@ _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
 
 @compiled
+def _beside_outline(theta: FloatArray, x: float, y: float) -> tuple[float, float, float, float]:
+    """Return the place of a pixel in the frame of the unit circle, u, v and rho, and the slope of rho^2 / 2.
+
+    Its distance from the outline is rho (rho - 1) over that slope, px, to first order.
+    """
+    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
+    dx, dy = x - theta[model.X0], y - theta[model.Y0]
+    u, v = p * dx + q * dy, q * dx + r * dy
+    slope = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+    return u, v, math.sqrt(u * u + v * v), slope
+
+
+@compiled
 def judge_residuals(
     pixels: FloatArray,
     n: int,
@@ -51,7 +64,6 @@ def judge_residuals(
     The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
     An eighth without any background is uneven, unless what is damaged was left out there.
     """
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
     A, band = theta[model.CONTRAST], _BAND_PX + _BAND_BLURS * theta[model.BLUR]
     mean, count = np.zeros(16), np.zeros(16)
     squares, used = 0.0, 0.0
@@ -62,10 +74,7 @@ def judge_residuals(
             residual = J[model.RESIDUAL + i]
             squares += residual * residual
             used += J[model.WEIGHT + i]
-            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            rho = math.sqrt(u * u + v * v)
-            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            u, v, rho, nw = _beside_outline(theta, pixels[0, first + i], pixels[1, first + i])
             d = rho * (rho - 1) / nw
             if abs(d) >= band:
                 continue
@@ -104,7 +113,6 @@ def sum_sectors(
     Returns:
         The second largest residual deeper inside than the edge, in robust standard deviations of those there.
     """
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
     A, s = theta[model.CONTRAST], theta[model.BLUR]
     band, deep = _BAND_PX + _BAND_BLURS * s, np.empty(n)
     inside = 0
@@ -113,10 +121,7 @@ def sum_sectors(
         m = min(model.BLOCK, n - first)
         model.linearise(pixels, first, m, theta, length, saturation, J)
         for i in range(m):
-            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            rho = math.sqrt(u * u + v * v)
-            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            u, v, rho, nw = _beside_outline(theta, pixels[0, first + i], pixels[1, first + i])
             d = rho * (rho - 1) / nw
             if abs(d) < band:
                 slope = J[model.WEIGHT + i] * _edge_slope(A, s, d, rho / nw)
@@ -157,7 +162,6 @@ def shape_equations(
         shape: receives the normal equations of the harmonics, their right-hand side, and the change of the
             centre by each, px per radius, shape (SHAPES + 3, SHAPES).
     """
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
     A, s = theta[model.CONTRAST], theta[model.BLUR]
     band = _BAND_PX + 2 * _BAND_BLURS * s
     mixed, column = np.zeros((model.UNKNOWNS, SHAPES)), np.empty(SHAPES)
@@ -166,15 +170,12 @@ def shape_equations(
         m = min(model.BLOCK, n - first)
         model.linearise(pixels, first, m, theta, length, saturation, J)
         for i in range(m):
-            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            rho = math.sqrt(u * u + v * v) + 1e-12
-            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            u, v, rho, nw = _beside_outline(theta, pixels[0, first + i], pixels[1, first + i])
             d = rho * (rho - 1) / nw
             if abs(d) >= band:
                 continue
             slope = J[model.WEIGHT + i] * _edge_slope(A, s, d, rho / nw)
-            c, z = u / rho, v / rho
+            c, z = u / (rho + 1e-12), v / (rho + 1e-12)
             ck, zk = c * c - z * z, 2 * c * z
             for k in range(0, SHAPES, 2):
                 ck, zk = ck * c - zk * z, zk * c + ck * z

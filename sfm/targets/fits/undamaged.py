@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,22 +60,29 @@ def fit_undamaged(
         The fits, flagged DAMAGED where something was left out and UNEVEN_EDGE where too little of the edge
         agrees with one ellipse; the variances of the intensities, shape (k,); the noise of the outlines.
     """
-    fits: list[tuple[EllipseFits, FloatArray, OutlineNoise]] = []
-    order: list[IntArray] = []
-    for some in sizes_apart(_radii(start)):
-        fits.append(_fit_population(image, start[some], sign[some], noise, saturation, least_variance))
-        order.append(some)
-    if not fits:
-        return _fit_population(image, start, sign, noise, saturation, least_variance)
-    back = np.argsort(np.concatenate(order))
-    parts = zip(*(one[0] for one in fits), strict=True)
-    whole = EllipseFits(*(np.concatenate(part)[back] for part in parts))
-    outlines = zip(*(one[2] for one in fits), strict=True)
+
+    def fit(begin: FloatArray, signs: IntArray, keep: BoolArray, depth: FloatArray) -> EllipseFits:
+        return _fit_in_threads(image, begin, signs, noise, saturation, keep, depth)
+
+    k = len(start)
+    every = fit(start, sign, np.ones((k, RAYS), bool), np.full(k, np.inf))
+    classes = sizes_apart(_radii(start)) or [np.zeros(0, dtype=np.int64)]
+    found = [_repaired(_some_of(every, one), sign[one], fit, noise**2, least_variance) for one in classes]
+    back = np.argsort(np.concatenate(classes))
+
+    def together(parts: Iterable[tuple[FloatArray | IntArray, ...]]) -> Iterator[Any]:
+        return (np.concatenate(part)[back] for part in zip(*parts, strict=True))
+
     return (
-        whole,
-        np.concatenate([one[1] for one in fits])[back],
-        OutlineNoise(*(np.concatenate(part)[back] for part in outlines)),
+        EllipseFits(*together(one[0] for one in found)),
+        np.concatenate([one[1] for one in found])[back],
+        OutlineNoise(*together(one[2] for one in found)),
     )
+
+
+def _some_of(fits: EllipseFits, some: IntArray) -> EllipseFits:
+    parts: Iterator[Any] = (part[some] for part in fits)
+    return EllipseFits(*parts)
 
 
 def sizes_apart(radius: FloatArray) -> list[IntArray]:
@@ -100,16 +109,27 @@ def sizes_apart(radius: FloatArray) -> list[IntArray]:
     return classes
 
 
-def _fit_population(
-    image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least_variance: float
+def _repaired(
+    fits: EllipseFits,
+    sign: IntArray,
+    fit: Callable[[FloatArray, IntArray, BoolArray, FloatArray], EllipseFits],
+    variance_of_noise: float,
+    least_variance: float,
 ) -> tuple[EllipseFits, FloatArray, OutlineNoise]:
-    """Fit ellipses of targets of about one size."""
-    k = len(start)
+    """Return fits of targets of about one size without damage, variances and the noise of outlines.
+
+    Args:
+        fits: of all of each target; changed.
+        sign: +1 bright, -1 dark target, shape (k,).
+        fit: fits targets from start values, with their sectors and depths that take part.
+        variance_of_noise: approximate one of the intensities.
+        least_variance: that of rounding the intensities.
+    """
+    k = len(sign)
     keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
-    fits = _fit_in_threads(image, start, sign, noise, saturation, keep, depth)
     judged = _least_curvature(fits.theta) > MIN_CURVATURE_BLURS * fits.theta[:, BLUR]
     for _ in range(ROUNDS):
-        h, weight, common, sound = _deviations(fits, keep, noise**2 + least_variance, least_variance)
+        h, weight, common, sound = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
         skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
         damaged = find_damage(h, weight, sound, skirt)
         inside = np.maximum(fits.statistics[:, goodness.INSIDE], 1.0)
@@ -123,10 +143,10 @@ def _fit_population(
             again & deep
         ]
         begin = fits.theta[again, : R + 1]
-        repaired = _fit_in_threads(image, begin, sign[again], noise, saturation, keep[again], depth[again])
+        repaired = fit(begin, sign[again], keep[again], depth[again])
         for whole, part in zip(fits, repaired, strict=True):
             whole[again] = part
-    h, weight, common, sound = _deviations(fits, keep, noise**2 + least_variance, least_variance)
+    h, weight, common, sound = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
     cut = ~keep.all(axis=1)
     small = _radii(fits.theta) < MIN_RADIUS_PX
     fits.flag[cut | np.isfinite(depth)] |= Flag.DAMAGED.value
