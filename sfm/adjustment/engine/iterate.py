@@ -37,6 +37,8 @@ TOLERANCE = 1e-6
 MIN_SHIFT = 1e-6
 ARMIJO = 1e-4  # share of the predicted decrease that a step must bring (Nocedal and Wright, sec. 3.1)
 SHORTEST = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
+BENT = 0.25  # share of a Gauss-Newton step below which a valley is bent
+CORRECTIONS = 3  # steps back to its bottom
 START_DAMPING = 1e-3  # share of the diagonal
 NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
@@ -156,6 +158,8 @@ def iterate(
                 continue
             start, tried = before
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
+            if better is None or SHORTEST <= shortest < 1 and better[1] < BENT:
+                better = _along_valley(problem, start, weight, tried) or better
             if better is None:  # no share of the last step leads where they can be solved
                 state, found = start, _solve(problem, start, weight)
                 break
@@ -312,6 +316,35 @@ def _line_search(
         reached = total(problem, moved, weight)
         if np.isfinite(reached) and reached <= _most_allowed(found, share, shortest):
             return moved, share
+        share /= 2
+    return None
+
+
+def _along_valley(
+    problem: Problem, start: State, weight: FloatArray, found: Move
+) -> tuple[State, float] | None:
+    """Return where a share of a step leads along the bent valley that it runs in, and the share.
+
+    A straight step leaves such a valley soon, and a share of it creeps. What leads back to the bottom is the
+    next step under the condition that the unknowns of the cameras do not go on along the first.
+    """
+    along = found.reduced
+    share = 1.0
+    while share >= BENT**2:
+        moved = step(problem.layout, start, share * found.reduced, share * found.points)
+        for _ in range(CORRECTIONS):
+            back = _solve(problem, moved, weight)
+            if back is None:
+                break
+            z = back.factor.solve(along)
+            nothing = point_step(back.equations, np.zeros_like(z), problem.layout)
+            Z = point_step(back.equations, z, problem.layout) - nothing
+            z, Z = back.motions.transform(z, Z)
+            part = float(along @ back.reduced) / float(along @ z)
+            moved = step(problem.layout, moved, back.reduced - part * z, back.points - part * Z)
+            reached = total(problem, moved, weight)
+            if np.isfinite(reached) and reached <= _most_allowed(found, share, SHORTEST):
+                return moved, share
         share /= 2
     return None
 

@@ -138,18 +138,24 @@ def compare_adjusters(
             f"k1 to k6 still grow together after {ours.iterations} iterations, numerator and denominator of "
             "the rational distortion cancelling",
         )
-        start = replace(start, cameras=tuple(distortion_held(camera) for camera in start.cameras))
-        ours = _adjusted(network, start, adjustment.sigma_px)
-    theirs = backend(network, start)
-    conditional = theirs.point_covariance
-
-    def against_ours(estimate: Estimate) -> Comparison:
-        return compare(ours.estimate, estimate, network, covariance=ours.covariance, names=("kolinear", name))
-
-    found, stopped_early = against_ours(theirs.estimate), False
-    if ours.converged and not (found.agree and theirs.converged):
+    while True:
+        if held:
+            start = replace(start, cameras=tuple(distortion_held(camera) for camera in start.cameras))
+            ours = _adjusted(network, start, adjustment.sigma_px)
+        theirs = backend(network, start)
+        found = compare(
+            ours.estimate, theirs.estimate, network, covariance=ours.covariance, names=("kolinear", name)
+        )
+        if not ours.converged or (found.agree and theirs.converged):
+            stopped_early = False
+            break
         further = _adjusted(network, theirs.estimate, adjustment.sigma_px)
-        stopped_early = further.converged and against_ours(further.estimate).agree
+        ended = compare(ours.estimate, further.estimate, network, covariance=ours.covariance)
+        stopped_early = further.converged and ended.agree
+        if stopped_early or held or not (rational and further.undetermined):
+            break
+        held = further.undetermined  # where one ends they are, where the other ends they hardly are not
+    conditional = theirs.point_covariance
     return AdjusterComparison(
         name,
         start.cameras[0].model,

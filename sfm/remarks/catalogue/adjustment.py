@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
@@ -10,7 +10,7 @@ SIGMA0 = Grade("ratio", warning=2.0, error=5.0)
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL = Grade("over_sigma", warning=10.0, error=30.0)
 REJECTED = Grade("share", warning=0.05)  # of the image points; gross errors are one in a hundred
-SOLUTION = Grade("moved", error=3.0)  # standard deviations: beyond three, theirs mean nothing
+SOLUTION = Grade("moved", error=WRONG_SIGMAS)  # standard deviations: the result is wrong if it is the true one
 
 ROWS = (
     Kind(
@@ -116,16 +116,16 @@ ROWS = (
     Kind(
         "other_solution",
         SOLUTION,
-        "With c of camera {camera} at {c} the image points fit as well (v'Pv {vPv} times that of the "
-        "result); points differ by {moved} standard deviations (RMS).",
+        "The image points allow another solution with c of camera {camera} at {c} (v'Pv {vPv} times that of "
+        "the result); points differ by {moved} standard deviations (RMS).",
         "a flat object or a narrow range of angles: the photographs allow two shapes",
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),
     Kind(
         "other_solution_reversed",
         SOLUTION,
-        "Reversed in depth the object fits as well (v'Pv {vPv} times that of the result); points differ by "
-        "{moved} standard deviations (RMS).",
+        "The image points allow another solution, with the object reversed in depth (v'Pv {vPv} times that of "
+        "the result); points differ by {moved} standard deviations (RMS).",
         "a flat object or a narrow range of angles: the photographs allow two shapes",
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),

@@ -79,16 +79,22 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return the other solutions that the image points allow: which of them is true they do not decide."""
-    farthest = sorted(result.other_solutions, key=lambda one: -one.moved)
-    return tuple(
-        remark("other_solution_reversed", vPv=other.vPv, moved=other.moved)
-        if other.reflected
-        else remark(
-            "other_solution", camera=other.camera, c=(other.c, other.unit), vPv=other.vPv, moved=other.moved
+    """Return the farthest other solution that the image points allow, and the farthest reversed in depth.
+
+    Along a flat valley of c there are many; what lies between them says nothing more.
+    """
+    found = []
+    for other in sorted(result.other_solutions, key=lambda one: -one.moved):
+        one = (
+            remark("other_solution_reversed", vPv=other.vPv, moved=other.moved)
+            if other.reflected
+            else remark(
+                "other_solution", camera=other.camera, c=(other.c, other.unit), vPv=other.vPv, moved=other.moved
+            )
         )
-        for other in farthest
-    )
+        if all(one.kind != before.kind for before in found):
+            found.append(one)
+    return tuple(found)
 
 
 def sigma0_remarks(sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]:
