@@ -1,12 +1,13 @@
 """Iteration of the normal equations to the least sum of squares.
 
 Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to get near and Gauss-Newton to end:
-the last steps are undamped in either case. Where only the values are wanted, the step that shows
-convergence may be taken with the reduced matrix of the step before, for the gradient of its own state
-(simplified Newton). A step that would bring a point behind a camera has an infinite sum of squares and
-is shortened or damped. Converged means that the predicted change of the adjusted observations, |A dx|
-weighted, is at most `tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would
-move by more than that share of its own a priori standard deviation.
+the last steps are undamped in either case. Where a bent valley leaves room for short straight steps only, a
+longer one is brought back to its bottom. Where only the values are wanted, the step that shows convergence
+may be taken with the reduced matrix of the step before, for the gradient of its own state (simplified
+Newton). A step that would bring a point behind a camera has an infinite sum of squares and is shortened or
+damped. Converged means that the predicted change of the adjusted observations, |A dx| weighted, is at most
+`tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would move by more than that
+share of its own a priori standard deviation.
 
 Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
 veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear
@@ -158,8 +159,8 @@ def iterate(
                 continue
             start, tried = before
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
-            if better is None or SHORTEST <= shortest < 1 and better[1] < BENT:
-                better = _along_valley(problem, start, weight, tried) or better
+            if better is not None and better[1] < BENT:
+                better = _along_valley(problem, start, weight, tried, better[1]) or better
             if better is None:  # no share of the last step leads where they can be solved
                 state, found = start, _solve(problem, start, weight)
                 break
@@ -321,31 +322,37 @@ def _line_search(
 
 
 def _along_valley(
-    problem: Problem, start: State, weight: FloatArray, found: Move
+    problem: Problem, start: State, weight: FloatArray, found: Move, straight: float
 ) -> tuple[State, float] | None:
     """Return where a share of a step leads along the bent valley that it runs in, and the share.
 
     A straight step leaves such a valley soon, and a share of it creeps. What leads back to the bottom is the
-    next step under the condition that the unknowns of the cameras do not go on along the first.
+    next step under the condition that the unknowns of the cameras do not go on along the first. A valley that
+    a straight share leaves by the square of it, and the way back by its square, allows the root.
+
+    Args:
+        problem: what is adjusted.
+        start: where the step starts.
+        weight: factor on the weight of each image point, shape (k,).
+        found: the step.
+        straight: share of it that can be taken straight.
     """
-    along = found.reduced
-    share = 1.0
-    while share >= BENT**2:
-        moved = step(problem.layout, start, share * found.reduced, share * found.points)
-        for _ in range(CORRECTIONS):
-            back = _solve(problem, moved, weight)
-            if back is None:
-                break
+    along, share = found.reduced, float(np.sqrt(straight))
+    allowed, height = _most_allowed(found, share, SHORTEST), np.inf
+    moved = step(problem.layout, start, share * found.reduced, share * found.points)
+    for _ in range(CORRECTIONS):
+        back = _solve(problem, moved, weight)
+        if back is None or back.vPv > height / 2:  # it does not lead back
+            return None
+        height = back.vPv
+        with np.errstate(over="ignore", invalid="ignore"):  # as for the step itself
             z = back.factor.solve(along)
             nothing = point_step(back.equations, np.zeros_like(z), problem.layout)
-            Z = point_step(back.equations, z, problem.layout) - nothing
-            z, Z = back.motions.transform(z, Z)
+            z, Z = back.motions.transform(z, point_step(back.equations, z, problem.layout) - nothing)
             part = float(along @ back.reduced) / float(along @ z)
             moved = step(problem.layout, moved, back.reduced - part * z, back.points - part * Z)
-            reached = total(problem, moved, weight)
-            if np.isfinite(reached) and reached <= _most_allowed(found, share, SHORTEST):
-                return moved, share
-        share /= 2
+        if total(problem, moved, weight) <= allowed:
+            return moved, share
     return None
 
 

@@ -10,7 +10,9 @@ SIGMA0 = Grade("ratio", warning=2.0, error=5.0)
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL = Grade("over_sigma", warning=10.0, error=30.0)
 REJECTED = Grade("share", warning=0.05)  # of the image points; gross errors are one in a hundred
-SOLUTION = Grade("moved", error=WRONG_SIGMAS)  # standard deviations: the result is wrong if it is the true one
+SOLUTION = Grade(
+    "moved", error=WRONG_SIGMAS
+)  # standard deviations: the result is wrong if it is the true one
 
 ROWS = (
     Kind(
@@ -124,8 +126,8 @@ ROWS = (
     Kind(
         "other_solution_reversed",
         SOLUTION,
-        "The image points allow another solution, with the object reversed in depth (v'Pv {vPv} times that of "
-        "the result); points differ by {moved} standard deviations (RMS).",
+        "The image points allow another solution, the object reversed in depth (v'Pv {vPv} times that of the "
+        "result); points differ by {moved} standard deviations (RMS).",
         "a flat object or a narrow range of angles: the photographs allow two shapes",
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),

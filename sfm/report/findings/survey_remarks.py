@@ -83,13 +83,17 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
     Along a flat valley of c there are many; what lies between them says nothing more.
     """
-    found = []
+    found: list[Remark] = []
     for other in sorted(result.other_solutions, key=lambda one: -one.moved):
         one = (
             remark("other_solution_reversed", vPv=other.vPv, moved=other.moved)
             if other.reflected
             else remark(
-                "other_solution", camera=other.camera, c=(other.c, other.unit), vPv=other.vPv, moved=other.moved
+                "other_solution",
+                camera=other.camera,
+                c=(other.c, other.unit),
+                vPv=other.vPv,
+                moved=other.moved,
             )
         )
         if all(one.kind != before.kind for before in found):
