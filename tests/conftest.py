@@ -1,4 +1,4 @@
-"""What all tests share: a cache folder of their own, and where the public reference data are, if they are."""
+"""What all tests share: a cache folder, reports without plots, and where public data are, if they are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 # Before numpy is loaded: the tests run in a process for each core, and threads of BLAS beyond the first spin.
@@ -37,3 +38,16 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the public reference data ../shared/data are absent")
     return SHARED
+
+
+@pytest.fixture
+def plots() -> None:
+    """Asked for by a test whose reports shall have their plots, drawn as for users."""
+
+
+@pytest.fixture(autouse=True)
+def no_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the plots, which take as long as a small survey, and the process that draws them."""
+    if "plots" not in request.fixturenames:
+        monkeypatch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
+        monkeypatch.setattr("sfm.report.output.draw_plots", lambda _: [])

@@ -28,7 +28,6 @@ def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "adapters.dask_cluster", raising=False)
     monkeypatch.delattr("adapters.dask_cluster", raising=False)
-    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
     monkeypatch.setattr(warmed, "is_warm", lambda: True)
 
 

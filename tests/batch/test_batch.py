@@ -61,12 +61,6 @@ def finished(surveys: tuple[Path, ...], tmp_path_factory: pytest.TempPathFactory
     return out
 
 
-@pytest.fixture(autouse=True)
-def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the drawing in this process, which takes most of the time of a small survey."""
-    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
-
-
 @pytest.fixture(scope="module")
 def two_workers() -> Iterator[DaskEngine]:
     with local_engine(2) as engine:
@@ -474,7 +468,7 @@ def test_a_disk_problem_ends_the_batch_with_one_line(surveys: tuple[Path, ...], 
 
 
 def test_workers_listen_to_this_computer_only_and_two_batches_do_not_meet(two_workers: DaskEngine) -> None:
-    with local_engine(1) as other:
+    with local_engine(0) as other:
         assert other.client.scheduler.address != two_workers.client.scheduler.address
         own = psutil.Process()
         listening = {

@@ -32,16 +32,15 @@ def _own_objects() -> Counter[str]:
     )
 
 
-def test_surveys_leave_nothing_behind(tmp_path: Path) -> None:
+def test_surveys_leave_nothing_behind(tmp_path: Path, plots: None) -> None:
     """After the first, which fills the caches, every survey ends with the objects it began with."""
     held = []
-    for k in range(4):
+    for k in range(3):
         file = write_observed_survey(tmp_path / f"s{k}", f"s{k}")
         job = SurveyJob(file, tmp_path / "out", f"s{k}", "inputs", allow_outside=False, owner=None)
         assert reconstruct(job, ALONE, [], tell=lambda _: None).status == "done"
         held.append(_own_objects())
     assert held[2] - held[1] == Counter()
-    assert held[3] - held[2] == Counter()
 
 
 def _wander(parts: list[object], *, tell: Tell) -> int:

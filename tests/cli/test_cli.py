@@ -25,6 +25,7 @@ from sfm.report.output import write_result
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
 
+SLOW = pytest.mark.slow
 SURVEY = """\
 [survey]
 name = "Plättchen 1"
@@ -160,7 +161,11 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 
 
 def test_a_survey_from_photographs_to_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, photographs: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    photographs: Path,
+    plots: None,
 ) -> None:
     path = tmp_path / "survey.toml"
     path.write_text(SURVEY.format(backend="colmap"), encoding="utf-8")
@@ -180,7 +185,7 @@ def test_a_survey_from_photographs_to_report(
     assert text["comparison"]["agree"] is True
     assert text["converged"] is True
     assert (out / "overlays" / "bild é 1.jpg").is_file()
-    assert list((out / "colmap").iterdir())
+    assert list((out / "colmap").iterdir()) and len(list((out / "plots").glob("*.png"))) == 4
 
     place = coded_points(photographs / "truth_points.csv")
     found = coded_points(out / "points.csv")
@@ -449,7 +454,7 @@ def test_nothing_that_takes_time_is_imported_for_the_help() -> None:
     assert heavy.isdisjoint(run.stderr.split())
 
 
-@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.8, 1.2])
+@pytest.mark.parametrize("seconds", [0.15, pytest.param(0.4, marks=SLOW), 0.8, pytest.param(1.2, marks=SLOW)])
 def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path, seconds: float) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", "print(1, flush=True); from sfm.cli import main; main()", "batch", tmp_path],

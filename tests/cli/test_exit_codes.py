@@ -56,8 +56,7 @@ COMMANDS = {
 
 
 @pytest.fixture(autouse=True)
-def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
+def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(starting, "_tell_of_compiling", lambda: None)
 
 

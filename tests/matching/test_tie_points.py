@@ -471,7 +471,6 @@ def test_batch_of_a_survey_without_targets_is_that_survey(
     survey = _write_small_survey(tmp_path / "a", "small")
     out = tmp_path / "out"
     looked: list[int] = []
-    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
     monkeypatch.setattr(
         "sfm.survey.measuring.tie_points.natural_points",
         lambda *given, **options: looked.append(1) or natural_points(*given, **options),

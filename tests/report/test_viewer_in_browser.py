@@ -20,7 +20,7 @@ from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.stored_result import StoredResult
-from tests.browser import Tab, chromium
+from tests.browser import Tab
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
 EVIL = "<img src=https://example.org/x onerror=document.title='broken'>"
@@ -109,12 +109,6 @@ def scene() -> ViewerScene:
 def page_file(scene: ViewerScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewer")
     return write_view(scene, folder / "page.html", source="here", paths=photographs(scene, folder))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

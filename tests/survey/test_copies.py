@@ -36,7 +36,7 @@ def plain(folder: Path) -> SurveyResult:
     return run_survey(read_survey(folder / "survey.toml"))
 
 
-@pytest.mark.parametrize("quality", [75, 95])
+@pytest.mark.parametrize("quality", [75, pytest.param(95, marks=pytest.mark.slow)])
 def test_photographs_saved_again_as_jpeg_count_once(
     plain: SurveyResult, folder: Path, quality: int, tmp_path: Path
 ) -> None:

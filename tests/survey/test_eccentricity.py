@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,7 @@ def ellipse_of(outline: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     return centre, 2 * np.sqrt(value[::-1]), float(np.arctan2(axes[1, 1], axes[0, 1]))
 
 
+@lru_cache
 def photographs(seed: int) -> MeasuredPhotographs:
     """Return what eight photographs of perfect circles show: exact ellipses and a little noise."""
     rng = np.random.default_rng(seed)
@@ -145,9 +147,11 @@ def test_large_oblique_targets_are_biased_without_the_correction(
     assert np.abs(error.mean()) == pytest.approx(0.017, abs=0.003)
 
 
-@pytest.mark.parametrize("known", ["nothing", "table", "table and one for all"])
+@pytest.mark.parametrize(
+    ("known", "seeds"), [("nothing", (1, 2, 3)), ("table", (1, 2, 3)), ("table and one for all", (1,))]
+)
 def test_they_are_unbiased_with_the_correction(
-    known: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: str, seeds: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, diameter = places()
     targets = ""
@@ -159,7 +163,7 @@ def test_they_are_unbiased_with_the_correction(
         targets = 'diameters = "diameters.csv"'
         targets += f"\ndiameter = {SMALL_MM}" if known != "table" else ""
     squares, means = [], []
-    for seed in (1, 2, 3):
+    for seed in seeds:
         result = surveyed(tmp_path, monkeypatch, targets, seed)
         ratio, _ = normalised(result)
         squares += list(ratio**2)
@@ -168,7 +172,7 @@ def test_they_are_unbiased_with_the_correction(
         assert 0.1 < result.eccentricity.largest_px < 0.3  # the nearest targets show 90 px
         assert 0 < result.eccentricity.sigma_px < 0.01
         assert 0.8 < result.adjustment.sigma0 < 1.2
-    # 14 large targets in three surveys; the frame of the small ones adds a little to each sigma
+    # 14 large targets in each survey; the frame of the small ones adds a little to each sigma
     assert np.abs(means).max() < 3.5
     assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / len(squares)))
 

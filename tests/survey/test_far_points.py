@@ -44,8 +44,16 @@ def network_with_far_points(number: int, count: int, distance: float) -> tuple[N
     )
 
 
-@pytest.mark.parametrize("count", [1, 4, 8])
-@pytest.mark.parametrize("distance", [1e4, 1e5, 1e7])
+@pytest.mark.parametrize(
+    ("count", "distance"),
+    [
+        (1, 1e4),
+        (8, 1e4),
+        (4, 1e7),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((4, 1e4), (1, 1e5), (4, 1e5))),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((8, 1e5), (1, 1e7), (8, 1e7))),
+    ],
+)
 def test_far_points_are_left_out_by_name(count: int, distance: float) -> None:
     for number in range(3):
         network, truth = network_with_far_points(number, count, distance)

@@ -159,7 +159,8 @@ def test_inner_constraints_refer_to_the_given_coordinates() -> None:
 
 
 @pytest.mark.skipif(not CAMCAL.exists(), reason="../shared/data/camcal is absent")
-@pytest.mark.parametrize("name", ["reference_free", pytest.param("reference_fixed", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reference_free", "reference_fixed"])
 def test_camcal_restarts(name: str, tmp_path: Path) -> None:
     prepare(CAMCAL, tmp_path / "camcal")
     survey = read_survey(tmp_path / "camcal" / f"{name}.toml")

@@ -50,8 +50,7 @@ Command = tuple[Callable[[Path], tuple[object, ...]], tuple[str, ...]]
 
 
 @pytest.fixture(autouse=True)
-def no_plots_and_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda *_, **__: HERE)
 
 

@@ -37,6 +37,8 @@ def fit(
     picture: AnyArray, xy: FloatArray, semi_axes: FloatArray, angle: float, sign: int, noise: float = 2.0
 ) -> EllipseFit:
     """Fit from a start that is off by half a pixel and 15 % of the size."""
+    if picture.dtype != np.uint8:  # the kernels are compiled for each type of pixels
+        picture = picture.astype(np.float64)
     shape = shape_from_axes(1.15 * np.array([semi_axes]), np.array([angle + 0.1]))
     return fit_ellipse_model(
         picture, (xy + np.array([0.5, -0.4]))[None], shape, np.array([sign]), noise=noise

@@ -142,7 +142,7 @@ def test_what_is_unlike_the_others() -> None:
     ("name", "size"),
     [
         ("12-gon", (25.0, 5)),
-        ("12-gon", (60.0, 4)),
+        pytest.param("12-gon", (60.0, 4), marks=pytest.mark.slow),
         ("JPEG 60", (25.0, 5)),
         ("sharpened", (14.0, 5)),
         ("rough, flat", (14.0, 6)),
@@ -164,7 +164,7 @@ def test_nicks_are_left_out_and_widen_the_sigma() -> None:
     assert 0.6 < over_stated(measured, damaged) < 1.3
 
 
-@pytest.mark.parametrize("radius", [14.0, 25.0])
+@pytest.mark.parametrize("radius", [pytest.param(14.0, marks=pytest.mark.slow), 25.0])
 def test_stains_are_not_measured(radius: float) -> None:
     """Before: a target more than half a pixel from the centre in 33 and 61 % of the stained dots."""
     measured, damaged, _ = measure_class("stain", ((radius, 5),))

@@ -251,7 +251,8 @@ def _scene(
         cells[i + 1] = cells[i] + columns[i].prod()
     start = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=cells[-1]))]).astype(np.int64)
     scene = Scene(
-        first, uv, kind, size, float(ratio), float(tolerance), estimate.oriented, c, estimate.position,
+        first, uv, kind, size, float(ratio), float(tolerance), estimate.oriented, c,
+        np.ascontiguousarray(estimate.position),  # kernels are compiled for each layout
         np.swapaxes(estimate.rotation, 1, 2).copy(), np.array([windows[k] for k in camera]), area, corner,
         cell, columns, cells[:-1], start, np.argsort(place, kind="stable"),
     )  # fmt: skip
