@@ -222,6 +222,16 @@ def test_held_parameters_that_are_wrong_are_found_and_right_ones_are_not() -> No
     assert contradicted_parameters(solved(network, truth)) == ()
 
 
+def test_a_principal_point_that_a_rotation_and_decentring_nearly_take_up_is_found() -> None:
+    """They leave less than 1e-5 of the squares of x0, which is free of rounding nevertheless."""
+    one = planted("held x0", 7004)
+    a = solved(one.network, one.start)
+    camera = a.estimate.cameras[0]
+    assert camera.free[camera.names.index("P1")]
+    assert contradicted_parameters(a) == ((camera.owner_of(1), "x0"),)
+    assert causes_of("held x0", 7004)[0] == "held_parameter"
+
+
 def given_c(by: float, sigma: float = 2e-3) -> Adjustment:
     """Return a network with a camera of which c is given with a standard deviation, wrong by so much, mm."""
     network, truth = make_network(seed_of("given c"), images=10, points=50, free=("c", "x0", "y0"))

@@ -19,6 +19,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.survey.correspondences import merge_held
 from sfm.survey.diagnosis.own_camera import SCALES, TOLERANCE
 from sfm.survey.inputs.settings import AdjustSettings
+from tests.survey.faults import planted
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
@@ -73,6 +74,18 @@ def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool)
     assert all(one.reason.kind in kinds for one in result.failed)
     assert not of_kind(result.remarks, "camera_per_photograph")
     assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize(("kind", "cause"), [("held b1", "held_parameter"), ("autofocus", "camera_varies")])
+def test_what_all_photographs_share_is_no_camera_of_one(kind: str, cause: str) -> None:
+    """A photograph lost points, and another c explained them; what explains all photographs is likelier."""
+    one = planted(kind, {"held b1": 7002, "autofocus": 7013}[kind])
+    camera = one.start.cameras[0]
+    free = tuple(name for name, on in zip(camera.names, camera.free, strict=True) if on)
+    result = run_survey(survey_of(one.network, one.start, free=free, adjust=TAU))
+    assert len(result.adjustment.estimate.cameras) == 1
+    assert not of_kind(result.remarks, "camera_per_photograph")
+    assert of_kind(result.remarks, cause)
 
 
 def test_the_tolerance_is_that_of_half_a_step_of_c() -> None:

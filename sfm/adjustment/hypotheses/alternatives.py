@@ -82,10 +82,10 @@ def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
         rows: alternatives that are tested.
     """
     level = np.exp(np.log(ALPHA / rows) - search)
-    return float(max(chi2_isf(level, rank), 2 * (_price(rank, touched, search) + np.log(1 / ALPHA))))
+    return float(max(chi2_isf(level, rank), 2 * (price_of(rank, touched, search) + np.log(1 / ALPHA))))
 
 
-def _price(rank: int, touched: int, search: float) -> float:
+def price_of(rank: int, touched: int, search: float) -> float:
     """Return what parameters must gain in ln likelihood, by the number of image points that they move.
 
     Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90, on the n of the Bayesian information criterion.
@@ -140,7 +140,7 @@ def _made(
             evidence = min(evidence, spread.redundancy / 2 * np.log1p(f * gain.rank / spread.redundancy))
         else:
             evidence = log_likelihood_gain(gain.value / over, r)
-    price = _price(gain.rank, touched, search)
+    price = price_of(gain.rank, touched, search)
     return Alternative(
         *(family, pattern, factor, gain, log_p, price, search, evidence - price), some, parameters
     )

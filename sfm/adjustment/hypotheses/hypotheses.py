@@ -30,7 +30,7 @@ from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
@@ -51,6 +51,11 @@ class Cause:
     alternative: Alternative
     refit: Refit
     as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
+
+    @property
+    def evidence(self) -> float:
+        """Gain of ln likelihood, freedoms and search paid for."""
+        return self.refit.gain - self.alternative.price
 
 
 @dataclass(frozen=True)
@@ -209,26 +214,47 @@ def free_network(final: Adjustment) -> Adjustment | None:
     tested = final.rejected.any() and not final.reweighted and not final.undetermined
     if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
         return final
-    part, estimate, rows = _sample(
-        without_given(network),
-        final,
-    )
+    return adjust_image_points(network, final.estimate, final.rejected, final.image_sigma_factor)
+
+
+def adjust_image_points(
+    network: Network, estimate: Estimate, rejected: BoolArray, factor: FloatArray
+) -> Adjustment | None:
+    """Adjust the image points of a network alone, a part of many; None where they determine no solution.
+
+    Args:
+        network: of photographs and points that are all known.
+        estimate: start values.
+        rejected: image points that are left out at the start, (k,).
+        factor: on the standard deviations of image points, (k,).
+    """
+    part, start, rows = _sample(without_given(network), estimate)
     try:
         free = adjust(
             part,
-            estimate,
+            start,
             datum=Datum("free"),
-            image_sigma_factor=final.image_sigma_factor[rows],
+            image_sigma_factor=factor[rows],
             reject="tau",
             alpha=level_of_single(FALSE_ALARM, 2 * int(rows.sum())),
-            rejected=final.rejected[rows],
+            rejected=rejected[rows],
         )
-    except GeometryError:
+    except (GeometryError, np.linalg.LinAlgError):
         return None
     return free if free.converged and not free.undetermined and free.redundancy > 1 else None
 
 
-def _sample(network: Network, final: Adjustment) -> tuple[Network, Estimate, BoolArray]:
+def best_explanation(plain: Adjustment) -> Cause | None:
+    """Return the alternative that explains an adjustment of image points alone best, if one does."""
+    if len(plain.network.images) > MAX_PHOTOGRAPHS:
+        return None
+    try:
+        return _best(plain, ())
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _sample(network: Network, whole: Estimate) -> tuple[Network, Estimate, BoolArray]:
     """Return a network of about `MAX_IMAGE_POINTS`, its estimate, and which image points it has.
 
     Points of many rays come first, and each photograph has its share.
@@ -245,5 +271,5 @@ def _sample(network: Network, final: Adjustment) -> tuple[Network, Estimate, Boo
                 np.add.at(count, images[j], 1)
     rows = points[seen.point]
     every = np.ones(m, dtype=bool)
-    part, estimate = reduce_network(network, final.estimate, every, points, np.ones_like(rows))
+    part, estimate = reduce_network(network, whole, every, points, np.ones_like(rows))
     return part, estimate, rows

@@ -112,15 +112,20 @@ def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns)
     return np.concatenate([one.columns(a, columns) for one in every], axis=2)
 
 
-def log_likelihood(a: Adjustment) -> float:
+def log_likelihood(a: Adjustment, freed: int = 0) -> float:
     """Return ln of the likelihood, rejected image points spread evenly over their photograph.
+
+    Args:
+        a: the adjustment.
+        freed: unknowns in it that others it is compared with do not have; their price is reckoned apart.
 
     Source: Rissanen (1978), Automatica 14; Foerstner and Wrobel (2016), sec. 4.7 (mixture of good and bad).
     """
     sizes = np.array([float(np.prod(camera.size_px)) for camera in a.estimate.cameras])
     area = sizes[a.network.camera[a.network.image_points.image[a.rejected]]]
-    variance = a.sigma0_px**2
-    return float(-a.redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
+    redundancy = a.redundancy + freed
+    variance = a.sigma0_px**2 * a.redundancy / redundancy
+    return float(-redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
 
 
 def shifts_of(

@@ -25,7 +25,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.distributions import f_sf
 from sfm.network import rows_of
 
-DETERMINED = 1e-5  # of the squares of a column that photographs, cameras and points must leave of it
+DETERMINED = 1e-5  # of the squares of combined columns that photographs, cameras and points must leave
+ROUNDING = float(np.sqrt(np.finfo(float).eps))  # of the squares of a column alone that rounding may leave
 SMALLEST_LOG = -600.0  # of a probability that `f_sf` still gives
 MAX_TERMS = 10_000  # of the series beyond it
 
@@ -289,10 +290,19 @@ def directions_of(H: FloatArray, squares: FloatArray) -> tuple[FloatArray, Float
     return values, vectors, scale
 
 
+def least_share(columns: int) -> float:
+    """Return the share of their squares above which directions of so many columns count as determined.
+
+    Of several columns a direction below it is left out, as the step along it is larger than what is linear.
+    One column alone has no other direction, as x0 has none where P1 and a rotation take most of it.
+    """
+    return DETERMINED if columns > 1 else ROUNDING
+
+
 def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> Gain:
     """Return the gain of columns with normal equations H, g and squares before the elimination."""
     values, vectors, scale = directions_of(H, squares)
-    good = values > DETERMINED
+    good = values > least_share(values.shape[-1])
     projected = vectors[:, good].T @ (scale * g)
     beta = -scale * (vectors[:, good] @ (projected / values[good]))
     return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
@@ -307,7 +317,7 @@ def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatAr
         squares: of the columns before the elimination, (n, q).
     """
     values, vectors, scale = directions_of(H, squares)
-    good = values > DETERMINED
+    good = values > least_share(values.shape[-1])
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
     gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
     return np.asarray(gains), np.asarray(good.sum(axis=1))

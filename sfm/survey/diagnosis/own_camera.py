@@ -6,8 +6,9 @@ the rest, so that a photograph with a few accepted points would stand among the 
 
 Tried are the photographs of which more points are rejected than chance makes. Each is adjusted alone on
 the points of the others, with the camera that it shares and with parameters of its own. The likelihood
-must pay for these and for the search, as in `sfm.adjustment.hypotheses`. A photograph that loses the
-larger part of its points with either is left out.
+must pay for these and for the search, as in `sfm.adjustment.hypotheses`, and exceed that of the
+alternatives there: a wrong parameter that all photographs share makes some of them look zoomed. A
+photograph that loses the larger part of its points with either is left out.
 
 Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2, for the larger part,
 the breakdown point of any estimate; Rissanen (1978), Automatica 14, for the likelihood of rejected points;
@@ -22,7 +23,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import ALPHA
+from sfm.adjustment.hypotheses.alternatives import ALPHA, price_of
+from sfm.adjustment.hypotheses.hypotheses import adjust_image_points, best_explanation
+from sfm.adjustment.hypotheses.refit import log_likelihood
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -33,6 +36,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
+from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
 LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
@@ -116,19 +120,74 @@ def treat_lost(
                 rms=(float(np.sqrt(np.mean(found.residuals[~found.rejected] ** 2))), "px"),
             )
         )
-    if not with_own and not out.any():
-        return None
     if with_own:
         cameras[: len(estimate.cameras)] = [_sharing(camera) for camera in estimate.cameras]
-    position[out], rotation[out] = np.nan, np.nan
+        own_network = replace(network, camera=owner)
+        own_estimate = replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation)
+        if _explained_otherwise(network, estimate, own_network, own_estimate, accepted, ~out):
+            with_own, remarks = [], []
+        else:
+            network, estimate = own_network, own_estimate
+    if not with_own and not out.any():
+        return None
+    position = np.where(out[:, None], np.nan, estimate.position)
+    rotation = np.where(out[:, None, None], np.nan, estimate.rotation)
     return Treated(
-        replace(network, camera=owner),
-        replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation),
+        network,
+        replace(estimate, position=position, rotation=rotation),
         tuple(left),
         tuple(remarks),
         tuple(with_own),
         out,
     )
+
+
+def _explained_otherwise(
+    network: Network,
+    estimate: Estimate,
+    own_network: Network,
+    own_estimate: Estimate,
+    accepted: BoolArray,
+    kept: BoolArray,
+) -> bool:
+    """Return whether another cause makes the image points likelier than cameras of some photographs.
+
+    Args:
+        network: all image points.
+        estimate: adjusted.
+        own_network: the same where some photographs have a camera by themselves.
+        own_estimate: its start values.
+        accepted: image points that the adjustment accepted, (k,).
+        kept: photographs that are not left out, (m,).
+    """
+    seen, images, points = network.image_points, kept & estimate.oriented, estimate.determined
+    rows = images[seen.image] & points[seen.point]
+    theirs = network.camera != own_network.camera
+    start = ~accepted[rows]
+    found = [
+        adjust_image_points(
+            *reduce_network(one, values, images, points, rows), rejected, np.ones(int(rows.sum()))
+        )
+        for one, values, rejected in (
+            (network, estimate, start),
+            (own_network, own_estimate, start & ~theirs[seen.image[rows]]),
+        )
+    ]
+    plain, own = found
+    other = None if plain is None else best_explanation(plain)
+    if plain is None or other is None or other.alternative.kind == "other_camera":
+        return False  # which photographs they are is seen best by what was rejected
+    if own is None:
+        return True
+    camera_of_row = own.network.camera[own.network.image_points.image]
+    search = float(np.log(len(OWN) * len(network.images)))
+    freed, price = 0, 0.0
+    for index in np.unique(camera_of_row[camera_of_row >= len(estimate.cameras)]).tolist():
+        q = sum(not group for group in own_estimate.cameras[index].shared)
+        freed += q
+        price += price_of(q, int((camera_of_row == index).sum()), search)
+    gained = log_likelihood(own, freed) - log_likelihood(plain) - price
+    return other.evidence > gained
 
 
 def _own_camera(
