@@ -34,6 +34,7 @@ from sfm.runtime.cores import cores
 from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family
+from sfm.targets.codes.tags import tag_family, tag_modules
 from sfm.targets.detect import find_targets
 
 IMAGES, POINTS = 8, 40
@@ -52,6 +53,9 @@ def compile_targets() -> None:
     for bright in (False, True):
         for codes in ("ring14", "arcs", "apriltag36h11"):
             find_targets(drawn_photograph(bright), polarity="auto", codes=codes)
+    black = np.pad(tag_modules(tag_family("apriltag36h11"), 3), 2)
+    tag = np.where(np.kron(black, np.ones((12, 12))), 40, 200).astype(np.uint8)
+    find_targets(tag, polarity="auto", codes="apriltag36h11")
 
 
 def compile_orientation() -> None:

@@ -66,6 +66,7 @@ class Outcome:
     named: tuple[str, ...]  # causes, in the order of the verdict, notes included
     first: str  # kind of the first remark that is no note
     unchecked: bool = False  # whether it says that an assumption is hardly checked
+    as_well: tuple[str, ...] = ()  # causes that it says cannot be told apart from those that are named
 
     @property
     def is_wrong(self) -> bool:
@@ -76,6 +77,12 @@ class Outcome:
     def is_right_cause(self) -> bool:
         """Whether the first cause named is the one that was planted."""
         return bool(self.named) and _class(self.named[0]) == _class(self.cause)
+
+    @property
+    def is_false(self) -> bool:
+        """Whether a cause is named and the planted one neither first nor as one that cannot be told apart."""
+        classes = {_class(kind) for kind in self.as_well}
+        return bool(self.named) and not self.is_right_cause and _class(self.cause) not in classes
 
 
 def _class(kind: str) -> str:
@@ -99,6 +106,7 @@ def outcome_of(kind: str, number: int) -> Outcome:
         *(kind, number, one.cause, verdict.level, _over_sigma(result, one), _is_detectable(one)),
         *(named, serious[0] if serious else ""),
         any(remark.kind in UNCHECKED for remark in verdict.remarks),
+        tuple(kind for one in verdict.remarks if one.kind in CAUSES for kind in one.names("instead")),
     )
 
 
@@ -153,7 +161,7 @@ def _row(some: list[Outcome]) -> str:
     untold = sum(not one.named and not one.first for one in seen)
     others = [one for one in wrong if not one.is_right_cause]
     said = sum(one.unchecked or bool(one.first) for one in others)
-    false = sum(bool(one.named) and not one.is_right_cause for one in some)
+    false = sum(one.is_false for one in some)
     counts = " ".join(f"{levels[level]:3}" for level in ("bad", "fair", "good", "none"))
     believed = sum(one.is_wrong and one.level == "good" for one in some)
     return (
@@ -165,14 +173,13 @@ def _row(some: list[Outcome]) -> str:
 
 def _conspicuous(one: Outcome) -> str:
     """Return a line on a survey that is not judged as it should be; empty where it is."""
-    false = bool(one.named) and not one.is_right_cause
     missed = one.is_wrong and one.cause and one.detectable and not one.is_right_cause
     bad = not one.cause and one.level in ("bad", "none")
-    if not (false or missed or bad or (one.is_wrong and one.level == "good")):
+    if not (one.is_false or missed or bad or (one.is_wrong and one.level == "good")):
         return ""
     return (
-        f"{one.number}: {one.level}, {one.over_sigma:.1f} sigma, {one.named}, first {one.first}, "
-        f"unchecked {one.unchecked}"
+        f"{one.number}: {one.level}, {one.over_sigma:.1f} sigma, {one.named}, or {one.as_well}, "
+        f"first {one.first}, unchecked {one.unchecked}"
     )
 
 

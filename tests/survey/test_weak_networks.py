@@ -24,13 +24,6 @@ def test_a_second_solution_of_equal_cost_makes_the_survey_bad() -> None:
     assert "other_solution" in found.kinds
 
 
-def test_c_that_had_to_be_held_is_tried_at_other_values() -> None:
-    """A plane from within 14 degrees, c 88 % too long and held: 5.7 sigma wrong and called fair."""
-    found = outcome_of(309)
-    assert found.over_sigma > 5 and found.level == "bad"
-    assert "other_solution" in found.kinds
-
-
 def test_two_photographs_of_a_plane_are_bad() -> None:
     """12 sigma wrong and called fair: two orientations fit alike."""
     found = outcome_of(59)
@@ -51,9 +44,10 @@ def test_a_pair_from_a_grazing_angle_is_no_other_solution() -> None:
 
 
 def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
-    """A plane, c 23 % too short and held there: 5.4 sigma wrong and called fair, with sigma0 1.9 times."""
-    found = outcome_of(141)
+    """A plane, c 49 % too short and held there, where other values have 0.0004 times its v'Pv: bad."""
+    found = outcome_of(0)
     assert found.over_sigma < 2 and found.c == pytest.approx(1, abs=0.01)
+    assert "better_solution_taken" in found.kinds and "held_to_converge" not in found.kinds
 
 
 @pytest.mark.parametrize(
@@ -78,6 +72,10 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
         87,  # c 163 % too long and held there, with solutions of 0.02 times its v'Pv: bad
         # c 30 % too short and held: 7.2 sigma wrong, fair; damped steps crept along the valley
         pytest.param(378, marks=pytest.mark.slow),
+        # c 88 % too long and held: 5.7 sigma wrong, fair
+        pytest.param(309, marks=pytest.mark.slow),
+        # c 23 % too short and held: 5.4 sigma wrong, fair, with sigma0 1.9 times
+        pytest.param(141, marks=pytest.mark.slow),
     ],
 )
 def test_bent_valleys_are_followed_to_their_lowest_point(number: int) -> None:

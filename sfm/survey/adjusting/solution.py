@@ -329,7 +329,7 @@ def _solved(start: _Prepared) -> _Solved:
         better = (_better_taken(final, others[0]),)
         estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
     own = () if treated is None else treated.remarks
-    held = first_held if settled.held == () else settled.held
+    held = settled.held or (() if first is not None else first_held)
     return _Solved(
         replace(final, iterations=iterations + final.iterations, start_sigma0=start_sigma0),
         settled,
