@@ -62,8 +62,10 @@ def test_a_gain_is_that_of_determined_parameters() -> None:
     assert (found.value, found.rank) == (pytest.approx(1.0 + 4.5), 2)
     np.testing.assert_allclose(found.beta, [-0.5, -1.5])
     # of a column photographs, cameras and points take all but 1e-5 of the squares
-    assert gain_of(np.array([[1.5e-5]]), np.ones(1), np.ones(1)).rank == 1
-    assert gain_of(np.array([[0.7e-5]]), np.ones(1), np.ones(1)).rank == 0
+    assert gain_of(np.diag([1.0, 1.5e-5]), np.ones(2), np.ones(2)).rank == 2
+    assert gain_of(np.diag([1.0, 0.7e-5]), np.ones(2), np.ones(2)).rank == 1
+    assert gain_of(np.array([[2e-8]]), np.ones(1), np.ones(1)).rank == 1
+    assert gain_of(np.array([[1e-8]]), np.ones(1), np.ones(1)).rank == 0
     none = gain_of(np.zeros((1, 1)), np.zeros(1), np.zeros(1))
     assert (none.value, none.rank, none.beta.tolist()) == (0.0, 0, [0.0])
 
