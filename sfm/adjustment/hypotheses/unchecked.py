@@ -25,7 +25,7 @@ from sfm.adjustment.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
-from sfm.adjustment.hypotheses.score import Gain, Reduced, directions_of, least_share, reduce_adjustment
+from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, directions_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
@@ -99,12 +99,11 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     D = reduced.whiten(one.columns(a, columns))
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
-    share = least_share(len(values))
-    rank = max(int((values > share).sum()), 1)
+    rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, ROWS)
     least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
-    longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, share))
+    longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)
