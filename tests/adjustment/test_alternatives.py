@@ -26,6 +26,7 @@ from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
     gain_of,
+    least_share,
     log_f_sf,
     log_likelihood_gain,
     log_probability,
@@ -64,8 +65,9 @@ def test_a_gain_is_that_of_determined_parameters() -> None:
     # of a column photographs, cameras and points take all but 1e-5 of the squares
     assert gain_of(np.diag([1.0, 1.5e-5]), np.ones(2), np.ones(2)).rank == 2
     assert gain_of(np.diag([1.0, 0.7e-5]), np.ones(2), np.ones(2)).rank == 1
-    assert gain_of(np.array([[2e-8]]), np.ones(1), np.ones(1)).rank == 1
-    assert gain_of(np.array([[1e-8]]), np.ones(1), np.ones(1)).rank == 0
+    assert gain_of(np.array([[2e-8]]), np.ones(1), np.ones(1), least_share(1)).rank == 1
+    assert gain_of(np.array([[1e-8]]), np.ones(1), np.ones(1), least_share(1)).rank == 0
+    assert least_share(2) == 1e-5
     none = gain_of(np.zeros((1, 1)), np.zeros(1), np.zeros(1))
     assert (none.value, none.rank, none.beta.tolist()) == (0.0, 0, [0.0])
 
@@ -291,7 +293,8 @@ def test_every_alternative_has_the_gain_of_its_columns(dense: Dense) -> None:
     }  # fmt: skip
     for one in every:
         H, g, squares = dense.normals(dense.reduced.whiten(one.columns(dense.a, dense.columns)))
-        right = gain_of(H, g, squares)
+        single = isinstance(one.family, families.InteriorFamily)
+        right = gain_of(H, g, squares, least_share(len(H)) if single else least_share(2))
         assert one.gain.rank == right.rank, one.family.name
         assert one.gain.value == pytest.approx(right.value, rel=1e-5), (one.family.name, one.pattern)
 

@@ -35,6 +35,7 @@ from sfm.adjustment.hypotheses.score import (
     Reduced,
     gain_of,
     gains_of,
+    least_share,
     log_f_sf,
     log_likelihood_gain,
     log_probability,
@@ -178,7 +179,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
         ]:
             own = D[:, :, columns]
             H, g, squares = reduced.project(own)
-            gain = gain_of(H, g, squares)
+            gain = gain_of(H, g, squares, least_share(len(H)))
             if gain.rank:
                 # what the photographs say of it once it, or all of the camera, are free
                 variance = float(gain.beta @ H @ gain.beta)

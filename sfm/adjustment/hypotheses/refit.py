@@ -14,7 +14,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import Alternative
-from sfm.adjustment.hypotheses.score import gain_of, reduce_adjustment
+from sfm.adjustment.hypotheses.score import gain_of, least_share, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
@@ -68,7 +68,7 @@ def refit(
             reduced = reduce_adjustment(current, columns)
         except np.linalg.LinAlgError:
             return None
-        gain = gain_of(*reduced.project(reduced.whiten(D)))
+        gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
         if gain.value < SETTLED or number == ROUNDS - 1:
             break
         step = gain.beta

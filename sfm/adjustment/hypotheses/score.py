@@ -299,10 +299,17 @@ def least_share(columns: int) -> float:
     return DETERMINED if columns > 1 else ROUNDING
 
 
-def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> Gain:
-    """Return the gain of columns with normal equations H, g and squares before the elimination."""
+def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = DETERMINED) -> Gain:
+    """Return the gain of columns with normal equations H, g and squares before the elimination.
+
+    Args:
+        H: normal equations, (q, q).
+        g: right sides, (q,).
+        squares: of the columns before the elimination, (q,).
+        least: share of their squares above which directions count as determined.
+    """
     values, vectors, scale = directions_of(H, squares)
-    good = values > least_share(values.shape[-1])
+    good = values > least
     projected = vectors[:, good].T @ (scale * g)
     beta = -scale * (vectors[:, good] @ (projected / values[good]))
     return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
@@ -317,7 +324,7 @@ def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatAr
         squares: of the columns before the elimination, (n, q).
     """
     values, vectors, scale = directions_of(H, squares)
-    good = values > least_share(values.shape[-1])
+    good = values > DETERMINED
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
     gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
     return np.asarray(gains), np.asarray(good.sum(axis=1))
