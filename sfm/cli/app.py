@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import platform
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
 
@@ -33,9 +35,21 @@ app = typer.Typer(
 )
 
 
+def _show_version(wanted: bool) -> None:
+    """Print the versions that a report of a fault needs, and end."""
+    if wanted:
+        print(f"kolinear {version('kolinear')}, Python {platform.python_version()}, {platform.platform()}")
+        raise typer.Exit
+
+
 @app.callback()
-def _commands() -> None:
-    """Keep `kolinear` a command with subcommands."""
+def _commands(
+    version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version and exit."),
+    ] = False,
+) -> None:
+    """Take the options that stand before a command."""
 
 
 for _command in (

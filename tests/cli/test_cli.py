@@ -10,11 +10,13 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from sfm import cli
 from sfm.cli import app
@@ -281,7 +283,7 @@ def test_wrong_survey_files(
 
 
 def test_no_survey_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "none.toml: a survey file cannot be read" in refused(monkeypatch, capsys, "run", "none.toml")
+    assert "none.toml: neither a survey file nor a folder" in refused(monkeypatch, capsys, "run", "none.toml")
 
 
 def test_run_and_adjust_know_their_surveys(
@@ -406,6 +408,11 @@ def test_adjust_runs_on_the_tables_of_a_result(
     second = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     c = [text["cameras"][0]["parameters"]["c"] for text in (first, second)]
     assert abs(c[0]["value"] - c[1]["value"]) < 3 * c[0]["sigma"]
+
+
+def test_the_version_is_printed() -> None:
+    found = CliRunner().invoke(app.app, ["--version"])
+    assert found.exit_code == 0 and found.output.startswith(f"kolinear {version('kolinear')}, Python 3.")
 
 
 def test_help_explains_every_command_and_option() -> None:

@@ -107,6 +107,8 @@ def run(
     Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
     why; 2 where a person must put something right.
     """
+    if not survey_file.exists():
+        raise KolinearError(f"{survey_file}: neither a survey file nor a folder of photographs is there")
     if survey_file.is_dir():
         if images is not None:
             raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
