@@ -14,6 +14,24 @@ MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger 
 MAX_SAID = 200  # characters of what the parser says
 MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
 
+# What people write in place of TOML: what the line looks like, and what to write.
+SLIPS = (
+    (re.compile(r"=\s*[-+]?\d+,\d+\s*(?:#.*)?$"), "a number has a decimal point, not a comma"),
+    (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text stands between straight quotation marks, \" or '"),
+    (
+        re.compile(r'"[^"\n]*\\[^"\n]*"'),
+        "write / in a path, or put it between single quotation marks",
+    ),
+    (re.compile(r"=\s*(?:True|False|yes|no|on|off)\b", re.IGNORECASE), "write true or false"),
+    (
+        re.compile(r"^\s*\[{1,2}[^\]]*$|^\s*\[\[[^\]]*\][^\]]*$"),
+        "a section stands in [ ] or [[ ]]",
+    ),
+    (re.compile(r"=\s*(?:#.*)?$"), "no value follows the ="),
+    (re.compile(r"=\s*[^\W\d][^\"']*$"), "text stands between quotation marks"),
+    (re.compile(r"^[^=\[#]+$"), "neither a section in [ ] nor a key with = and its value"),
+)
+
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_KEY_PARTS}}}")
 
@@ -48,10 +66,25 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     try:
         return text, tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise SurveyFileError(f"{path}: not a TOML file: {_cut(str(error))}") from error
+        raise SurveyFileError(f"{path}{_slip(text, str(error))}") from error
     except (ValueError, RecursionError) as error:
         told = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
         raise SurveyFileError(f"{path}: not a TOML file: {told}") from error
+
+
+def _slip(text: str, message: str) -> str:
+    """Return where and what is wrong in words for people; what the parser says where it is nothing usual."""
+    found = re.search(r"\(at line (\d+), column \d+\)$", message)
+    number = int(found[1]) if found else 0
+    line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
+    if twice := re.match(r"Cannot declare \('(.{1,40}?)',?\) twice", message):
+        return f", line {number}: [{as_plain(twice[1])}] stands twice; put its keys into one section"
+    if message.startswith("Cannot overwrite a value"):
+        return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} stands twice"
+    for looks, write in SLIPS if len(line) <= MAX_SAID else ():
+        if looks.search(line):
+            return f", line {number}: {as_plain(line.strip())}: {write}"
+    return f": not a TOML file: {_cut(message)}"
 
 
 def _cut(message: str) -> str:

@@ -169,7 +169,21 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         ),
         ("c_mm = 7.3", "c_mm = 7.3\nsensor_mm = [7, 5]", r"pixel_mm and sensor_mm are both given"),
         ('[control]\nfile = "control.csv"', "", None),
-        ("[survey]", "[survey", r"not a TOML file: .*line 1"),
+        ("[survey]", "[survey", r"line 1: \[survey: a section stands in \[ \]"),
+        ("c_mm = 7.3", "c_mm = 7,3", r"line \d+: c_mm = 7,3: a number has a decimal point, not a comma"),
+        ('name = "camcal"', "name = camcal", r"line 2: name = camcal: text stands between quotation marks"),
+        (
+            'name = "camcal"',
+            "name = \u201ccamcal\u201d",
+            r"line 2: .*: text stands between straight",
+        ),
+        ('name = "camcal"', 'name = "C:\\Users\\x"', r"line 2: .*: write / in a path, or put it"),
+        ('name = "camcal"', "name = True", r"line 2: name = True: write true or false"),
+        ('name = "camcal"', "name =", r"line 2: name =: no value follows"),
+        ('name = "camcal"', "camcal", r"line 2: camcal: neither a section in \[ \] nor a key"),
+        ('name = "camcal"', 'name = "camcal"\nname = "b"', r"line 3: name stands twice"),
+        ("[control]", "[survey]", r"line \d+: \[survey\] stands twice"),
+        ('name = "camcal"', "name = [1 2]", r"not a TOML file: .*line 2"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, old: str, new: str, match: str | None) -> None:
