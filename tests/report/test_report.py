@@ -33,7 +33,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
 from sfm.report.html.page import environment
 from sfm.report.html.report_page import report_page
-from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
+from sfm.report.numbers import finer_unit, probability, significant, to_precision, with_exponent
 from sfm.report.output import WRITTEN, write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
@@ -97,6 +97,12 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_small_probabilities_are_written_as_such() -> None:
+    assert [probability(p) for p in (0.0, 0.00099, 0.0012, 0.25)] == [
+        *("p < 0.001", "p < 0.001", "p = 0.001", "p = 0.250")
+    ]
 
 
 def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> None:
