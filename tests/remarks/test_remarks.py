@@ -99,7 +99,7 @@ LIMITS = {  # by kind: the number, and from where it is a warning and an error
     "other_solution_reversed": ("moved", 0.0, 5.0),
     "photographs_missing": ("share", 0.0, 0.5),
     "c_far_from_given": ("share", 5e-4, None),
-    "c_hardly_determined": ("share", 0.05, None),
+    "c_hardly_determined": ("share", 0.05, 1.0),
     "principal_point_far": ("share", 0.1, None),
     "key_points_not_measured": ("missing", 0.5, None),
     "targets_blurred": ("blur", 2.5, None),

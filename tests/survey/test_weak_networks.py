@@ -84,6 +84,11 @@ def test_bent_valleys_are_followed_to_their_lowest_point(number: int) -> None:
     assert "c_held_contradicted" not in found.kinds
 
 
+def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:
+    """The same place along it was tried again for ever."""
+    assert outcome_of(918).over_sigma < 2
+
+
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
     cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0, rms=2.0)
     (found,) = contradicted(("A",), (cause,))

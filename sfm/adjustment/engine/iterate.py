@@ -158,8 +158,9 @@ def iterate(
                 state = first  # the damped steps have led where nothing can be solved
                 continue
             start, tried = before
+            whole = share == 1.0
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
-            if better is not None and better[1] < BENT:
+            if whole and better is not None and better[1] < BENT:
                 better = _along_valley(problem, start, weight, tried, better[1]) or better
             if better is None:  # no share of the last step leads where they can be solved
                 state, found = start, _solve(problem, start, weight)
