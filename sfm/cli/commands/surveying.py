@@ -107,8 +107,6 @@ def run(
     Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
     why; 2 where a person must put something right.
     """
-    if not survey_file.exists():
-        raise KolinearError(f"{survey_file}: neither a survey file nor a folder of photographs is there")
     if survey_file.is_dir():
         if images is not None:
             raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
@@ -196,6 +194,8 @@ def _run_survey(
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
 
+    if not survey_file.exists():
+        raise KolinearError(f"{survey_file}: neither a survey file nor a folder of photographs is there")
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
     if from_photographs is None:  # whichever it is
