@@ -10,9 +10,7 @@ SIGMA0 = Grade("ratio", warning=2.0, error=5.0)
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL = Grade("over_sigma", warning=10.0, error=30.0)
 REJECTED = Grade("share", warning=0.05)  # of the image points; gross errors are one in a hundred
-SOLUTION = Grade(
-    "moved", error=WRONG_SIGMAS
-)  # standard deviations: the result is wrong if it is the true one
+SOLUTION = Grade("moved", error=WRONG_SIGMAS)  # the result is wrong if the other solution is the true one
 
 ROWS = (
     Kind(
