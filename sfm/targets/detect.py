@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
+from sfm.kernels.sampling import as_grey
 from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
 from sfm.targets.codes.families import TargetFamily, code_family
 from sfm.targets.codes.plates import PlateFamily, find_crossings, name_dots
@@ -133,6 +134,7 @@ def find_targets(
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
+    grey = as_grey(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
     fit = fit_ellipse_model(
@@ -149,7 +151,7 @@ def find_targets(
     good = reason == 0
     if isinstance(family, CodeFamily) and good.any():
         code[good], confidence[good] = read_codes(
-            photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
+            grey, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
         )
         reason[good & find_parts_of_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
     if isinstance(family, PlateFamily):
@@ -157,11 +159,11 @@ def find_targets(
         confidence[code >= 0] = 1.0
         reason[good & (code < 0)] = Flag.NOT_ON_PLATE.value
     free = np.flatnonzero((reason == 0) & (code < 0))
-    counter = find_counters(photograph, fit.xy[free], fit.shape[free], levels[free])
+    counter = find_counters(grey, fit.xy[free], fit.shape[free], levels[free])
     reason[free[counter]] = Flag.THIN_BACKGROUND.value
     xy, covariance = fit.xy, fit.covariance
     if centres != "model":
-        xy, covariance = _measure_centres(photograph, fit, outlines.sign, noise, centres)
+        xy, covariance = _measure_centres(grey, fit, outlines.sign, noise, centres)
         reason[(reason == 0) & np.isnan(xy[:, 0])] = Flag.NO_CONVERGENCE.value
     keep = np.flatnonzero(reason == 0)
     keep = keep[np.lexsort((xy[keep, 0], xy[keep, 1]))]
@@ -201,13 +203,13 @@ def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFam
 
 
 def _measure_centres(
-    photograph: AnyArray, fit: EllipseFit, sign: IntArray, noise: float, centres: str
+    grey: AnyArray, fit: EllipseFit, sign: IntArray, noise: float, centres: str
 ) -> tuple[FloatArray, FloatArray]:
     """Return centres, px, (k, 2), and their covariance, (k, 2, 2), measured another way about a fit."""
     if centres == "edges":
-        edges = measure_edge_ellipses(photograph, fit.xy, fit.shape, sign, noise=noise)
+        edges = measure_edge_ellipses(grey, fit.xy, fit.shape, sign, noise=noise)
         return edges.xy, edges.covariance
-    return measure_centroids(photograph, fit.xy, fit.shape, sign, noise=noise, weights=centres)
+    return measure_centroids(grey, fit.xy, fit.shape, sign, noise=noise, weights=centres)
 
 
 def _with_crossings(targets: Targets, found: Saddles, code: IntArray) -> Targets:

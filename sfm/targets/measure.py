@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.sampling import as_grey
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
 from sfm.targets.fits.undamaged import fit_undamaged
@@ -80,7 +81,7 @@ def fit_ellipse_model(
     """Fit the model of a blurred ellipse to every target, starting from roughly known outlines.
 
     Args:
-        photograph: intensities, shape (H, W), uint8 or uint16 or float.
+        photograph: intensities, shape (H, W), uint8 or uint16 or float32.
         xy: approximate centres, px, shape (k, 2).
         shape: approximate (p, q, r) of S, 1/px, shape (k, 3).
         sign: +1 for a target brighter than its surroundings, -1 for a darker one, shape (k,).
@@ -100,7 +101,12 @@ def fit_ellipse_model(
     start = np.column_stack([np.asarray(xy, float).reshape(k, 2), np.asarray(shape, float).reshape(k, 3)])
     least_variance = QUANTISATION if integers else 0.0
     fits, variance, outlines = fit_undamaged(
-        photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation), least_variance
+        as_grey(photograph),
+        start,
+        np.asarray(sign, np.int64),
+        float(noise),
+        float(saturation),
+        least_variance,
     )
     theta, cofactor, statistics, flag = fits[:4]
     found = statistics.T

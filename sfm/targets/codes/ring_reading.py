@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
-from sfm.kernels.sampling import bilinear
+from sfm.kernels.sampling import as_grey, bilinear
 from sfm.targets.codes.ring_cells import fit_cells
 from sfm.targets.codes.rings import CodeFamily, smallest_rotation
 
@@ -70,7 +70,8 @@ def read_codes(
         no valid code, shape (k,); confidence of the reading, 0 to 1, shape (k,).
     """
     radii = family.inner + RADII * (family.outer - family.inner)
-    polar = _sample_rings(photograph, xy, shape, levels, radii, ANGLES)
+    grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
+    polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
     if family.cells == 0:
         return _read_arcs(polar)
     code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
@@ -80,7 +81,7 @@ def read_codes(
     ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
     blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
     geometry = xy[ring], shape[ring], levels[ring], blur[ring]
-    cells = fit_cells(photograph, *geometry, family.cells, family.inner, family.outer)
+    cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer)
     for k, found in zip(ring, cells, strict=True):
         code[k], confidence[k] = _read_cells(found, family)
     return code, confidence

@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.flags import Flag
 
@@ -168,12 +169,12 @@ def _fitted(
     photograph: AnyArray, quads: FloatArray, number: IntArray, family: TagFamily, scale: float
 ) -> CornerFits:
     """Fit the corners of tags twice, the second time with their codes where the first corners place them."""
-    m = family.modules
-    clear = np.array([~tag_modules(family, int(one)) for one in number]).reshape(-1, m, m)
+    m, grey = family.modules, as_grey(photograph)
+    clear = np.array([~tag_modules(family, int(one)) for one in number], dtype=bool).reshape(-1, m, m)
     square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
     for _ in range(2):
         H = [cv2.getPerspectiveTransform(quad.astype(np.float32), square) for quad in quads]
-        fits = fit_corners(photograph, quads, np.array(H, dtype=float).reshape(-1, 3, 3), clear, scale)
+        fits = fit_corners(grey, quads, np.array(H, dtype=float).reshape(-1, 3, 3), clear, scale)
         found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
         quads = np.where(found[..., None], fits.theta[..., :2], quads)
     return fits

@@ -10,6 +10,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import KolinearError
 from sfm.kernels.options import compiled
+from sfm.kernels.sampling import as_grey
 
 WEIGHTS = ("binary", "intensity", "squared")
 # The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
@@ -62,7 +63,9 @@ def measure_centroids(
     if weights not in WEIGHTS:
         raise KolinearError(f"weights {weights!r}, expected one of {', '.join(WEIGHTS)}")
     outline = np.column_stack([np.asarray(xy, float).reshape(-1, 2), np.asarray(shape, float).reshape(-1, 3)])
-    result = _centroids(photograph, outline, np.asarray(sign, np.int64), float(noise), WEIGHTS.index(weights))
+    result = _centroids(
+        as_grey(photograph), outline, np.asarray(sign, np.int64), float(noise), WEIGHTS.index(weights)
+    )
     return Centroids(result[:, :2], result[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
+from sfm.kernels.sampling import as_grey
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 
 # The edges are traced from the ellipse found last; three times do from a start that is half a radius off.
@@ -52,7 +53,7 @@ def measure_edge_ellipses(
     Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2014), sec. 5.4.2.5, star operator.
     """
     outline = np.column_stack([np.asarray(xy, float).reshape(-1, 2), np.asarray(shape, float).reshape(-1, 3)])
-    theta, residual = _fit_edges(photograph, outline, np.asarray(sign, np.int64), float(noise))
+    theta, residual = _fit_edges(as_grey(photograph), outline, np.asarray(sign, np.int64), float(noise))
     used = np.isfinite(residual).sum(axis=1)
     v = np.nan_to_num(residual)
     squares = (v**2).sum(axis=1)
