@@ -60,9 +60,9 @@ def _begin() -> None:
 def _run() -> None:
     """Run the command that the arguments name."""
     with loading():
-        from sfm.cli.app import USAGE_ERROR, app
+        from sfm.cli.app import USAGE_ERROR, commands
     try:
-        code = app(prog_name="kolinear", standalone_mode=False)
+        code = commands()(prog_name="kolinear", standalone_mode=False)
     except USAGE_ERROR as error:
         if not sys.argv[1:]:  # which asks for the help, and is no mistake
             error.show()

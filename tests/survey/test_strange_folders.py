@@ -311,7 +311,7 @@ def test_no_process_looks_for_libraries_in_the_current_folder(
         "import os, sfm.cli.app; from sfm.cli import main\n"
         "def app(**_):\n"
         "    import cv2; print(os.environ['LD_LIBRARY_PATH'])\n"
-        "sfm.cli.app.app = app\n"
+        "sfm.cli.app.commands = lambda: app\n"
         "main(); print(os.environ.get('LD_LIBRARY_PATH'))"
     )
     environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
@@ -339,7 +339,7 @@ def test_no_process_imports_modules_of_the_current_folder(tmp_path: Path) -> Non
         "    one = get_context('spawn').Process(target=begin)\n"
         "    one.start(); one.join()\n"
         "if __name__ == '__main__':\n"
-        "    sfm.cli.app.app = app\n"
+        "    sfm.cli.app.commands = lambda: app\n"
         "    sfm.cli.main()\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
