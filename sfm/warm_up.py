@@ -19,17 +19,25 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.common_problem import common_problem
-from sfm.conventions import AnyArray
+from sfm.conventions import AnyArray, rotation_from_angles
+from sfm.geometry.mesh import Mesh
 from sfm.kernels.sampling import resample
 from sfm.kernels.warmed import set_warm
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import METHODS
+from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.feature_tracks import link_features
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
+from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
+from sfm.orientation.resection.zeng_wang import resect_zeng_wang
+from sfm.planning.design.gain import gains
+from sfm.planning.sight.occlusion import box_tree, hidden_points
+from sfm.rendering.render import render_photographs
+from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring
 from sfm.runtime.cores import cores
 from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
@@ -70,6 +78,9 @@ def compile_orientation() -> None:
         tolerance_px=1.0,
         diameters_px=[np.full(int((seen.image == i).sum()), 10.0) for i in range(IMAGES)],
     )
+    corners, above = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.3, 0.3, 3.0])
+    for method in (resect_zeng_wang, resect_fischler_bolles):
+        method((corners - above)[:, :2] / above[2], corners)
 
 
 def compile_adjustment() -> None:
@@ -97,9 +108,30 @@ def compile_matching() -> None:
     texture = np.kron(cells, np.ones((5, 5), dtype=np.uint8))
     parts = [np.ascontiguousarray(texture[:, shift : shift + 240]) for shift in (0, 20, 40)]
     link_features([natural_points(part) for part in parts])
+    network, _ = made_up_network()
+    points_apart(network.image_points, np.ones(IMAGES * POINTS, dtype=bool), 21.0, n_points=POINTS)
 
 
-PARTS = (compile_orientation, compile_targets, compile_adjustment, compile_matching)  # the longest first
+def compile_planning() -> None:
+    """Render a photograph of a coded target, and see which points a triangle hides, as plans do."""
+    face = Faces(np.zeros((1, 3)), np.eye(3)[None, :2], np.ones((1, 2)), *np.array([[0.8], [0.0], [1.0]]))
+    ring = coded_ring(0, np.zeros(2), 0.1, 20, ring_family("ring14"), 0.1)
+    target = CircularTargets(np.zeros(1, dtype=np.int64), np.zeros((1, 2)), np.full(1, 0.1), np.full(1, 20))
+    camera = camera_from_values("camera", "brown", (60, 50), (0.1, 0.1), c_mm=C_MM)
+    above, down = np.array([[0.0, 0.0, DISTANCE]]), rotation_from_angles(0.0, 0.0, 0.0)[None]
+    render_photographs(Scene(face, ring, target), camera, above, down, optics=Optics(), seed=1, threads=1)
+    triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    hidden_points(box_tree(triangle), above[0], np.zeros((1, 3)))
+    gains(np.eye(3)[None], np.ones((1, 1, 2, 3)), np.ones(1), np.ones(1, dtype=bool))
+
+
+PARTS = (  # the longest first
+    compile_orientation,
+    compile_targets,
+    compile_adjustment,
+    compile_matching,
+    compile_planning,
+)
 
 
 def main(progress: Progress = SILENT) -> None:

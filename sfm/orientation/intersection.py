@@ -79,7 +79,7 @@ def intersect(
         np.ascontiguousarray(image, dtype=np.int64),
         np.ascontiguousarray(positions, dtype=float),
         np.ascontiguousarray(rotations, dtype=float),
-        np.array(P, dtype=float),  # that kernels may write to, as they are compiled for
+        np.array(P, dtype=float, order="C"),  # that kernels may write to, as they are compiled for
     )
     limit, cos_limit = tolerance * tolerance, float(np.cos(np.radians(min_angle_deg)))
     cost = _intersect_all(rays, ray, start, limit, cos_limit, xyz, Q, count, angle, residuals, used)

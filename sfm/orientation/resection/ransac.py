@@ -25,8 +25,10 @@ from sfm.orientation.resection.least_squares import (
 SAMPLE = 3  # points of a trial
 MARGIN_SD = 3  # standard deviations of the number of trials that are added to its expectation
 MAX_TRIALS = 20_000
-LOCAL_STEPS = 4  # Gauss-Newton steps of the local improvement of a candidate
-FINAL_STEPS = 30
+LOCAL, FINAL = 0, 1
+# Gauss-Newton steps of the local improvement of a candidate and of the final one; not plain numbers, for
+# each of which `adjust_pose` would be compiled
+STEPS = np.array([4, 30])
 ROUNDS = 10  # of least squares and new choice of the fitting points
 CHANCE = 0.5  # poses that random points may be expected to support
 FEW_POINTS = 8  # up to here every triple is tried and every candidate improved
@@ -229,7 +231,7 @@ def _search(
                 elif select(tangents, points, try_X0, try_R, limit, used) < SAMPLE + 1:
                     break
                 adjust_pose(
-                    tangents, points, weights, used, try_X0, try_R, LOCAL_STEPS, history, N, residuals
+                    tangents, points, weights, used, try_X0, try_R, STEPS[LOCAL], history, N, residuals
                 )
                 new = truncated_squares(tangents, points, try_X0, try_R, limit, np.inf)
                 if new >= score:
@@ -253,7 +255,7 @@ def _search(
             break
         try_X0[:], try_R[:] = X0, R
         _, _, end = adjust_pose(
-            tangents, points, weights, used, try_X0, try_R, FINAL_STEPS, history, N, residuals
+            tangents, points, weights, used, try_X0, try_R, STEPS[FINAL], history, N, residuals
         )
         score = truncated_squares(tangents, points, try_X0, try_R, limit, np.inf)
         if (end != DONE and end != LIMIT) or score > best * (1.0 + 1e-12):
