@@ -14,6 +14,7 @@ Source: Foerstner and Wrobel (2016), sec. 4.5 and 15.2.5; Luhmann et al. (2020),
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
@@ -25,6 +26,7 @@ from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
 from sfm.adjustment.engine.products import times_reduced
+from sfm.adjustment.engine.solvers import memory
 from sfm.adjustment.engine.solvers.full_rows import (
     HALVED,
     multiply_rows,
@@ -34,7 +36,6 @@ from sfm.adjustment.engine.solvers.full_rows import (
     subtract_square,
     times_triangle,
 )
-from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares, times_inverse
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -73,6 +74,11 @@ class DenseSolver:
         # S, a product and rows; or factor, its inverse, their product, and of either half rows and products
         return BYTES * max(2 * matrix + rows, 3 * matrix + 4 * half)
 
+    @cached_property
+    def limit(self) -> float:
+        """Memory that may be taken, bytes, asked for once in an adjustment: files say it."""
+        return memory.available_bytes()
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> DenseFactor | None:
@@ -81,7 +87,9 @@ class DenseSolver:
         Raises:
             GeometryError: the matrix would not fit in memory.
         """
-        refuse_what_does_not_fit(self.bytes, f"{self.layout.reduced} unknowns that are all connected")
+        memory.refuse_what_does_not_fit(
+            self.bytes, f"{self.layout.reduced} unknowns that are all connected", limit=self.limit
+        )
         scale = equations.parts.scale
         S = schur_complement(equations, self.layout, self.pairs, single=coarse)
         Q = motions.orthonormal(scale)

@@ -26,17 +26,17 @@ def available_bytes() -> float:
     return SHARE * known
 
 
-def refuse_what_does_not_fit(size: float, unknowns: str) -> None:
+def refuse_what_does_not_fit(size: float, unknowns: str, *, limit: float) -> None:
     """Refuse normal equations that need more memory than there is.
 
     Args:
         size: bytes that they, their factor and its inverse take.
         unknowns: which unknowns need them, in words.
+        limit: what they may take, bytes, see `available_bytes`.
 
     Raises:
-        GeometryError: it is more than `available_bytes`.
+        GeometryError: it is more than that.
     """
-    limit = available_bytes()
     if size > limit:
         raise GeometryError(
             f"adjustment: {unknowns} need {size / 1e9:.0f} GB when they are factored and inverted, at most "

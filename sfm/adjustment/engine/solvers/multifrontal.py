@@ -15,6 +15,7 @@ Wrobel (2016), sec. 15.2.4 and 4.5.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,9 +26,9 @@ from scipy.linalg.lapack import dpotrf
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
+from sfm.adjustment.engine.solvers import memory
 from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
-from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
 from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined, search_bytes
 from sfm.adjustment.engine.solvers.pairs import subtract_border
@@ -63,6 +64,11 @@ class MultifrontalSolver:
         layout = self.layout
         return self.fronts.bytes(layout.reduced - layout.exterior_free.size, search_bytes(layout))
 
+    @cached_property
+    def limit(self) -> float:
+        """Memory that may be taken, bytes, asked for once in an adjustment: files say it."""
+        return memory.available_bytes()
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> MultifrontalFactor | None:
@@ -71,7 +77,9 @@ class MultifrontalSolver:
         Raises:
             GeometryError: the factor would not fit in memory.
         """
-        refuse_what_does_not_fit(self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs")
+        memory.refuse_what_does_not_fit(
+            self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs", limit=self.limit
+        )
         scale = equations.parts.scale
         Q = motions.orthonormal(scale)
         holds = _largest(Q)
