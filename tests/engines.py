@@ -16,6 +16,14 @@ from sfm.runtime.in_process import InProcess
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import OtherPrograms
 
+# The command line in a process that draws no plots, which take as long as a survey, for tests that see none
+PLOTLESS = (
+    "import sys; sys.argv[0] = 'kolinear'\n"
+    "from contextlib import nullcontext\n"
+    "import sfm.report.figures.plot_process as drawing\n"
+    "drawing.draw_plots, drawing.plot_process = (lambda _: ()), (lambda _: nullcontext())\n"
+    "from sfm.cli import main; main()"
+)
 KILLER = "killer"  # a survey of this name kills whoever works on it
 
 

@@ -24,6 +24,7 @@ from sfm.cli.commands import starting
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
 from sfm.report.output import write_result
+from tests.engines import PLOTLESS
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
 
@@ -437,7 +438,7 @@ def test_a_name_that_the_terminal_cannot_show_is_no_fault(tmp_path: Path) -> Non
     survey = write_observed_survey(tmp_path / "s", "\u6e2c\u91cf")
     out = tmp_path / "\u6e2c"
     run = subprocess.run(
-        [sys.executable, "-c", "from sfm.cli import main; main()", "adjust", str(survey), "--out", str(out)],
+        [sys.executable, "-c", PLOTLESS, "adjust", str(survey), "--out", str(out)],
         cwd=ROOT,
         env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
         capture_output=True,

@@ -19,7 +19,7 @@ from sfm.cli.commands import starting
 from sfm.errors import KolinearError
 from sfm.report.log import read_log
 from sfm.runtime.faults import told_of_error, working_on
-from tests.engines import ALONE, HERE, Notes
+from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
 
@@ -202,7 +202,7 @@ def without_reader(*arguments: object, stdout: bool = True, stderr: bool = False
     reader, writer = os.pipe()
     os.close(reader)
     run = subprocess.run(
-        [sys.executable, "-c", READER_GONE, *map(str, arguments)],
+        [sys.executable, "-c", PLOTLESS if arguments[0] == "adjust" else READER_GONE, *map(str, arguments)],
         cwd=ROOT,
         stdout=writer if stdout else subprocess.PIPE,
         stderr=writer if stderr else subprocess.PIPE,

@@ -28,7 +28,7 @@ from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore,
 from sfm.survey.measuring.targets import target_settings
 from sfm.targets.codes.families import code_family
 from sfm.targets.detect import Targets, find_targets
-from tests.engines import points_of
+from tests.engines import PLOTLESS, points_of
 from tests.places import ROOT
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
 
@@ -44,7 +44,7 @@ def kolinear(*arguments: object, limit: int | None = None) -> subprocess.Complet
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     return subprocess.run(
-        [*KOLINEAR, *map(str, arguments)],
+        [sys.executable, "-c", PLOTLESS, *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -154,7 +154,7 @@ def test_read_only_folder_is_one_line(tmp_path: Path) -> None:
     survey = write_observed_survey(tmp_path / "s", "s")
     out = tmp_path / "out"
     out.mkdir(mode=0o555)
-    command = [*KOLINEAR, "adjust", str(survey), "--out", str(out / "s")]
+    command = [sys.executable, "-c", PLOTLESS, "adjust", str(survey), "--out", str(out / "s")]
     if os.geteuid() == 0:  # for whom folders are writable all the same
         setpriv = shutil.which("setpriv")
         if setpriv is None:
