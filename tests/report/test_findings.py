@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.log import SurveyLog
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
+from tests import compare_results
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
 
@@ -67,28 +69,44 @@ def test_every_number_of_a_survey_is_computed_once(
     assert calls == dict.fromkeys((name for _, name in COMPUTED), 1)
 
 
+@pytest.fixture(scope="module")
+def written(result: SurveyResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written") / "out"
+    write_result(findings_of(result), folder)
+    return folder
+
+
 @pytest.fixture
-def folders(result: SurveyResult, tmp_path: Path) -> tuple[Path, Path]:
-    write_result(findings_of(result), tmp_path / "old")
-    shutil.copytree(tmp_path / "old", tmp_path / "new")
+def folders(written: Path, tmp_path: Path) -> tuple[Path, Path]:
+    for name in ("old", "new"):
+        shutil.copytree(written, tmp_path / name)
     return tmp_path / "old", tmp_path / "new"
 
 
-def compared(old: Path, new: Path, *options: str) -> tuple[int, str]:
-    done = subprocess.run(
-        [sys.executable, SCRIPT, old, new, *options], capture_output=True, text=True, check=False
-    )
-    return done.returncode, done.stdout
+Compared = Callable[..., tuple[int, str]]
 
 
-def test_a_result_written_twice_is_the_same(result: SurveyResult, folders: tuple[Path, Path]) -> None:
+@pytest.fixture
+def compared(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Compared:
+    """The script in this process, which gives its exit code and what it prints."""
+
+    def run(old: Path, new: Path, *options: str) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", [str(SCRIPT), str(old), str(new), *options])
+        return compare_results.main(), capsys.readouterr().out
+
+    return run
+
+
+def test_a_result_written_twice_is_the_same(
+    result: SurveyResult, folders: tuple[Path, Path], compared: Compared
+) -> None:
     shutil.rmtree(folders[1])
     write_result(findings_of(result), folders[1])  # the times differ
     code, told = compared(*folders)
     assert code == 0 and "the results are the same" in told, told
 
 
-def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path]) -> None:
+def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path], compared: Compared) -> None:
     old, new = folders
     lines = (new / "points.csv").read_text().splitlines()
     cells = lines[3].split(",")
@@ -115,7 +133,7 @@ def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path]
     ],
 )
 def test_words_may_differ_where_that_is_meant_but_numbers_may_not(
-    folders: tuple[Path, Path], name: str, before: str, after: str, wording: int
+    folders: tuple[Path, Path], compared: Compared, name: str, before: str, after: str, wording: int
 ) -> None:
     old, new = folders
     text = (new / name).read_text(encoding="utf-8")
@@ -125,7 +143,9 @@ def test_words_may_differ_where_that_is_meant_but_numbers_may_not(
     assert compared(old, new, "--wording")[0] == wording
 
 
-def test_missing_files_and_other_folders_are_told(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_missing_files_and_other_folders_are_told(
+    folders: tuple[Path, Path], compared: Compared, tmp_path: Path
+) -> None:
     old, new = folders
     (new / "given.csv").unlink()
     code, told = compared(old, new)
