@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -514,12 +515,23 @@ def test_names_that_are_known_before_are_not_used(
     assert content(home) == before
 
 
+@pytest.fixture(scope="module")
+def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a survey and its result."""
+    folder = tmp_path_factory.mktemp("adjusted")
+    survey = write_observed_survey(folder / "s", "s", backend="colmap")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
+        patch.setattr("sfm.report.output.draw_plots", lambda _: [])
+        assert kolinear(patch, "adjust", survey, "--out", folder / "out") == 0
+    return folder
+
+
 @pytest.fixture
-def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+def result(adjusted: Path, tmp_path: Path) -> tuple[Path, Path]:
     """A survey and the folder of its result."""
-    survey = write_observed_survey(tmp_path / "s", "s", backend="colmap")
-    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
-    return survey, tmp_path / "out"
+    shutil.copytree(adjusted, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "s" / "survey.toml", tmp_path / "out"
 
 
 @pytest.mark.parametrize(
