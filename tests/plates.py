@@ -11,7 +11,8 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray, rotation_from_vector
 from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, rectangles
-from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.plates import GRIDS, PlateFamily
+from sfm.targets.codes.tags import opencv_dictionary, tag_family, tag_modules
 
 PITCH = 12.0
 SIZE_PX, PIXEL_MM = (800, 600), 0.0075
@@ -63,20 +64,29 @@ def camera() -> Camera:
     return made.with_parameters(p)
 
 
-def plate_scene(plate: PlateFamily, *, rings: bool = False, move: FloatArray | None = None) -> Scene:
-    """Return a plate with its first point at the origin, X to the right, Y up; `move` shifts its points."""
+def plate_scene(
+    plate: PlateFamily, *, rings: bool = False, move: FloatArray | None = None, mark: float = 4.6
+) -> Scene:
+    """Return a plate with its first point at the origin, X to the right, Y up.
+
+    Args:
+        plate: the plate.
+        rings: whether its marks are rings.
+        move: shifts its points.
+        mark: radius of the marks, 3 that of the other dots.
+    """
     xyz = plate.plane(PITCH) + (0.0 if move is None else move)
     middle = plate.plane(PITCH).mean(axis=0)
-    half = np.array([[(plate.columns + 1) * PITCH / 2, (plate.rows + 1) * PITCH / 2]])
+    half = np.ptp(plate.plane(PITCH), axis=0)[None, :2] / 2 + PITCH
     faces = Faces(middle[None], np.eye(3)[None, :2], half, np.array([0.85]), np.zeros(1), np.ones(1))
     xy = (xyz - middle)[:, :2]
-    if plate.name == "grid":
+    if plate.name in GRIDS:
         is_mark = np.isin(np.arange(plate.count), [r * plate.columns + c for r, c in plate.marks])
-        marks: list[Marks] = [discs(0, xy[~is_mark], 3.0, 0.06), discs(0, xy[is_mark], 4.6, 0.06)]
-        radius = np.where(is_mark, 4.6, 3.0)
+        marks: list[Marks] = [discs(0, xy[~is_mark], 3.0, 0.06), discs(0, xy[is_mark], mark, 0.06)]
+        radius = np.where(is_mark, mark, 3.0)
         if rings:
-            marks.append(discs(0, xy[is_mark], 2.4, 0.85))
-            radius = np.where(is_mark, 2.4, 3.0)
+            marks.append(discs(0, xy[is_mark], 0.52 * mark, 0.85))
+            radius = np.where(is_mark, 0.52 * mark, 3.0)
         targets = CircularTargets(np.zeros(plate.count, dtype=np.int64), xy, radius, np.arange(plate.count))
         return Scene(faces, join_marks(marks), targets)
     row, column = np.mgrid[-1 : plate.rows, -1 : plate.columns]
@@ -85,10 +95,27 @@ def plate_scene(plate: PlateFamily, *, rings: bool = False, move: FloatArray | N
     centre = np.stack([(column[dark] + 0.5) * PITCH, -(row[dark] + 0.5) * PITCH], axis=1) - middle[:2]
     k = len(centre)
     squares = rectangles(0, centre, np.full((k, 2), PITCH / 2), np.zeros(k), np.full(k, 0.06))
+    if plate.name == "charuco":
+        squares = join_marks([squares, _tags_of(plate, middle)])
     none = CircularTargets(
         np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64)
     )
     return Scene(faces, squares, none)
+
+
+def _tags_of(plate: PlateFamily, middle: FloatArray) -> Marks:
+    """Return the tags in the white squares of a board."""
+    family, dictionary = tag_family(plate.dictionary), opencv_dictionary(plate.dictionary)
+    size = plate.columns + 1, plate.rows + 1
+    board = cv2.aruco.CharucoBoard(size, PITCH, plate.tag_share * PITCH, dictionary)
+    side, centre = plate.tag_share * PITCH / family.modules, []
+    for number, corners in enumerate(board.getObjPoints()):
+        row, column = np.nonzero(tag_modules(family, number))
+        x, y = (column + 0.5) * side + corners[0, 0] - PITCH, (row + 0.5) * side + corners[0, 1] - PITCH
+        centre.append(np.stack([x, -y], axis=1) - middle[:2])
+    joined = np.concatenate(centre)
+    k = len(joined)
+    return rectangles(0, joined, np.full((k, 2), side / 2), np.zeros(k), np.full(k, 0.06))
 
 
 def stations(rng: np.random.Generator, count: int, plate: PlateFamily) -> tuple[FloatArray, FloatArray]:
@@ -117,11 +144,12 @@ def plate_pictures(
     count: int,
     *,
     rings: bool = False,
+    mark: float = 4.6,
     noise: float = NOISE,
     bits: int = 8,
 ) -> list[AnyArray]:
     """Return rendered photographs of a plate."""
-    scene, truth = plate_scene(plate, rings=rings), camera()
+    scene, truth = plate_scene(plate, rings=rings, mark=mark), camera()
     optics = Optics(blur_px=0.8, exposure=0.9, noise=noise, oversampling=3, bits=bits)
     position, rotation = stations(rng, count, plate)
     rays = corner_rays(truth)

@@ -10,8 +10,10 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.kernels.sampling import as_grey
 from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
+from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.dot_plates import name_dots
 from sfm.targets.codes.families import TargetFamily, code_family
-from sfm.targets.codes.plates import PlateFamily, find_crossings, name_dots
+from sfm.targets.codes.plates import BOARDS, PlateFamily
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
@@ -134,6 +136,8 @@ def find_targets(
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
+    if isinstance(family, PlateFamily) and family.name in BOARDS:
+        return _of_crossings(*find_crossings(photograph, family, scale=scale, noise=noise))
     grey = as_grey(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
@@ -187,15 +191,13 @@ def find_targets(
         rejected_xy=np.vstack([outlines.rejected_xy, outlines.xy[reason != 0]]),
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
     )
-    if isinstance(family, PlateFamily) and family.name != "grid":
-        return _with_crossings(targets, *find_crossings(photograph, family, scale=scale, noise=noise))
     return targets if tags is None else _with_corners(targets, tags)
 
 
 def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFamily) -> IntArray:
     """Return which point of a plate each good target is; insides of rings are of the other polarity."""
-    if plate.name != "grid" or not good.any():
-        return np.full(int(good.sum()), UNCODED)
+    if not good.any():
+        return np.zeros(0, dtype=np.int64)
     semi_axes, _ = axes_from_shape(fit.shape[good])
     own = sign[good]
     is_ring = own != (1 if (own > 0).sum() > len(own) / 2 else -1)
@@ -212,7 +214,7 @@ def _measure_centres(
     return measure_centroids(grey, fit.xy, fit.shape, sign, noise=noise, weights=centres)
 
 
-def _with_crossings(targets: Targets, found: Saddles, code: IntArray) -> Targets:
+def _of_crossings(found: Saddles, code: IntArray) -> Targets:
     """Return the crossings of a board; circles have no place on it."""
     k = len(found.xy)
     return Targets(
@@ -230,8 +232,8 @@ def _with_crossings(targets: Targets, found: Saddles, code: IntArray) -> Targets
         blur=np.full(k, np.nan),
         noise=np.full(k, np.nan),
         flag=np.full(k, Flag.CROSSING.value),
-        rejected_xy=targets.rejected_xy,
-        rejected_flag=targets.rejected_flag,
+        rejected_xy=np.zeros((0, 2)),
+        rejected_flag=np.zeros(0, dtype=np.int64),
     )
 
 

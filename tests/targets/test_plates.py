@@ -16,7 +16,8 @@ from sfm.errors import SurveyFileError
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
-from sfm.targets.codes.plates import PlateFamily, name_dots
+from sfm.targets.codes.dot_plates import name_dots
+from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets
 from tests.plates import BOARD, GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
 from tests.synthetic import seed_of
@@ -142,7 +143,7 @@ def survey_text(**changes: str) -> str:
         ({"marks": "marks = [[3, 3], [5, 3]]"}, "the marks look alike turned by 180 degrees"),
         ({"marks": "", "kind": 'kind = "free"'}, "looks alike turned by 180 degrees has no"),
         ({"codes": 'codes = "charuco"', "marks": ""}, "targets.dictionary = '', codes = 'charuco' needs"),
-        ({"codes": 'codes = "checkerboard"'}, "targets.marks are of codes = 'grid'"),
+        ({"codes": 'codes = "checkerboard"'}, "targets.marks are of grid, asymmetric-grid"),
         ({"codes": 'codes = "checkerboard"', "rows": "rows = 2", "marks": ""}, "board of 2 x 11 cross"),
         ({"unit": 'unit = "mm"\n[control]\nfile = "c.csv"'}, r"\[control\] beside a calibration plate"),
     ],

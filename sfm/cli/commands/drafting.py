@@ -31,6 +31,15 @@ def init(
             help="File to write; no other is replaced.  [default: PHOTOS/survey.toml]",
         ),
     ] = None,
+    pitch: Annotated[
+        float | None,
+        typer.Option(
+            "--pitch",
+            metavar="MM",
+            min=1e-6,
+            help="Squares of a board, or distance of the dots of a plate, mm.  [default: assumed]",
+        ),
+    ] = None,
 ) -> None:
     """Draft a survey file from a folder of photographs.
 
@@ -41,7 +50,7 @@ def init(
 
     file = photographs / "survey.toml" if out is None else out
     refuse_existing(file)
-    draft = _draft(photographs)
+    draft = _draft(photographs, pitch)
     _write(draft, file)
     beside = file.parent.resolve() == photographs.resolve()
     print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
@@ -75,7 +84,7 @@ def drafted_beside(photographs: Path, out: Path | None) -> tuple[Path, Path]:
     return file, out
 
 
-def _draft(photographs: Path) -> Draft:
+def _draft(photographs: Path, pitch: float | None = None) -> Draft:
     with loading():
         from sfm.api import one_blas_thread, sensor_widths
         from sfm.runtime.progress_bar import drawn_progress
@@ -88,6 +97,7 @@ def _draft(photographs: Path) -> Draft:
         draft = draft_survey(
             photographs,
             sensor_width=sensor_widths(unknown.append),
+            pitch=pitch,
             store=MeasuredStore.of_user(),
             progress=drawn,
         )

@@ -49,6 +49,13 @@ ROWS = (
         "Put coded targets among them.",
     ),
     Kind(
+        "plate_pitch_assumed",
+        "note",
+        "The pitch of the plate is assumed to be {pitch}.",
+        "a calibration plate was found, its size is not known",
+        "Give the distance of neighbouring dots or crossings if lengths matter; cameras do not depend on it.",
+    ),
+    Kind(
         "sensor_not_looked_up",
         "note",
         "{camera} was not looked up in COLMAP's list of cameras: {reason}.",

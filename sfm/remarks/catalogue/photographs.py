@@ -56,9 +56,22 @@ ROWS = (
         "plate_not_found",
         "note",
         "The calibration plate of {size} dots was not found in {photographs:photograph}: {photographs}.",
-        "a plate without marks must be seen whole, one with marks with all of them; nothing may look like "
-        "a mark",
-        "Show all of it; check rows, columns and marks.",
+        "a plate without marks must be seen whole, one with marks with enough of them",
+        "Show all of it; check the polarity of the dots.",
+    ),
+    Kind(
+        "plate_not_recognised",
+        "note",
+        "In {photographs:photograph} {dots:dot} do not fit the plate of {size}: {photographs}.",
+        "rows, columns or marks are not those of the plate; its marks are hidden; a part of it without marks",
+        "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
+    ),
+    Kind(
+        "plate_looks_alike_turned",
+        "warning",
+        "The plate looks alike turned by 180 degrees: {cameras} may count its points from opposite corners.",
+        "a board with an even number of rows and columns together, or dots without marks, and two cameras",
+        "Do not compare stations of one camera with those of the other; take a plate with marks.",
     ),
     Kind(
         "board_not_found",

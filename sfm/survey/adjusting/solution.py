@@ -54,6 +54,7 @@ from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
+from sfm.survey.inputs.plate import plate_family
 from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
@@ -220,13 +221,19 @@ class _Free:
     iterations: int
 
 
-def _free_network(start: _Prepared) -> _Free:
+def _free_network(start: _Prepared) -> _Free | None:
     """Adjust the image points alone: nothing that was given bends their network, or costs one of them.
+
+    Returns:
+        The network; None for a plate that looks alike turned, whose points have no identity without it.
 
     Raises:
         GeometryError: they do not make a network by themselves.
     """
     task, estimate = start.task, start.estimate
+    plate = plate_family(task.survey.targets)
+    if plate is not None and plate.is_ambiguous:
+        return None
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations())
     task = replace(task, network=network)
     if task.datum.kind == "control":
@@ -273,7 +280,7 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
 def _solved(start: _Prepared) -> _Solved:
     """Adjust the image points, judge what was given by them, and adjust all that is left together."""
     try:
-        free: _Free | None = _free_network(start)
+        free = _free_network(start)
     except GeometryError:
         if start.task.datum.kind != "control":
             raise

@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm.network import Estimate
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.inputs.plate import plate_family
 from sfm.survey.inputs.survey import Survey
 
 FAR = 0.2  # relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens
@@ -21,10 +22,13 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
     """Return a remark for each adjusted principal distance that lies far from the one that the survey gives.
 
     Args:
-        survey: whose cameras state `c_mm`; those by EXIF data are not looked at.
+        survey: whose cameras state `c_mm`; those by EXIF data are not looked at, nor those that photograph a
+            plate of known coordinates: no distance runs away from it.
         estimate: adjusted cameras.
         sigma: standard deviation of the principal distance of each, in its unit.
     """
+    if plate_family(survey.targets) is not None and survey.datum.kind == "control":
+        return ()
     given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
     remarks = []
     for camera, s in zip(estimate.cameras, sigma, strict=True):

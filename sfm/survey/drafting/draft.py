@@ -19,10 +19,13 @@ from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth
 from sfm.survey.drafting.target_trial import MANY_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
 from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.targets.codes.plates import BOARDS, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
-SIGMA_PX, TIE_SIGMA_PX = 0.05, 0.1
+FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
+SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
+PITCH = 25.0  # of a plate, UNIT, where none is given: that of many printed boards
 UNIT = "mm"
 SHOWN = 8  # names that a line lists
 
@@ -42,6 +45,7 @@ def draft_survey(
     folder: Path,
     *,
     sensor_width: SensorWidth = lambda make, model: None,
+    pitch: float | None = None,
     store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> Draft:
@@ -50,6 +54,7 @@ def draft_survey(
     Args:
         folder: the photographs, directly in it.
         sensor_width: a list of cameras, asked where EXIF data do not tell the pixel size.
+        pitch: distance of neighbouring dots or crossings, should they be on a plate, mm; else assumed.
         store: keeps the targets measured on trial.
         progress: told of what is tried.
 
@@ -70,9 +75,9 @@ def draft_survey(
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     return Draft(
         name,
-        _text(name, folder, grouping, trial, left_out),
+        _text(name, grouping, trial, pitch, left_out),
         _found(grouping, trial),
-        _remarks(grouping, trial),
+        _remarks(grouping, trial, pitch),
         left_out,
     )
 
@@ -107,7 +112,11 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
 
 
 def _text(
-    name: str, folder: Path, grouping: Grouping, trial: TargetTrial, left_out: Sequence[tuple[str, str]]
+    name: str,
+    grouping: Grouping,
+    trial: TargetTrial,
+    pitch: float | None,
+    left_out: Sequence[tuple[str, str]],
 ) -> str:
     lines = [
         "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
@@ -116,14 +125,17 @@ def _text(
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     for camera in grouping.cameras:
-        lines += ["", *_camera_lines(camera)]
+        lines += ["", *_camera_lines(camera, FREE if trial.plate is None else FREE_BY_PLATES)]
     if left_out:
         lines += ["", "# Left out:"]
         lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
-    lines += ["", *_target_lines(trial)]
-    lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
-    lines += ["", *_example_lines(trial)]
-    sigma = SIGMA_PX if trial.codes != "none" else TIE_SIGMA_PX
+    lines += ["", *_target_lines(trial, pitch)]
+    if trial.plate is None:
+        lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
+        lines += ["", *_example_lines(trial)]
+    else:
+        lines += ["", "[datum]", 'kind = "control"  # the plate, flat and true, is the datum']
+    sigma = CORNER_SIGMA_PX if trial.codes in ("none", *BOARDS) else SIGMA_PX
     lines += [
         "",
         "[adjust]",
@@ -135,7 +147,7 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
-def _camera_lines(camera: CameraGroup) -> list[str]:
+def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
     globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
     lines = [
         f"# {len(camera.photographs)} photographs of {camera.size_px[0]} x {camera.size_px[1]} px",
@@ -145,17 +157,39 @@ def _camera_lines(camera: CameraGroup) -> list[str]:
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
         'model = "brown"',
-        f"free = {json.dumps(list(FREE))}",
+        f"free = {json.dumps(list(free))}",
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
 
 
-def _target_lines(trial: TargetTrial) -> list[str]:
+def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
     counted = ", ".join(f"{family} {count}" for family, count in trial.counts)
     lines = [f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"]
+    if trial.plate is not None:
+        return [*lines, *_plate_lines(trial.plate, pitch)]
     if trial.codes == "none":
         return [*lines, "# No coded targets: points of natural texture take their place.", "[tie_points]"]
     return [*lines, "[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
+
+
+def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
+    assumed = "" if pitch else "; ASSUMED, it sets the scale"
+    lines = [
+        "[targets]",
+        f"codes = {_quoted(plate.name)}",
+        f"rows = {plate.rows}  # of dots, or of crossings inside the board",
+        f"columns = {plate.columns}",
+        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots or crossings{assumed}",
+    ]
+    if plate.marks:
+        lines.append(f"marks = {json.dumps([list(mark) for mark in plate.marks])}  # row and column, from 0")
+    if plate.dictionary:
+        lines += [
+            f"dictionary = {_quoted(plate.dictionary)}",
+            f"tag_size = {plate.tag_share * (pitch or PITCH):.4g}  # {UNIT}, side of the tags: "
+            f"{plate.tag_share:g} of the pitch",
+        ]
+    return lines
 
 
 def _example_lines(trial: TargetTrial) -> list[str]:
@@ -185,7 +219,11 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
         )
         for camera in grouping.cameras
     ]
-    if trial.codes != "none":
+    if trial.plate is not None:
+        plate = trial.plate
+        marks = f", {len(plate.marks)} marks" if plate.marks else ""
+        found.append(("targets", f"{plate.name} of {plate.rows} x {plate.columns}{marks}"))
+    elif trial.codes != "none":
         repeated = f"{len(trial.repeated)} codes that two of {len(trial.photographs)} photographs have"
         found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
@@ -193,7 +231,7 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
     return tuple(found)
 
 
-def _remarks(grouping: Grouping, trial: TargetTrial) -> tuple[Remark, ...]:
+def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tuple[Remark, ...]:
     """Return what a person should know of the photographs and targets."""
     remarks = [one for camera in grouping.cameras for one in camera.remarks]
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
@@ -202,6 +240,8 @@ def _remarks(grouping: Grouping, trial: TargetTrial) -> tuple[Remark, ...]:
     if len(grouping.cameras) > 1:
         each = [f"{camera.name} ({len(camera.photographs)})" for camera in grouping.cameras]
         remarks.append(remark("several_cameras", cameras=each))
+    if trial.plate is not None and pitch is None:
+        remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
         remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
     if trial.codes == "none" and trial.circles >= MANY_TARGETS:

@@ -1,29 +1,41 @@
-"""Which targets photographs show, by trying a few of them with every family of codes."""
+"""Which targets a few photographs show: rings, square tags, boards and plates of dots, in this order."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, PhotographError
+from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.codes.families import code_family
-from sfm.targets.codes.rings import RINGS
-from sfm.targets.codes.tags import DICTIONARIES, TagFamily, corner_name
+from sfm.targets.codes.plate_search import search_charuco, search_checkerboard, search_dots, shows_a_lattice
+from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.ring_reading import read_codes
+from sfm.targets.codes.rings import RINGS, CodeFamily
+from sfm.targets.codes.tags import (
+    LARGEST_DICTIONARIES,
+    TagFamily,
+    corner_name,
+    read_dictionaries,
+    smallest_dictionary,
+)
 from sfm.targets.detect import Targets
+from sfm.targets.measure import shape_from_axes
 
-TRIED = 3  # photographs, spread over the folder
+TRIED, PLATES_TRIED = 3, 8  # photographs, spread over the folder
 MIN_READABLE = 2
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
-MIN_PROMISING = 3  # codes in the first photograph for which a family is tried on the others
 MANY_TARGETS = 12  # circles in a photograph that are no chance finds
 
 
@@ -38,6 +50,7 @@ class TargetTrial:
     circles: float  # median number of circular targets in a photograph
     blur_px: float  # median standard deviation of their edges, px; NaN without
     photographs: tuple[str, ...]  # that were tried
+    plate: PlateFamily | None = None  # calibration plate
     unreadable: tuple[tuple[str, str], ...] = ()  # photographs that could not be decoded, and why
 
 
@@ -46,8 +59,8 @@ def try_targets(
 ) -> TargetTrial:
     """Return which targets photographs show.
 
-    Rings are tried first, then square tags. A family is believed for codes that two photographs have in
-    common: a wrong family reads a code now and then, but not the same one twice.
+    A family is believed for codes that two photographs have in common: a wrong family reads a code now and
+    then, but not the same one twice. A plate is believed if two photographs show it whole.
 
     Args:
         paths: photographs in their order; those that cannot be decoded are passed over.
@@ -57,81 +70,135 @@ def try_targets(
     Raises:
         GeometryError: fewer than two of them can be decoded.
     """
-    tried, unreadable = _readable(paths, store)
-    progress.stage("trial", 2 * len(RINGS))
-    rings = {}
-    for family in RINGS:
-        rings[family] = [_measure(tried[0], family, store)]
-        progress.advance(family)
-    promising = [family for family in RINGS if _coded(rings[family][0]) >= MIN_PROMISING] or list(RINGS)
-    for family in promising:
-        rings[family] += [_measure(path, family, store) for path in tried[1:]]
-        progress.advance(family)
-    plain = rings[promising[0]]
-    counts = {family: _repeated(found) for family, found in rings.items()}
-    best = max(counts, key=lambda family: len(counts[family]))
-    found = rings[best]
+    progress.stage("trial", TRIED + 4)
+    tried, plain, unreadable = _readable(paths, store, progress)
+    photographs = [read_photograph(path) for path in tried]
+    read = {family: list(map(partial(_ring_codes, family), photographs, plain)) for family in RINGS}
+    counts = {family: _repeated(codes) for family, codes in read.items()}
+    progress.advance("rings")
+    best, plate, measured = max(counts, key=lambda family: len(counts[family])), None, plain
     if len(counts[best]) < MIN_REPEATED:
-        progress.stage("trial of tags", len(DICTIONARIES))
-        tags = {}
-        for family in DICTIONARIES:
-            first = _measure(tried[0], family, store)
-            if _coded(first) >= MIN_REPEATED:
-                tags[family] = [first, *(_measure(path, family, store) for path in tried[1:])]
-            progress.advance(family)
-        counts |= {family: _repeated(measured) for family, measured in tags.items()}
-        best = max(counts, key=lambda family: len(counts[family]))
-        found = tags.get(best, rings.get(best, plain))
-    coded = len(counts[best]) >= MIN_REPEATED
-    measured = found if coded else plain
+        refused = {name for name, _ in unreadable}
+        more = [paths[k] for k in _spread(len(paths), PLATES_TRIED) if paths[k].name not in refused]
+        tags, plate = _tags_and_boards(list(map(_as_bytes, photographs)), more, progress)
+        if plate is None and tags:
+            measured = [_measure(path, tags, store) for path in tried]
+            counts[tags], best = _repeated([one.code for one in measured]), tags
+        elif plate is None:
+            plate = _dots(plain, [path for path in more if path not in tried], store)
+        progress.advance("plates of dots")
+    coded = len(counts[best]) >= MIN_REPEATED and plate is None
+    if coded and best in RINGS:
+        measured = [_measure(path, best, store) for path in tried]
     return TargetTrial(
-        best if coded else "none",
+        best if coded else "none" if plate is None else plate.name,
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
         float(np.median([np.isfinite(one.axes_covariance[:, 0, 0]).sum() for one in measured])),
         _blur(measured),
         tuple(path.name for path in tried),
+        plate,
         unreadable,
     )
 
 
+def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray:
+    """Return the codes that measured targets have in a family of rings, negative where none, (k,)."""
+    rings = code_family(family)
+    assert isinstance(rings, CodeFamily)
+    levels = np.column_stack([targets.background, targets.contrast])
+    shape = shape_from_axes(targets.semi_axes, targets.angle)
+    return read_codes(photograph, targets.xy, shape, levels, rings, blur_px=targets.blur)[0]
+
+
+def _tags_and_boards(
+    tried: Sequence[AnyArray], more: Sequence[Path], progress: Progress
+) -> tuple[str, PlateFamily | None]:
+    """Return the dictionary of tags that photographs have in common, "" without, and their board.
+
+    A checkerboard may be a ChArUco board, which its tags show.
+    """
+    none = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
+    plate = search_checkerboard([_as_bytes(read_photograph(path)) for path in more])
+    progress.advance("boards")
+    read = [read_dictionaries(photograph) for photograph in (tried if plate is None else tried[:1])]
+    if plate is not None and read[0]:
+        read += [read_dictionaries(photograph) for photograph in tried[1:]]
+    progress.advance("tags")
+    repeated = {
+        family: _shared([one.get(family, none)[0] for one in read]) for family in LARGEST_DICTIONARIES
+    }
+    family = max(repeated, key=lambda name: len(repeated[name]))
+    if not len(repeated[family]):
+        return "", plate
+    seen = [one.get(family, none) for one in read]
+    family = smallest_dictionary(family, repeated[family])
+    return family, search_charuco(tried, family, seen) or plate
+
+
+def _shared(photographs: Sequence[IntArray]) -> IntArray:
+    """Return the numbers that two photographs have; none in one photograph."""
+    number, times = np.unique(np.concatenate([np.unique(one) for one in photographs]), return_counts=True)
+    return np.asarray(number[times > 1])
+
+
+def _dots(
+    plain: Sequence[Targets], others: Sequence[Path], store: MeasuredStore | None
+) -> PlateFamily | None:
+    """Return the plate of dots that photographs show; others are measured where one has a lattice."""
+
+    def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
+        return targets.xy, np.sqrt(targets.semi_axes.prod(axis=1)), targets.polarity
+
+    seen = [circles(one) for one in plain]
+    if any(shows_a_lattice(xy) for xy, _, _ in seen):
+        seen += [circles(_measure(path, "none", store)) for path in others]
+    return search_dots(seen)
+
+
+def _as_bytes(photograph: AnyArray) -> AnyArray:
+    """Return the intensities of a photograph as bytes."""
+    return photograph if photograph.dtype == np.uint8 else (photograph >> 8).astype(np.uint8)
+
+
+def _spread(count: int, tried: int) -> list[int]:
+    """Return places spread over so many."""
+    return sorted({round(i * (count - 1) / max(tried - 1, 1)) for i in range(tried)})
+
+
 def _readable(
-    paths: Sequence[Path], store: MeasuredStore | None
-) -> tuple[list[Path], tuple[tuple[str, str], ...]]:
-    """Return photographs that can be decoded, spread over the folder, and which cannot and why."""
-    tried: set[int] = set()
+    paths: Sequence[Path], store: MeasuredStore | None, progress: Progress
+) -> tuple[list[Path], list[Targets], tuple[tuple[str, str], ...]]:
+    """Return photographs spread over the folder and their targets, and which cannot be decoded and why."""
+    tried: dict[int, Targets] = {}
     refused: dict[int, tuple[str, str]] = {}
-    for place in (round(i * (len(paths) - 1) / (TRIED - 1)) for i in range(TRIED)):
+    for place in _spread(len(paths), TRIED):
         for k in sorted(range(len(paths)), key=lambda k: abs(k - place)):
             if k in tried or k in refused:
                 continue
             try:
-                _measure(paths[k], next(iter(RINGS)), store)
+                tried[k] = _measure(paths[k], "none", store)
             except PhotographError as error:
                 refused[k] = paths[k].name, str(error).removeprefix(f"{paths[k].name}: ")
                 continue
-            tried.add(k)
+            progress.advance(paths[k].name)
             break
     if len(tried) < MIN_READABLE:
         why = listed((f"{name}: {reason}" for name, reason in refused.values()), separator="; ")
         raise GeometryError(f"{len(tried)} readable photographs, at least {MIN_READABLE} are needed ({why})")
-    return [paths[k] for k in sorted(tried)], tuple(refused.values())
+    return [paths[k] for k in sorted(tried)], [tried[k] for k in sorted(tried)], tuple(refused.values())
 
 
 def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:
     return measure_photograph(path, TargetSettings(), code_family(family), store)[0]
 
 
-def _coded(targets: Targets) -> int:
-    return len(np.unique(targets.code[targets.code >= 0]))
-
-
-def _repeated(photographs: Sequence[Targets]) -> tuple[int, ...]:
+def _repeated(photographs: Sequence[IntArray]) -> tuple[int, ...]:
     """Codes that two photographs have, each once in both, the most frequent first."""
     seen = Counter[int]()
-    for targets in photographs:
-        codes, times = np.unique(targets.code[targets.code >= 0], return_counts=True)
+    for read in photographs:
+        codes, times = np.unique(read[read >= 0], return_counts=True)
         seen.update(codes[times == 1].tolist())
     return tuple(code for code, times in seen.most_common() if times > 1)
 

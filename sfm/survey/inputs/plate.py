@@ -7,7 +7,7 @@ import numpy as np
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.settings import TargetSettings
-from sfm.targets.codes.plates import PLATES, PlateFamily, refuse_unusable_plate
+from sfm.targets.codes.plates import GRIDS, PLATES, PlateFamily, refuse_unusable_plate
 from sfm.targets.codes.tags import DICTIONARIES
 
 OF_PLATES = ("rows", "columns", "pitch", "marks", "plate_sigma", "dictionary")
@@ -74,8 +74,8 @@ def refuse_contradicting_plates(targets: TargetSettings, where: str) -> None:
         )
     if not board and targets.dictionary is not None:
         raise SurveyFileError(f"{where}: targets.dictionary is of codes = 'charuco', found '{targets.codes}'")
-    if targets.codes != "grid" and targets.marks:
-        raise SurveyFileError(f"{where}: targets.marks are of codes = 'grid', found '{targets.codes}'")
+    if targets.codes not in GRIDS and targets.marks:
+        raise SurveyFileError(f"{where}: targets.marks are of {', '.join(GRIDS)}, found '{targets.codes}'")
     if targets.codes == "checkerboard" and min(plate.rows, plate.columns) < MIN_SIDE:
         raise SurveyFileError(
             f"{where}: a checkerboard of {plate.rows} x {plate.columns} crossings, at least {MIN_SIDE} x "
@@ -90,9 +90,7 @@ def refuse_contradicting_plates(targets: TargetSettings, where: str) -> None:
 def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:
     """Raise SurveyFileError where each point has coordinates of its own, and which it is cannot be told."""
     plate = plate_family(targets)
-    if plate is None or datum == "control" or targets.codes == "charuco" or plate.marks:
-        return
-    if targets.codes == "checkerboard" and (plate.rows + plate.columns) % 2:
+    if plate is None or datum == "control" or not plate.is_ambiguous:
         return
     raise SurveyFileError(
         f"{where}: a plate that looks alike turned by 180 degrees has no points of its own; needed [datum] "

@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes.lattice import Lattice, find_lattice
+from sfm.targets.codes.plates import quarter_turn
 
 SMOOTHING_PX = 2.0
 # Saddles below this share of the strong ones are none; the strong ones are those of this rank.
@@ -48,7 +49,7 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
         return none
     found: list[tuple[int, IntArray]] = []
     for turn in range(4):
-        turned = _turned(lattice.place, turn)
+        turned = quarter_turn(lattice.place, turn)
         turned = turned - turned.min(axis=0)
         ends = _ends(lattice.xy, turned, grey.shape)
         size = turned.max(axis=0) + 1
@@ -142,9 +143,3 @@ def _offset(seen: int, whole: int, ends: tuple[bool, bool]) -> int | None:
 def _is_upright(xy: FloatArray, column: IntArray) -> bool:
     """Whether columns run to the right."""
     return float((xy[:, 0] - xy[:, 0].mean()) @ (column - column.mean())) > 0
-
-
-def _turned(place: IntArray, quarters: int) -> IntArray:
-    """Return rows and columns turned by quarters, (k, 2)."""
-    row, column = place.T
-    return np.stack(((row, column), (column, -row), (-row, -column), (-column, row))[quarters], axis=1)

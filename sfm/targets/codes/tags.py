@@ -24,6 +24,8 @@ DICTIONARIES = {
     "aruco_original": "DICT_ARUCO_ORIGINAL",
     "aruco_mip_36h12": "DICT_ARUCO_MIP_36h12",
 }
+# Without those that are the first tags of a larger one.
+LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
 # A black module narrower than this is not told apart from the code behind it.
 MIN_MODULE_PX = 3.0
@@ -79,7 +81,7 @@ class TagCorners:
 
 def tag_family(name: str) -> TagFamily:
     """Return the family of a name in DICTIONARIES."""
-    dictionary = _dictionary(name)
+    dictionary = opencv_dictionary(name)
     return TagFamily(name, dictionary.markerSize + 2, len(dictionary.bytesList))
 
 
@@ -91,7 +93,7 @@ def tag_modules(family: TagFamily, number: int) -> BoolArray:
     """
     if not 0 <= number < family.count:
         raise GeometryError(f"tag {number}: family {family.name} has 0 to {family.count - 1}")
-    return np.asarray(_dictionary(family.name).generateImageMarker(number, family.modules) == 0)
+    return np.asarray(opencv_dictionary(family.name).generateImageMarker(number, family.modules) == 0)
 
 
 def corner_name(code: int) -> str:
@@ -114,11 +116,9 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
     """
     grey = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
-    settings = cv2.aruco.DetectorParameters()
-    settings.errorCorrectionRate = CORRECTED
-    settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
+    settings = _reading_settings()
     settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / max(grey.shape)
-    detector = cv2.aruco.ArucoDetector(_dictionary(family.name), settings)
+    detector = cv2.aruco.ArucoDetector(opencv_dictionary(family.name), settings)
     # OpenCV's own search for inverted tags loses upright ones, so that the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
     found = [_detect(detector, picture) for picture in pictures]
@@ -180,6 +180,47 @@ def _fitted(
     return fits
 
 
+def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatArray]]:
+    """Return the tags of every dictionary that a photograph shows, found at once and not measured.
+
+    Args:
+        photograph: intensities, uint8, shape (H, W).
+
+    Returns:
+        Numbers (t,) and corners (t, 4, 2), px, of the tags by the name of their dictionary; of dictionaries
+        that are part of one another, by that of the largest.
+    """
+    detector = cv2.aruco.ArucoDetector(
+        [opencv_dictionary(name) for name in LARGEST_DICTIONARIES], _reading_settings()
+    )
+    for picture in (photograph, 255 - photograph):  # upright tags, or inverted ones
+        corners, ids, _, which = detector.detectMarkersMultiDict(picture)
+        if ids is None or not len(ids):
+            continue
+        number = np.asarray(ids).reshape(-1).astype(np.int64)
+        quads, place = np.array(corners, dtype=float).reshape(-1, 4, 2), np.asarray(which).reshape(-1)
+        return {
+            name: (number[place == k], quads[place == k])
+            for k, name in enumerate(LARGEST_DICTIONARIES)
+            if (place == k).any()
+        }
+    return {}
+
+
+def smallest_dictionary(name: str, number: IntArray) -> str:
+    """Return the smallest dictionary that is part of one and has tags of these numbers."""
+    kind, count = name.rsplit("_", 1)
+    parts = (f"{kind}_{n}" for n in (50, 100, 250, 1000)) if count == "1000" else (name,)
+    return next(part for part in parts if tag_family(part).count > number.max(initial=0))
+
+
+def _reading_settings() -> cv2.aruco.DetectorParameters:
+    settings = cv2.aruco.DetectorParameters()
+    settings.errorCorrectionRate = CORRECTED
+    settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
+    return settings
+
+
 def _detect(detector: cv2.aruco.ArucoDetector, picture: AnyArray) -> tuple[FloatArray, IntArray]:
     """Return corners a to d (t, 4, 2) and ids (t,) of the tags that OpenCV finds."""
     corners, ids, _ = detector.detectMarkers(picture)
@@ -197,6 +238,6 @@ def inside_tags(xy: FloatArray, tags: TagCorners, family: TagFamily) -> BoolArra
     return inside
 
 
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
+def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
     """Return OpenCV's dictionary of a name in DICTIONARIES."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[name]))

@@ -1,0 +1,98 @@
+"""Boards as targets: the crossings of checkerboards and ChArUco boards, and which of the board they are.
+
+A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
+follows from its colours (an odd number of rows and columns together) or is taken as it stands in the
+photograph, since the board looks alike turned by 180 degrees.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.codes.cut_boards import name_cut_board
+from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.tags import opencv_dictionary
+from sfm.targets.fits.saddle import Saddles, measure_saddles
+
+FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+
+
+def find_crossings(
+    photograph: AnyArray, plate: PlateFamily, *, scale: float, noise: float
+) -> tuple[Saddles, IntArray]:
+    """Find, name and measure the crossings of a checkerboard or ChArUco board in a photograph.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+        plate: the board.
+        scale: largest intensity that the photograph can hold.
+        noise: standard deviation of an intensity.
+
+    Returns:
+        The crossings, and which point of the plate each is.
+
+    Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for place and name; measured by
+    `measure_saddles`.
+    """
+    grey = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    if plate.name == "charuco":
+        xy, code = _charuco(grey, plate)
+    else:
+        xy, code = _checkerboard(grey, plate)
+    saddles = measure_saddles(photograph, xy, _spacing(xy), noise=noise)
+    good = np.isfinite(saddles.xy[:, 0])
+    return saddles.select(good), code[good]
+
+
+def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
+    """Return the crossings of a checkerboard and their points, upright or by the colours of its squares.
+
+    OpenCV's older finder takes boards without a white rim. What neither finds whole may be cut by the border
+    of the photograph.
+    """
+    size = plate.columns, plate.rows
+    found, corners = cv2.findChessboardCornersSB(grey, size, flags=FLAGS)
+    if not found:
+        found, corners = cv2.findChessboardCorners(grey, size, flags=OLDER_FLAGS)
+    if not found:
+        return name_cut_board(grey, plate.rows, plate.columns)
+    xy = np.asarray(corners, dtype=float).reshape(plate.rows, plate.columns, 2)
+    across, down = xy[0, -1] - xy[0, 0], xy[-1, 0] - xy[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0:  # seen from behind
+        xy = xy[:, ::-1]
+    turned = xy[::-1, ::-1]
+    if (plate.rows + plate.columns) % 2:
+        swap = _first_square(grey, xy) > _first_square(grey, turned)  # the first square is the dark one
+    else:
+        swap = (xy[0, -1] - xy[0, 0])[0] < 0
+    xy = turned if swap else xy
+    return xy.reshape(-1, 2), np.arange(plate.count)
+
+
+def _first_square(grey: AnyArray, xy: FloatArray) -> float:
+    """Return the intensity in the middle of the first square inside the crossings."""
+    x, y = xy[:2, :2].reshape(-1, 2).mean(axis=0)
+    return float(cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean())
+
+
+def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
+    """Return the crossings of a ChArUco board and their points."""
+    board = cv2.aruco.CharucoBoard(
+        (plate.columns + 1, plate.rows + 1), 1.0, plate.tag_share, opencv_dictionary(plate.dictionary)
+    )
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+    if ids is None or len(ids) == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+    return np.asarray(corners, dtype=float).reshape(-1, 2), np.asarray(ids).reshape(-1).astype(np.int64)
+
+
+def _spacing(xy: FloatArray) -> FloatArray:
+    """Return the distance of each crossing from the nearest other one, px, (k,)."""
+    if len(xy) < 2:
+        return np.zeros(len(xy))
+    distance = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    np.fill_diagonal(distance, np.inf)
+    return np.asarray(distance.min(axis=1))

@@ -1,0 +1,157 @@
+"""Plates of dots: which dot of the plate each of a photograph is.
+
+Dots make a lattice (see `lattice`). A placement puts it on the plate: turned by quarters, or for shifted
+rows one of the bases of the lattice, and moved. With marks each placement that overlaps the plate has a
+likelihood: dots are as large as perspective makes them but for errors, marks larger by one common ratio, and
+some dots may be anything (damage, shadows). The placement that is certain is taken; what lies beyond the
+plate gets no name. Without marks the whole plate must be seen, and nothing beside it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.targets.codes.lattice import Lattice, find_lattice
+from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
+
+LEAST_DOTS, LEAST_BENT = 9, 20  # that show a plate, and the bend of the trend of their sizes
+# Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
+ROUNDS, BIWEIGHT, MAD = 20, 4.685, 1.4826
+LEAST_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
+# A dot is anything with this probability, spread over so many standard deviations.
+STRANGE, RANGE = 0.01, 50.0
+RING = 10.0  # standard deviations of a ring: never taken for a dot
+CERTAIN = 0.999  # probability of a placement
+
+
+def name_dots(xy: FloatArray, radius: FloatArray, is_ring: BoolArray, plate: PlateFamily) -> IntArray:
+    """Return which point of a plate each dot is, UNCODED where none, (k,).
+
+    Args:
+        xy: centres of the dots and of the insides of rings, px, (k, 2).
+        radius: mean semi-axes, px, (k,).
+        is_ring: which are insides of rings, (k,).
+        plate: the plate.
+    """
+    code = np.full(len(xy), UNCODED)
+    lattice = find_lattice(xy, ~is_ring)
+    if lattice is None or len(lattice.rows) < LEAST_DOTS:
+        return code
+    if plate.marks:
+        placed = _placed_by_marks(lattice, size_of_marks(lattice, radius, is_ring), plate)
+    else:
+        placed = _placed_whole(lattice, plate)
+    if placed is not None:
+        code[lattice.rows] = placed
+    return code
+
+
+def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> FloatArray:
+    """Return by how much each place of a lattice is larger than perspective makes it, in standard deviations.
+
+    The trend of the logarithms of the radii is fitted by Tukey's biweight, from least absolute residuals.
+
+    Args:
+        lattice: the dots.
+        radius: mean semi-axes of all dots and rings, px, (k,).
+        is_ring: which are insides of rings, (k,); they are RING standard deviations larger.
+    """
+    log, ring = np.log(radius[lattice.rows]), is_ring[lattice.rows]
+    place = lattice.place - lattice.place.mean(axis=0)
+    row, column = (place / np.maximum(np.abs(place).max(axis=0), 1)).T
+    trend = [np.ones(len(row)), row, column]
+    if len(row) >= LEAST_BENT:
+        trend += [row * row, row * column, column * column]
+    design, weight = np.stack(trend, axis=1), (~ring).astype(float)
+    for k in range(ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        larger = log - design @ np.linalg.lstsq(root * design, root[:, 0] * log, rcond=None)[0]
+        scatter = max(MAD * float(np.median(np.abs(larger[~ring]))), LEAST_SCATTER)
+        if k < ROUNDS // 2:
+            weight = ~ring / np.maximum(np.abs(larger), LEAST_SCATTER)
+        else:
+            weight = ~ring * np.maximum(1 - (larger / (BIWEIGHT * scatter)) ** 2, 0.0) ** 2
+    return np.where(ring, RING, np.clip(larger / scatter, -RANGE / 2, RANGE / 2))
+
+
+def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
+    """Return the lattice as rows and columns of the plate in every way it can be turned, each (k, 2).
+
+    Columns of plates with shifted rows are counted in halves.
+    """
+    if not plate.is_shifted:
+        return [quarter_turn(lattice.place, turn) for turn in range(4)]
+    steps = [np.array(one) for one in ((1, 1), (1, -1), (0, 2), (2, 0))]
+    steps += [-one for one in steps]
+    return [
+        lattice.place @ np.stack([down, across])
+        for down, across in itertools.permutations(steps, 2)
+        if across[1] * down[0] - across[0] * down[1] == 2  # neighbours, and right-handed as the lattice is
+    ]
+
+
+def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> IntArray | None:
+    """Return the points of the plate at the places of a lattice; None where marks leave them uncertain."""
+    table = _table(plate)
+    marked = np.zeros(plate.count + 1, dtype=bool)
+    marked[[row * plate.columns + column for row, column in plate.marks]] = True
+    found: list[tuple[float, IntArray]] = []
+    plain = _log_likelihood(size)
+    for place in placements(lattice, plate):
+        low, high = place.min(axis=0), place.max(axis=0)
+        for offset in itertools.product(*(range(-high[k], table.shape[k] - low[k]) for k in range(2))):
+            code = _codes(place + np.array(offset), table)
+            here = marked[code]
+            if not here.any() or (code != UNCODED).sum() < LEAST_DOTS:
+                continue
+            gain = _log_likelihood(size[here] - np.median(size[here])) - plain[here]
+            found.append((float(gain.sum()), code))
+    if not found:
+        return None
+    best, code = max(found, key=lambda one: one[0])
+    all_of_them = sum(math.exp(gain - best) for gain, _ in found) + math.exp(-best)  # or no mark is seen
+    return code if 1 / all_of_them > CERTAIN else None
+
+
+def _placed_whole(lattice: Lattice, plate: PlateFamily) -> IntArray | None:
+    """Return the points of a plate without marks that is seen whole, turned as little as can be."""
+    table = _table(plate)
+    best: tuple[float, IntArray] | None = None
+    for place in placements(lattice, plate):
+        place = place - place.min(axis=0)
+        if tuple(place.max(axis=0) + 1) != table.shape:
+            continue
+        code = _codes(place, table)
+        if (code == UNCODED).any():
+            continue
+        x = lattice.xy[:, 0] - lattice.xy[:, 0].mean()
+        upright = float(x @ (place[:, 1] - place[:, 1].mean()))  # columns to the right
+        if best is None or upright > best[0]:
+            best = upright, code
+    return None if best is None else best[1]
+
+
+def _table(plate: PlateFamily) -> IntArray:
+    """Return the point at each row and column (halves of them for shifted rows), UNCODED where none."""
+    places = plate.places
+    table = np.full(places.max(axis=0) + 1, UNCODED)
+    table[places[:, 0], places[:, 1]] = np.arange(plate.count)
+    return table
+
+
+def _codes(place: IntArray, table: IntArray) -> IntArray:
+    """Return the points at rows and columns, UNCODED beyond the plate, (k,)."""
+    inside = ((place >= 0) & (place < table.shape)).all(axis=1)
+    code = np.full(len(place), UNCODED)
+    code[inside] = table[place[inside, 0], place[inside, 1]]
+    return code
+
+
+def _log_likelihood(z: FloatArray) -> FloatArray:
+    """Return the logarithm of the density of normal deviates of which some are anything."""
+    normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+    return np.asarray(np.log((1 - STRANGE) * normal + STRANGE / RANGE))

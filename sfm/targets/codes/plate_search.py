@@ -1,0 +1,199 @@
+"""Which calibration plate photographs show, when nothing is known of it but that the photographs show it.
+
+A plate is believed if two photographs show one of the same size whole. Larger dots or rings are marks if both
+photographs have them in the same places.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.dot_plates import placements, size_of_marks
+from sfm.targets.codes.lattice import find_lattice
+from sfm.targets.codes.plates import GRIDS, PlateFamily, quarter_turn, refuse_unusable_plate
+from sfm.targets.codes.tags import opencv_dictionary
+
+LEAST_SIDE, LEAST_DOTS, LEAST_CROSSINGS = 3, 20, 12
+FILLED = 0.8  # of the places of a plate hold dots
+# A dot so many standard deviations larger than those around it in two photographs is a mark.
+MARK_SIGMAS = 5.0
+# Boards are sought in photographs of at most this size, px.
+SEARCHED_PX = 1600
+SMALLEST = (3, 3)  # board that OpenCV is asked for, and for any larger one
+MAX_SQUARES = 40  # along a side of a ChArUco board
+OFF_PLACE = 0.15  # of a square, between a tag and its place on the board
+_LARGER = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+
+
+def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
+    """Return the checkerboard that photographs (uint8) show, the longer side as columns; None without.
+
+    Source: Duda and Frese (2018), in OpenCV, for boards of any size.
+    """
+    sizes = Counter[tuple[int, int]]()
+    for grey in photographs:
+        scale = min(1.0, SEARCHED_PX / max(grey.shape))
+        small = (
+            cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+        )
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
+        if found and meta is not None and min(meta.shape[:2]) >= LEAST_SIDE:
+            sizes[min(meta.shape[:2]), max(meta.shape[:2])] += 1
+    for (rows, columns), count in sizes.most_common():
+        if count > 1 and rows * columns >= LEAST_CROSSINGS:
+            plate = PlateFamily("checkerboard", rows, columns)
+            if _named(photographs, plate):
+                return plate
+    return None
+
+
+def search_charuco(
+    photographs: Sequence[AnyArray], dictionary: str, tags: Sequence[tuple[IntArray, FloatArray]]
+) -> PlateFamily | None:
+    """Return the ChArUco board that photographs show; None where their tags are on none.
+
+    Args:
+        photographs: intensities, uint8, each (H, W).
+        dictionary: of the tags, a name in tags.DICTIONARIES.
+        tags: numbers (t,) and corners (t, 4, 2), px, of the tags in each photograph.
+    """
+    last = max((int(number.max()) for number, _ in tags if len(number)), default=0)
+    for across in range(2, MAX_SQUARES):
+        down = next((n for n in range(2, MAX_SQUARES) if across * n // 2 > last), None)
+        if down is None:
+            continue
+        board = cv2.aruco.CharucoBoard((across, down), 1.0, 0.5, opencv_dictionary(dictionary))
+        middle = np.array(board.getObjPoints())[:, :, :2].mean(axis=1)
+        shares = [share for one in tags if (share := _tag_share(*one, middle)) is not None]
+        if len(shares) < 2:
+            continue
+        share = round(float(np.median(shares)), 3)
+        plate = PlateFamily("charuco", down - 1, across - 1, (), dictionary, share)
+        if min(plate.rows, plate.columns) > 1 and _named(photographs, plate):
+            return plate
+    return None
+
+
+def search_dots(
+    photographs: Sequence[tuple[FloatArray, FloatArray, IntArray]],
+) -> PlateFamily | None:
+    """Return the plate of dots that photographs show whole; None without one.
+
+    Args:
+        photographs: of each the centres of its circles, px, (k, 2), their mean radii, px, (k,), and their
+            polarities, (k,).
+    """
+    seen: dict[tuple[str, int, int], list[tuple[IntArray, FloatArray]]] = {}
+    for xy, radius, polarity in photographs:
+        is_ring = polarity != (1 if (polarity > 0).sum() > len(polarity) / 2 else -1)
+        lattice = find_lattice(xy, ~is_ring)
+        if lattice is None or len(lattice.rows) < LEAST_DOTS:
+            continue
+        size = size_of_marks(lattice, radius, is_ring)
+        for name in GRIDS:
+            whole = [
+                (plate, place)
+                for place in placements(lattice, PlateFamily(name, 1, 1))
+                if (plate := _whole_plate(name, place)) is not None
+            ]
+            if whole and _apart(whole[0][0], whole[0][1], lattice.xy) == name:
+                plate, place = min(whole, key=lambda one: one[0].rows > one[0].columns)
+                seen.setdefault((name, plate.rows, plate.columns), []).append((place, size))
+    for (name, rows, columns), found in sorted(seen.items(), key=lambda one: -len(one[1])):
+        if len(found) > 1:
+            return _with_marks(PlateFamily(name, rows, columns), found)
+    return None
+
+
+def shows_a_lattice(xy: FloatArray) -> bool:
+    """Return whether most of the circles of a photograph (px, (k, 2)) are in rows and columns."""
+    lattice = find_lattice(xy, np.ones(len(xy), dtype=bool))
+    return lattice is not None and len(lattice.rows) > max(LEAST_DOTS, len(xy) / 2)
+
+
+def _named(photographs: Sequence[AnyArray], plate: PlateFamily) -> bool:
+    """Return whether two photographs show at least half of the crossings of a board."""
+    found = 0
+    for grey in photographs:
+        # the noise is of no consequence for what is found
+        saddles, _ = find_crossings(grey, plate, scale=255.0, noise=1.0)
+        found += len(saddles.xy) >= max(plate.count / 2, LEAST_CROSSINGS / 2)
+        if found > 1:
+            return True
+    return False
+
+
+def _tag_share(number: IntArray, quads: FloatArray, middle: FloatArray) -> float | None:
+    """Return the side of tags in squares if they are at their places on a board, whose middles are given."""
+    if len(number) < 4:
+        return None
+    H, _ = cv2.findHomography(quads.mean(axis=1), middle[number])
+    if H is None:
+        return None
+    placed = cv2.perspectiveTransform(quads.reshape(1, -1, 2), H).reshape(-1, 4, 2)
+    if np.hypot(*(placed.mean(axis=1) - middle[number]).T).max() > OFF_PLACE:
+        return None
+    share = float(np.median(np.linalg.norm(placed - np.roll(placed, 1, axis=1), axis=2)))
+    return share if 0 < share < 1 else None
+
+
+def _whole_plate(name: str, place: IntArray) -> PlateFamily | None:
+    """Return the plate that dots at rows and columns fill; None where they do not."""
+    place = place - place.min(axis=0)
+    rows, steps = (int(n) for n in place.max(axis=0) + 1)
+    shifted = PlateFamily(name, rows, 1).is_shifted
+    plate = PlateFamily(name, rows, steps // 2 if shifted else steps)
+    if min(plate.rows, plate.columns) < LEAST_SIDE or len(place) < FILLED * plate.count:
+        return None
+    if shifted and (steps % 2 or ((place[:, 0] + place[:, 1]) % 2).any()):
+        return None
+    return plate
+
+
+def _apart(plate: PlateFamily, place: IntArray, xy: FloatArray) -> str:
+    """Return the arrangement whose distance of rows comes nearest to what a photograph shows."""
+    if not plate.is_shifted:
+        return plate.name
+    place = place - place.mean(axis=0)
+    step = np.linalg.lstsq(place, xy - xy.mean(axis=0), rcond=None)[0]
+    apart = float(np.hypot(*step[0]) / np.hypot(*step[1]) / 2)
+    shifted = {name: grid.apart for name, grid in GRIDS.items() if grid.shift}
+    return min(shifted, key=lambda name: abs(np.log(apart / shifted[name])))
+
+
+def _with_marks(plate: PlateFamily, found: Sequence[tuple[IntArray, FloatArray]]) -> PlateFamily:
+    """Return a plate with the dots that are larger in two photographs as marks, if they show its turn."""
+    tables = []
+    for place, size in found:
+        place = place - place.min(axis=0)
+        table = np.full(place.max(axis=0) + 1, -np.inf)
+        table[place[:, 0], place[:, 1]] = size
+        tables.append(table)
+    best: tuple[float, PlateFamily] = (0.0, plate)
+    for first, second in itertools.combinations(tables, 2):
+        for turn in range(4):
+            turned = quarter_turn(np.argwhere(np.isfinite(second)), turn)
+            low = turned.min(axis=0)
+            if tuple(np.ptp(turned, axis=0) + 1) != first.shape:
+                continue
+            other = np.full(first.shape, -np.inf)
+            other[tuple((turned - low).T)] = second[np.isfinite(second)]
+            both = np.minimum(first, other)
+            row, step = np.nonzero(both > MARK_SIGMAS)
+            column = step // 2 if plate.is_shifted else step
+            marks = tuple(zip(row.tolist(), column.tolist(), strict=True))
+            marked = PlateFamily(plate.name, plate.rows, plate.columns, marks)
+            try:
+                refuse_unusable_plate(marked)
+            except GeometryError:
+                continue
+            best = max(best, (float(both[row, step].sum()), marked), key=lambda one: one[0])
+    return best[1]
