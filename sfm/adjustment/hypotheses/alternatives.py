@@ -302,7 +302,7 @@ class _Part:
     def gain(self, factor: FloatArray) -> Gain:
         """Return the gain where the photographs have the family with these factors."""
         return gain_of(
-            np.einsum("i,iajb,j->ab", factor, self.H, factor, optimize=True),
+            np.tensordot(np.tensordot(factor, self.H, (0, 0)), factor, (1, 0)),
             factor @ self.g,
             factor**2 @ self.squares,
         )
@@ -310,7 +310,7 @@ class _Part:
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:
         """Return how much the photographs differ in the family beyond what a pattern explains."""
         m = len(self.g)
-        left = self.g + np.einsum("iajb,j,b->ia", self.H, factor, gain.beta, optimize=True)
+        left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
         some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
         values, ranks = gains_of(self.blocks[some], left[some], self.squares[some])
         redundancy = int(ranks.sum()) - gain.rank
@@ -331,7 +331,7 @@ class _Part:
             for _ in range(ROUNDS):
                 beta = self.gain(factor).beta
                 # v'Pv as a function of the factors: s'Qs + 2 l's with beta held, one photograph after another
-                Q = np.einsum("a,iajb,b->ij", beta, self.H, beta, optimize=True)
+                Q = np.tensordot(beta, self.H, (0, 1)) @ beta
                 linear = self.g @ beta
                 again = factor.copy()
                 for i in range(m):

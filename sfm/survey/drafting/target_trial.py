@@ -13,6 +13,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, PhotographError
+from sfm.kernels.sampling import as_grey
 from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
@@ -109,7 +110,7 @@ def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray
     assert isinstance(rings, CodeFamily)
     levels = np.column_stack([targets.background, targets.contrast])
     shape = shape_from_axes(targets.semi_axes, targets.angle)
-    return read_codes(photograph, targets.xy, shape, levels, rings, blur_px=targets.blur)[0]
+    return read_codes(as_grey(photograph), targets.xy, shape, levels, rings, blur_px=targets.blur)[0]
 
 
 def _tags_and_boards(
