@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +81,7 @@ def find_targets(
     codes: str | TargetFamily = "none",
     centres: str = "model",
     min_diameter_px: float = 4.0,
-    max_diameter_px: float = 250.0,
+    max_diameter_px: float = math.inf,
 ) -> Targets:
     """Find, measure and decode the targets of one photograph.
 
@@ -96,7 +97,7 @@ def find_targets(
             edges (ellipse through the edges on rays), or the centroid with binary, intensity or squared
             weights.
         min_diameter_px: least minor axis of a target.
-        max_diameter_px: largest major axis of a target.
+        max_diameter_px: largest major axis of a target, without: the width of the photograph.
 
     Returns:
         The targets in order of rows, and the rejected candidates.

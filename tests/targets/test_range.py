@@ -1,4 +1,4 @@
-"""The range of targets that is found: 3 to 200 px, tilts to 75 degrees, touching, any channel of colour."""
+"""The range of targets that is found: 3 to 1100 px, tilts to 75 degrees, touching, any channel of colour."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag
+from tests.targets.shapes import polygon_coverage
 from tests.targets.test_bound import coverage
 
 PITCH = 260
@@ -72,6 +73,27 @@ def test_all_sizes_and_tilts_of_both_polarities_in_one_photograph(sixteen_bit: b
         one = find_targets(image, polarity=polarity, min_diameter_px=2.5)
         assert (one.polarity == sign).all()
         assert len(one) == len(truth) // 2
+
+
+def test_a_target_may_be_as_large_as_the_photograph() -> None:
+    """Dots of 400 to 1100 px across, each alone: found, and as far from the truth as their sigma allows."""
+    rng, normalised = np.random.default_rng(5), []
+    height, width = 1200, 1300
+    phi = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
+    for a in (200, 300, 450, 560):
+        centre = np.array([width / 2, height / 2]) + rng.uniform(-15, 15, 2)
+        b, turn = a * rng.uniform(0.8, 1), 0.4
+        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) * (a, b)
+        outline = centre + 0.5 + np.stack([np.cos(phi), np.sin(phi)], axis=1) @ axes.T
+        sharp = (200 - 155 * polygon_coverage(outline, height, width)).astype(np.float32)
+        image = cv2.GaussianBlur(sharp, (0, 0), 0.9)
+        image += 2 * rng.standard_normal(image.shape, dtype=np.float32)
+        targets = find_targets(np.rint(image).clip(0, 255).astype(np.uint8))
+        (k,) = np.flatnonzero(np.hypot(*(targets.xy - centre).T) < 1)
+        assert targets.semi_axes[k] == pytest.approx((a, b), abs=0.1)
+        root = np.linalg.cholesky(targets.covariance[k])
+        normalised.append(np.linalg.solve(root, targets.xy[k] - centre))
+    assert np.sqrt(np.mean(np.square(normalised))) < 1.7  # of 8 values; the 0.999 quantile is 1.8
 
 
 def test_touching_and_cut_targets_are_not_measured_as_one() -> None:
