@@ -26,6 +26,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.network import Estimate, InteriorObservations, Network
+from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, kinds_of
 from tests.survey.faults import EVERY, FAULTS, planted
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -210,6 +211,14 @@ def test_a_point_that_moved_far_is_named_with_its_distance(distance: float) -> N
     assert kinds_of(found) == ("points_moved",)
     assert found[0].names("points") == ("8",)
     assert found[0].number("distance") == pytest.approx(distance, rel=0.1)
+
+
+@pytest.mark.parametrize(("kind", "severity"), [("third moved", "error"), ("some moved", "warning")])
+def test_many_points_that_moved_far_leave_no_result_and_a_few_a_fair_one(kind: str, severity: str) -> None:
+    one = planted(kind, 500 if severity == "error" else 504)
+    (found,) = judge_alternatives(solved(one.network, one.start)).causes
+    assert found.kind == "points_moved" and found.number("shift") > 10
+    assert (found.severity, found.number("rms") > WRONG_SIGMAS) == (severity, severity == "error")
 
 
 def test_held_parameters_that_are_wrong_are_found_and_right_ones_are_not() -> None:

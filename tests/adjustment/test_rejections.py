@@ -193,6 +193,7 @@ def test_points_that_moved_at_one_place_of_the_sequence_are_one_remark() -> None
     assert [one.names("from") for one in found[:3]] == [("D",), ("E",), ("F",)]
     assert [one.number("distance") for one in found[:3]] == [4.0, 2.0, 3.0]
     assert [one.number("shift") for one in found[:3]] == [5.0, 7.0, 6.0]
+    assert {one.severity for one in found} == {"warning"}  # the result does not depend on rejected ones
     alone = found[3]
     assert alone.names("point") == ("p3",) and alone.names("photographs") == ("E", "H")
     assert (alone.number("distance"), alone.number("sigmas")) == (1.0, 9.0)

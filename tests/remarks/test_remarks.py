@@ -120,6 +120,19 @@ def test_limits_of_severity(kind: str) -> None:
         assert severity(0.99 * error) == "warning" and severity(1.01 * error) == "error"
 
 
+SHIFTING = [name for name, row in KINDS.items() if isinstance(row.severity, Grade) and row.severity.also]
+
+
+def test_alternatives_that_shift_coordinates_have_one_grade() -> None:
+    assert len(SHIFTING) == 9 and "points_moved" in SHIFTING
+    for kind in SHIFTING:
+        severity = [
+            Remark(kind, numbers={"shift": Quantity(shift), "rms": Quantity(rms)}).severity
+            for shift, rms in ((2.9, 1.0), (3.1, 1.0), (100.0, 4.9), (100.0, 5.1), (5.1, 5.1))
+        ]
+        assert severity == ["note", "warning", "warning", "error", "error"], kind
+
+
 def test_every_kind_is_made_somewhere() -> None:
     source = "\n".join(
         path.read_text(encoding="utf-8")

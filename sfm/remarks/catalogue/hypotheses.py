@@ -7,7 +7,6 @@ from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 # Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
 # limits that anybody expects.
 SHIFT = Grade("shift", warning=3.0, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
-LOCAL = Grade("shift", warning=3.0)  # of a few points, which the remark names
 SHIFTED = "Coordinates shift by up to {shift} standard deviations, {rms} RMS."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
 
@@ -85,7 +84,7 @@ ROWS = (
     ),
     Kind(
         "points_moved",
-        LOCAL,
+        SHIFT,  # a few points leave the RMS of all small
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
         f"{INSTEAD}",
         "targets or parts of the object moved during the survey",
