@@ -24,6 +24,7 @@ LAYERS = (
             "sfm.network_check",
             "sfm.depth_reversal",
             "sfm.similarity",
+            "sfm.units",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
         *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.remarks"),

@@ -48,17 +48,12 @@ from sfm.comparison.stable_points import (
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, mean_distance
+from sfm.units import UnitFactor, find_unit
 
 ALPHA = 0.001  # probability of a cause where there is none, of all rows together
 PERMUTATIONS = 999  # of the names; with as many the level of the permutation test is 0.001
 MIN_PERMUTED = 7  # points whose permutations are more than PERMUTATIONS
 MIRROR = np.diag([1.0, 1.0, -1.0])
-UNITS = {
-    **{10.0: ("mm", "cm"), 100.0: ("cm", "m"), 1e3: ("mm", "m"), 1e6: ("um", "m")},
-    **{25.4: ("mm", "inch"), 2.54: ("cm", "inch"), 1 / 0.0254: ("inch", "m"), 12.0: ("inch", "foot")},
-    **{304.8: ("mm", "foot"), 30.48: ("cm", "foot"), 1 / 0.3048: ("foot", "m")},
-}
-"""factors of lengths by what the finer and the coarser unit are"""
 
 
 @dataclass(frozen=True)
@@ -98,7 +93,8 @@ class Cause:
     other_object: bool = False  # nothing does: the points have nothing to do with one another
     lengths: float = 1.0  # of the second result over those of the first, if the scale is another
     lengths_sigma: float = 0.0
-    unit: tuple[str, str] | None = None  # finer and coarser unit of which `lengths` is the factor
+    unit: UnitFactor | None = None  # that lengths of the whole are given in another unit, if they are
+    rest: bool = False  # whether lengths differ beyond the unit, if the scale is another
     stretches: tuple[Stretch, ...] = ()  # significant ones, the largest first, if there is a strain
     renamed: tuple[tuple[str, str], ...] = ()  # name in the first result and name of the same in the second
     moved: tuple[str, ...] = ()  # points that differ besides
@@ -116,6 +112,7 @@ class _Fit:
     agreed: bool  # whether a majority of the points agrees
     stable: BoolArray
     lengths: tuple[float, float]  # of b over those of a, and the standard deviation
+    unit: UnitFactor | None  # of lengths
     stretches: tuple[Stretch, ...]
     other: IntArray | None  # point of b that is each of a, -1 for none; None where names are as given
 
@@ -233,6 +230,7 @@ def _fitted(
         T = replace(T, rotation=T.rotation @ MIRROR)
     if whole:  # large ones too
         T = fit_affinity(T, pairs.a, pairs.b, reference)
+    unit = None if pairs.scale is None else find_unit(pairs.scale / T.scale)
     d, Q = pairs.differences(T)
     similarity = motions(pairs.a)
     G = similarity[:, : MOTIONS["similarity" if estimated else "rigid"]]
@@ -245,7 +243,8 @@ def _fitted(
         exchanged = int(((other >= 0) & (other != np.arange(len(other)))).sum())
         searched = exchanged * math.log(len(other))
     penalty = lost * cost + parameters / 2 * math.log(3 * n) + searched
-    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, np.zeros(n, dtype=bool), (1.0, 0.0), (), other)
+    nobody = np.zeros(n, dtype=bool)
+    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, nobody, (1.0, 0.0), unit, (), other)
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
     if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
         return failed
@@ -267,8 +266,9 @@ def _fitted(
     moved = candidates - int(found.stable.sum())
     penalty += moved * cost + math.log(math.comb(candidates, moved))
     lengths = _lengths(pairs, T, d, Q, similarity, found.stable) if row.scale else (1.0, 0.0)
-    stretches = _stretches(pairs, T, d, Q, similarity, found.stable) if row.strain else ()
-    return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, stretches, other)
+    factor = unit.factor if unit else 1.0
+    stretches = _stretches(pairs, T, d, Q, similarity, found.stable, factor) if row.strain else ()
+    return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, unit, stretches, other)
 
 
 def _relative_sigma(pairs: PointPairs) -> float:
@@ -299,11 +299,18 @@ def _lengths(
 
 
 def _stretches(
-    pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, whole: FloatArray, stable: BoolArray
+    pairs: PointPairs,
+    T: Similarity,
+    d: FloatArray,
+    Q: FloatArray,
+    whole: FloatArray,
+    stable: BoolArray,
+    unit: float,
 ) -> tuple[Stretch, ...]:
     """Return the principal strains that are significant, by the stable points, the largest first.
 
-    Where the scale is not known to both, they are relative to the middle one.
+    Lengths of the second are taken as so many times too large, by their unit. Where the scale is not known
+    to both, they are relative to the middle one.
     """
     among = candidates_of(d, Q, whole[:, : MOTIONS["similarity" if pairs.scale is None else "rigid"]], stable)
     axes, along = extended_axes(pairs.a)
@@ -317,7 +324,7 @@ def _stretches(
         N += np.trace(N) * np.outer(i == j, i == j)
     covariance = np.linalg.inv(N)
     left = np.tensordot(covariance @ (S.T @ (among.P @ among.d)), tensors, 1)
-    F = (pairs.scale or 1.0) * np.linalg.solve(T.scale * T.rotation, np.eye(3) + left)
+    F = (pairs.scale or 1.0) / unit * np.linalg.solve(T.scale * T.rotation, np.eye(3) + left)
     squares, directions = np.linalg.eigh(F.T @ F)
     lengths = np.sqrt(squares)
     gradient = np.einsum("xa,kxy,ya->ak", directions, tensors, directions)
@@ -334,14 +341,9 @@ def _stretches(
 
 def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
     """Put in words of the field what a row found."""
-    row, (lengths, sigma) = fit.row, fit.lengths
-    unit = None
-    if row.scale:
-        limit = math.sqrt(critical_value(ALPHA / len(UNITS), 1, pairs.redundancy))
-        for factor, names in UNITS.items():
-            for value in (factor, 1 / factor):
-                if abs(lengths - value) <= limit * sigma:
-                    unit = names
+    row, (lengths, sigma), unit = fit.row, fit.lengths, fit.unit
+    limit = math.sqrt(critical_value(ALPHA, 1, pairs.redundancy))
+    rest = row.scale and (unit is None or abs(lengths - unit.factor) > limit * sigma)
     renamed: tuple[tuple[str, str], ...] = ()
     if fit.other is not None:
         renamed = tuple(
@@ -353,6 +355,7 @@ def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
         lengths=lengths,
         lengths_sigma=sigma,
         unit=unit,
+        rest=rest,
         stretches=fit.stretches,
         renamed=renamed,
         moved=moved,

@@ -44,10 +44,14 @@ def remarks_of_cause(
         yield remark("another_object", points=points, **between)
     if row.mirror:
         yield remark("mirrored", **between)
-    if row.scale:
-        kind = "lengths_differ" if cause.unit is None else "unit_differs"
-        numbers = {"lengths": cause.lengths, "sigma": cause.lengths_sigma}
-        yield remark(kind, unit=cause.unit and " and ".join(cause.unit), moved=moved, **numbers, **between)
+    factor = cause.unit.factor if cause.unit else 1.0
+    units = dict(zip(("finer", "coarser"), cause.unit.units, strict=True)) if cause.unit else {}
+    if units:
+        last = not (cause.rest or row.strain or row.bending)
+        yield remark("unit_differs", factor=factor, moved=moved if last else None, **units, **between)
+    if row.scale and cause.rest:
+        numbers = {"lengths": cause.lengths / factor, "sigma": cause.lengths_sigma / factor}
+        yield remark("lengths_differ", moved=moved, **numbers, **units, **between)
     if row.names:
         exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
         yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
@@ -80,7 +84,8 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
         yield _differences(found, longest, unit)
     tested = int(np.isfinite(found.statistic).sum())
     if found.untested is not None:
-        yield found.untested
+        if found.cause is None or found.untested.kind != "untestable":  # its cause was found and tested
+            yield found.untested
     elif found.approximate:
         yield remark("tested_singly")
     elif tested <= MAX_POINTS < len(found.points):

@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.comparison import causes
-from sfm.comparison.causes import UNITS, PointPairs, Row, find_cause, is_unrelated
-from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.causes import PointPairs, Row, find_cause, is_unrelated
+from sfm.comparison.findings import remarks_of_cause, verdict_of_comparison
 from sfm.comparison.point_pairs import ROUNDING
 from sfm.comparison.point_patterns import find_pattern
 from sfm.comparison.significance import compare_results
 from sfm.conventions import rotation_from_vector
+from sfm.remarks.remark import kinds_of
 from sfm.similarity import Similarity
+from sfm.units import UNITS
 from tests.comparison.causes import EXPECTED, compared, epochs, expected, pair, transformed
-from tests.synthetic import seed_of
+from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 CAUSES = {kind for kinds in EXPECTED.values() for kind in kinds} - {"points_differ"}
 
@@ -65,14 +69,44 @@ def pairs_of(scale: float, size: float = 1.0, sigma: float = 1e-5, n: int = 30) 
 @pytest.mark.parametrize("factor", [*UNITS, *(1 / factor for factor in UNITS)])
 def test_every_unit_is_known(factor: float) -> None:
     found = find_cause(pairs_of(factor))
-    assert found is not None and found.row == Row(scale=True)
-    assert found.unit == next(names for value, names in UNITS.items() if factor in (value, 1 / value))
+    assert found is not None and found.row == Row(scale=True) and not found.rest
+    assert found.unit is not None and found.unit.factor == pytest.approx(factor)
 
 
-def test_a_scale_beside_a_unit_is_a_scale() -> None:
-    found = find_cause(pairs_of(1000.5))
-    assert found is not None and found.unit is None
-    assert abs(found.lengths - 1000.5) < 4 * found.lengths_sigma
+def test_a_scale_beside_a_unit_is_reported_beside_it() -> None:
+    """Millimetres for metres, and an object that expanded: 1000.5 was a wrong bar, or warmth."""
+    cause = find_cause(pairs_of(1000.5))
+    assert cause is not None and cause.rest
+    assert abs(cause.lengths - 1000.5) < 4 * cause.lengths_sigma
+    unit, scale = remarks_of_cause(cause, "a", "b", 30, (1.0, "m"))
+    assert (unit.kind, unit.number("factor")) == ("unit_differs", 1000.0)
+    assert scale.kind == "lengths_differ" and scale.number("sigma") < 1e-5
+    assert abs(scale.number("lengths") - 1.0005) < 4 * scale.number("sigma")
+    assert [one.names(name) for one in (unit, scale) for name in ("finer", "coarser")] == 2 * [
+        ("mm",),
+        ("m",),
+    ]
+
+
+def test_a_strain_beside_a_unit_is_that_of_lengths_in_one_unit() -> None:
+    a = pairs_of(1000.0)
+    cause = find_cause(replace(a, b=a.b * [1.001, 1.0, 1.0]))
+    assert cause is not None and cause.row == Row(strain=True)
+    unit, strain = remarks_of_cause(cause, "a", "b", 30, (1.0, "m"))
+    assert (unit.kind, unit.number("factor")) == ("unit_differs", 1000.0)
+    assert strain.kind == "strained" and abs(strain.number("lengths") - 1.001) < 1e-4
+
+
+def test_what_a_unit_explains_is_tested() -> None:
+    """Beside the cause, the covariance of coordinates 1000 times as large was called singular."""
+    network, truth = make_network(seed_of("cmp"), images=10, points=40)
+    first, second = (
+        stored_of(name, adjust(observed_anew(network, truth, 0.1, seed_of(name)), truth, datum=Datum("free")))
+        for name in ("first", "second")
+    )
+    grown = transformed(second, 1000.3 * np.eye(3), np.zeros(3), np.arange(40))
+    kinds = kinds_of(verdict_of_comparison(compare_results(first, grown)).remarks)
+    assert kinds[:2] == ("unit_differs", "lengths_differ") and "untestable" not in kinds
 
 
 def test_results_that_differ_by_rounding_do_not_differ() -> None:

@@ -17,19 +17,6 @@ from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit"), [(1015.0, 1000.0), (1 / 985.0, 1000.0), (1030.0, None), (25.0, 25.4), (11.0, None)]
-)
-def test_a_factor_is_that_of_a_unit_within_two_percent(factor: float, unit: float | None) -> None:
-    assert given_scales._unit_factor(float(np.log(factor))) == unit
-
-
-def test_units_of_length() -> None:
-    mm = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
-    apart = {max(a, b) / min(a, b) for a in mm.values() for b in mm.values() if a != b}
-    assert set(given_scales.UNIT_FACTORS) <= {round(one, 6) for one in apart}
-
-
 @pytest.mark.parametrize(("off", "contradicted"), [(0.006, False), (0.01, True)])
 def test_a_print_may_be_half_a_percent_larger_than_stated(off: float, contradicted: bool) -> None:
     """Of coordinates without standard deviations, whose scale is known to 0.2 %: beyond 3.8 times that."""

@@ -8,15 +8,16 @@ ROWS = (
     Kind(
         "lengths_differ",
         "error",
-        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[; "
-        "{moved:point} {moved:differs|differ} besides]].",
+        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[, beside "
+        "the factor between {finer} and {coarser}]][[; {moved:point} {moved:differs|differ} besides]].",
         "a scale bar or control that is wrong in one of them, or an object that expanded, as warmth does",
         "Check the lengths of the scale bars, and the temperature of both surveys.",
     ),
     Kind(
         "unit_differs",
         "error",
-        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}, the factor of {unit}"
+        "Lengths in {second} are {factor:.8g} times those in {first}, the factor between {finer} "
+        "and {coarser}"
         "[[; {moved:point} {moved:differs|differ} besides]].",
         "lengths of bars or control were entered in another unit than the survey states",
         "Enter them in the object unit of the survey, or correct the unit.",

@@ -20,9 +20,8 @@ from sfm.network import ScaleBars
 from sfm.remarks.kind import significant
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
+from sfm.units import find_unit
 
-UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
-SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
 PRINT_SIGMA = (
     0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
 )
@@ -177,5 +176,5 @@ def _mean_scale(model: GivenModel, kept: list[int]) -> float:
 
 def _unit_factor(log: float) -> float | None:
     """Return the factor between two units that a difference of scale is; None if it is none."""
-    factor = float(np.exp(abs(log)))
-    return next((one for one in UNIT_FACTORS if abs(factor / one - 1) < SAME_UNIT), None)
+    found = find_unit(float(np.exp(abs(log))))
+    return found.factor if found else None
