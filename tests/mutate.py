@@ -1,10 +1,12 @@
 """What the tests hold: small changes of the program, each of which a test must notice.
 
-    python -m tests.mutate [COUNT [SEED]]       `make mutate`
+    python -m tests.mutate [COUNT [SEED [ROOM ...]]]       `make mutate`
 
 draws mutations of the rooms below: a comparison turned round, a sum in place of a difference, a threshold
 doubled or halved, a condition negated. Each is written into a copy of the project, the tests of its room run
-until one fails, and the table lists which survived. Nothing is changed in the project.
+until one fails, and the table lists which survived, and how many ended in no time, apart. Before, the tests
+of each room run on its unchanged modules, written in the same way; where they fail, nothing is counted.
+Nothing is changed in the project.
 
 Some change nothing that a test could notice: in score.py the centre of the motions that `_constraints` fixes,
 as rotations about any centre are the same motions, and the scale of the normals, which only rounding needs.
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import importlib
 import os
 import random
 import shutil
@@ -21,15 +24,20 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
+from typing import Literal
+
+import numpy as np
 
 from tests.places import ROOT
 
-TIMEOUT = 300  # s, of the tests of one mutation; one that never ends is noticed
+TIMEOUT = 300  # s, of the tests of one mutation
+Ended = Literal["killed", "survived", "timed out"]
 ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that hold it
     "sfm/adjustment/hypotheses": (
         "tests/adjustment/test_alternatives.py",
@@ -59,6 +67,19 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         )
         for module in ("given_values", "given_points")
     },
+    "sfm/adjustment/quality/consistency.py": ("tests/report/test_consistency.py",),
+    "sfm/adjustment/quality/other_solutions.py": (
+        "tests/adjustment/test_other_solutions.py",
+        "tests/survey/test_weak_networks.py",
+    ),
+    "sfm/comparison/causes.py": ("tests/comparison/test_causes.py",),
+    "sfm/remarks/catalogue": ("tests/remarks",),
+    "sfm/survey/hypotheses": (
+        "tests/survey/test_given_thresholds.py",
+        "tests/survey/test_wrong_scale.py",
+        "tests/survey/test_mistyped.py",
+    ),
+    "sfm/units.py": ("tests/test_units.py",),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
 }
 COMPARED = {
@@ -81,8 +102,9 @@ class Mutation:
 def mutations_of(file: str, tests: tuple[str, ...]) -> Iterator[Mutation]:
     """Return all mutations of a module."""
     tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    numbers = _numbers_of(file)
     for number, node in enumerate(ast.walk(tree)):
-        for what, change in _changes(node):
+        for what, change in _changes(node, numbers):
             changed = copy.deepcopy(tree)
             other = next(one for k, one in enumerate(ast.walk(changed)) if k == number)
             change(other)
@@ -90,7 +112,21 @@ def mutations_of(file: str, tests: tuple[str, ...]) -> Iterator[Mutation]:
             yield Mutation(file, line, what, ast.unparse(ast.fix_missing_locations(changed)), tests)
 
 
-def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
+def _numbers_of(file: str) -> dict[str, object]:
+    """Return the constants of a module that are numbers, or several, however they are written."""
+    module = importlib.import_module(file.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
+    return {name: value for name, value in vars(module).items() if name.isupper() and _is_number(value)}
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, tuple):
+        return len(value) > 0 and all(_is_number(one) for one in value)
+    if isinstance(value, np.ndarray):
+        return bool(np.issubdtype(value.dtype, np.number))
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def _changes(node: ast.AST, numbers: dict[str, object]) -> Iterator[tuple[str, Callable[..., object]]]:
     """Return what can be changed of a node: words, and a function that changes it."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARED:
         new = COMPARED[type(node.ops[0])]
@@ -106,9 +142,14 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, object]]:
             "condition negated",
             lambda one: setattr(one, "test", ast.UnaryOp(ast.Not(), one.test)),
         )
-    elif isinstance(node, ast.Assign) and _is_threshold(node):
-        for factor in (2.0, 0.5):
-            yield f"{ast.unparse(node.targets[0])} times {factor:g}", lambda one, f=factor: _scale(one, f)
+    elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        if isinstance(target, ast.Name) and target.id in numbers:
+            yield from _scalings(target.id, numbers[target.id])
+    elif isinstance(node, ast.Call):
+        for k, one in enumerate(node.keywords):
+            if one.arg is not None and _is_limit(node, one):
+                yield from _scalings(one.arg, 1.0, k)
 
 
 def _is_text(node: ast.BinOp) -> bool:
@@ -119,55 +160,82 @@ def _is_string(node: ast.AST) -> bool:
     return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 
-def _is_threshold(node: ast.Assign) -> bool:
-    """Return whether a number with a name of its own is set."""
-    target, value = node.targets[0], node.value
-    return (
-        isinstance(target, ast.Name)
-        and target.id.isupper()
-        and isinstance(value, ast.Constant)
-        and type(value.value) in (int, float)
-    )
+def _is_limit(call: ast.Call, one: ast.keyword) -> bool:
+    """Return whether a keyword is given a number that is no count or index, or a limit of a grade."""
+    if isinstance(call.func, ast.Name) and call.func.id == "Grade":
+        return one.arg in ("warning", "error")
+    return isinstance(one.value, ast.Constant) and isinstance(one.value.value, float) and one.value.value != 0
 
 
-def _scale(node: ast.Assign, factor: float) -> None:
-    assert isinstance(node.value, ast.Constant)
-    value = node.value.value
-    new = factor * value  # type: ignore[operator]
-    node.value = ast.Constant(max(round(new), 1) if isinstance(value, int) else new)
+def _scalings(
+    name: str, value: object, keyword: int | None = None
+) -> Iterator[tuple[str, Callable[..., object]]]:
+    """Return what makes a number, or each of several, twice and half as large."""
+
+    def scale(node: ast.Assign | ast.AnnAssign | ast.Call, factor: float) -> None:
+        owner = node if keyword is None else node.keywords[keyword]  # type: ignore[union-attr]
+        assert isinstance(owner, ast.Assign | ast.AnnAssign | ast.keyword) and owner.value is not None
+        parts = owner.value.elts if isinstance(owner.value, ast.Tuple) else [owner.value]
+        values = value if isinstance(owner.value, ast.Tuple) and isinstance(value, tuple) else [value]
+        new = [_times(*one, factor) for one in zip(parts, values, strict=True)]
+        owner.value = ast.Tuple(new, ast.Load()) if isinstance(owner.value, ast.Tuple) else new[0]
+
+    for factor in (2.0, 0.5):
+        yield f"{name} times {factor:g}", lambda node, f=factor: scale(node, f)
 
 
-def drawn(count: int, seed: int) -> list[Mutation]:
-    """Return so many mutations, spread over the rooms by their size."""
-    every: list[Mutation] = []
-    for room, tests in ROOMS.items():
-        path = ROOT / room
-        files = [path] if path.is_file() else sorted(path.glob("*.py"))
-        for file in files:
-            every += mutations_of(str(file.relative_to(ROOT)), tests)
+def _times(node: ast.expr, value: object, factor: float) -> ast.expr:
+    if isinstance(value, int):
+        return ast.Constant(max(round(factor * value), 1))
+    return ast.BinOp(ast.Constant(factor), ast.Mult(), node)
+
+
+def files_of(room: str) -> list[str]:
+    """Return the modules of a room."""
+    path = ROOT / room
+    files = [path] if path.is_file() else sorted(path.glob("*.py"))
+    return [file.relative_to(ROOT).as_posix() for file in files]
+
+
+def drawn(count: int, seed: int, rooms: Iterable[str]) -> list[Mutation]:
+    """Return so many mutations, spread over rooms by their size."""
+    every = [one for room in rooms for file in files_of(room) for one in mutations_of(file, ROOMS[room])]
     random.Random(seed).shuffle(every)
     return every[:count]
 
 
-def is_noticed(one: Mutation, folder: Path) -> bool:
-    """Return whether the tests of a mutation fail, in a copy of the project."""
-    path = folder / one.file
-    before = path.read_text(encoding="utf-8")
-    path.write_text(one.source, encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *one.tests]
+def run_changed(sources: dict[str, str], tests: tuple[str, ...], folder: Path) -> tuple[Ended, str]:
+    """Return how tests end where modules are other ones, in a copy of the project, and their output."""
+    before = {file: (folder / file).read_text(encoding="utf-8") for file in sources}
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     try:
-        ended = subprocess.run(command, cwd=folder, capture_output=True, timeout=TIMEOUT, env=environment)
-        return ended.returncode != 0
+        for file, source in sources.items():
+            (folder / file).write_text(source, encoding="utf-8")
+        ended = subprocess.run(
+            command, cwd=folder, capture_output=True, timeout=TIMEOUT, env=environment, text=True
+        )
+        return ("killed" if ended.returncode else "survived"), ended.stdout + ended.stderr
     except subprocess.TimeoutExpired:
-        return True
+        return "timed out", ""
     finally:
-        path.write_text(before, encoding="utf-8")
+        for file, source in before.items():
+            (folder / file).write_text(source, encoding="utf-8")
 
 
-def main(count: int = 100, seed: int = 1, processes: int = 2) -> int:
+def fails_unchanged(room: str, folder: Path) -> str:
+    """Return why the tests of a room say nothing: how they end on its unchanged modules; empty if well."""
+    parsed = {file: ast.parse((ROOT / file).read_text(encoding="utf-8")) for file in files_of(room)}
+    ended, output = run_changed(
+        {file: ast.unparse(tree) for file, tree in parsed.items()}, ROOMS[room], folder
+    )
+    return "" if ended == "survived" else f"{room}: {ended} without a change\n{output}"
+
+
+def main(count: int = 100, seed: int = 1, *rooms: str, processes: int = 2) -> int:
     """Run the mutations and print those that survive."""
-    some, found = drawn(count, seed), Counter[tuple[str, bool]]()
+    some, found = drawn(count, seed, rooms or ROOMS), Counter[tuple[str, Ended]]()
+    files = {one.file for one in some}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(processes) as pool:
         folders: Queue[Path] = Queue()
         for k in range(processes):
@@ -177,24 +245,45 @@ def main(count: int = 100, seed: int = 1, processes: int = 2) -> int:
             )
             folders.put(copied)
 
-        def tried(one: Mutation) -> bool:
+        @contextmanager
+        def a_copy() -> Iterator[Path]:
             folder = folders.get()
             try:
-                return is_noticed(one, folder)
+                yield folder
             finally:
                 folders.put(folder)
 
-        for one, noticed in zip(some, pool.map(tried, some), strict=True):
-            found[one.file, noticed] += 1
-            if not noticed:
-                print(f"survived: {one.file}:{one.line} {one.what}", flush=True)
-    print(f"{'room':50} killed of")
-    for file in sorted({file for file, _ in found}):
-        print(f"{file:50} {found[file, True]:6} {found[file, True] + found[file, False]}")
-    killed = sum(number for (_, noticed), number in found.items() if noticed)
-    print(f"{'all':50} {killed:6} {len(some)}  {100 * killed / max(len(some), 1):.0f} %")
-    return 0 if killed >= 0.95 * len(some) else 1
+        def why_failed(room: str) -> str:
+            with a_copy() as folder:
+                return fails_unchanged(room, folder)
+
+        def ended_of(one: Mutation) -> Ended:
+            with a_copy() as folder:
+                return run_changed({one.file: one.source}, one.tests, folder)[0]
+
+        drawn_rooms = [room for room in ROOMS if files & set(files_of(room))]
+        failed = [why for why in pool.map(why_failed, drawn_rooms) if why]
+        if failed:
+            print("\n".join(failed))
+            return 2
+
+        for one, ended in zip(some, pool.map(ended_of, some), strict=True):
+            found[one.file, ended] += 1
+            if ended != "killed":
+                print(f"{ended}: {one.file}:{one.line} {one.what}", flush=True)
+    print(f"{'room':50} killed survived timed out")
+    for file in sorted(files):
+        print(_row(file, *(found[file, ended] for ended in ("killed", "survived", "timed out"))))
+    killed, survived, out = (
+        sum(found[file, ended] for file in files) for ended in ("killed", "survived", "timed out")
+    )
+    print(_row("all", killed, survived, out), f" {100 * killed / max(killed + survived, 1):.0f} %")
+    return 0 if killed >= 0.95 * (killed + survived) else 1
+
+
+def _row(name: str, killed: int, survived: int, out: int) -> str:
+    return f"{name:50} {killed:6} {survived:8} {out:9}"
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(one) for one in sys.argv[1:])))
+    sys.exit(main(*(int(one) for one in sys.argv[1:3]), *sys.argv[3:]))

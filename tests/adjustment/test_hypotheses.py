@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import hypotheses
+from sfm.adjustment.hypotheses import refit as refitting
 from sfm.adjustment.hypotheses.alternatives import interiors
 from sfm.adjustment.hypotheses.columns import (
     CAMERA,
@@ -25,6 +28,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.errors import GeometryError
 from sfm.network import Estimate, InteriorObservations, Network
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, kinds_of
@@ -302,6 +306,42 @@ def moved_twice(seed: str) -> Adjustment:
     middle = (seen.image >= 5) & (seen.image < 10)
     xy = np.where(middle[:, None], there, seen.xy)
     return solved(replace(network, image_points=replace(seen, xy=xy)), truth)
+
+
+def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of most evidence, which are listed first."""
+    every = [
+        SimpleNamespace(
+            kind=kind,
+            evidence=20.0,
+            gain=SimpleNamespace(value=0.0),
+            family=SimpleNamespace(cause=lambda one, k=k: (one.kind, k)),
+        )
+        for kind in ("object", "camera")
+        for k in range(5)
+    ]
+    tried: list[object] = []
+    monkeypatch.setattr(hypotheses, "columns_of", lambda _: None)
+    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
+    monkeypatch.setattr(hypotheses, "is_significant", lambda *_: True)
+    monkeypatch.setattr(hypotheses, "log_likelihood_gain", lambda *_: 0.0)
+    monkeypatch.setattr(hypotheses, "refit", lambda _, one, *__: tried.append(one))
+    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda *_: SimpleNamespace(redundancy=1))
+    assert hypotheses._best(SimpleNamespace(), ()) is None  # type: ignore[arg-type]
+    assert tried == [*every[:2], *every[5:7]]
+
+
+def test_a_step_is_halved_three_times(clean: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def refuse(network: Network, *_: object, **__: object) -> Adjustment:
+        tried.append(float(clean.network.image_points.xy[0, 0] - network.image_points.xy[0, 0]))
+        raise GeometryError("none")
+
+    monkeypatch.setattr(refitting, "adjust", refuse)
+    D = np.ones((len(clean.rejected), 2, 1))
+    assert refitting._stepped(clean, D, clean, np.zeros(1), np.ones(1)) is None
+    assert tried == pytest.approx([1.0, 0.5, 0.25, 0.125])
 
 
 def test_two_causes_are_adjusted_together() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from sfm.display import MAX_LISTED
 from sfm.remarks.catalogue import KINDS
+from sfm.remarks.catalogue.hypotheses import SHIFT
 from sfm.remarks.kind import Grade, Kind, significant
 from sfm.remarks.remark import Quantity, Remark, kinds_of, of_kind, remark, unless_note
 from sfm.remarks.verdict import judge, lines_of
@@ -91,12 +92,16 @@ def test_a_remark_is_plain_values_for_json() -> None:
     assert stored["numbers"]["ratio"]["value"] is None
 
 
-LIMITS = {  # by kind: the number, and from where it is a warning and an error
+LIMITS: dict[
+    str, tuple[str, float, float | None]
+] = {  # by kind: the number, and from where it is a warning and an error
     "sigma0_high": ("ratio", 2.0, 5.0),
     "residual_kept": ("over_sigma", 10.0, 30.0),
     "image_points_rejected": ("share", 0.05, None),
     "other_solution": ("moved", 0.0, 5.0),
     "other_solution_reversed": ("moved", 0.0, 5.0),
+    "given_contradicted": ("shift", 0.0, 5.0),
+    "given_differs": ("shift", 0.0, 5.0),
     "photographs_missing": ("share", 0.0, 0.5),
     "c_far_from_given": ("share", 5e-4, None),
     "c_hardly_determined": ("share", 0.05, 1.0),
@@ -104,6 +109,9 @@ LIMITS = {  # by kind: the number, and from where it is a warning and an error
     "key_points_not_measured": ("missing", 0.5, None),
     "targets_blurred": ("blur", 2.5, None),
 }
+
+
+SHIFTING = [name for name, row in KINDS.items() if row.severity is SHIFT]
 
 
 @pytest.mark.parametrize("kind", LIMITS)
@@ -120,7 +128,9 @@ def test_limits_of_severity(kind: str) -> None:
         assert severity(0.99 * error) == "warning" and severity(1.01 * error) == "error"
 
 
-SHIFTING = [name for name, row in KINDS.items() if isinstance(row.severity, Grade) and row.severity.also]
+def test_limits_of_all_grades_are_tested() -> None:
+    graded = {name for name, row in KINDS.items() if isinstance(row.severity, Grade)}
+    assert graded == {*LIMITS, *SHIFTING}
 
 
 def test_alternatives_that_shift_coordinates_have_one_grade() -> None:

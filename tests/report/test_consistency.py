@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
+from sfm.adjustment.quality import consistency
 from sfm.adjustment.quality.consistency import consistency_of
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, Network
@@ -33,6 +35,20 @@ def test_photographs_of_other_noise_are_told() -> None:
     xy = seen.xy + 0.3 * own[:, None] * rng.standard_normal((len(seen), 2))
     found = consistency_of(_solved(replace(network, image_points=replace(seen, xy=xy)), truth, "none")).uneven
     assert found is not None and found.worst == "image 5" and found.largest > 2 * found.median
+
+
+def _components(largest: float, redundancy: float) -> VarianceComponents:
+    """Return those of eight photographs, one of which has a larger one."""
+    names, r = tuple("abcdefgh"), np.full(8, redundancy)
+    return VarianceComponents(names, np.array([1.0] * 7 + [largest]), r, r.astype(int))
+
+
+def test_photographs_are_uneven_from_half_as_large_again() -> None:
+    assert consistency._uneven(_components(1.4, 1e4)) is None
+    found = consistency._uneven(_components(1.6, 1e4))
+    assert found is not None and (found.worst, found.largest, found.median) == ("h", 1.6, 1.0)
+    every = [consistency._uneven(_components(1.6, r)) for r in np.arange(2, 100, 0.5)]
+    assert 0.008 < max(one.probability for one in every if one is not None) <= 0.01
 
 
 def _false_alarms(runs: int) -> Counter[str]:

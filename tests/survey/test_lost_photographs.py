@@ -116,6 +116,19 @@ def test_another_c_orients_the_larger_part_of_what_was_lost(oriented: int, bette
     assert try_other_principal_distances(network, truth, alone, lambda _: whole) == (alone, ())
 
 
+def test_principal_distances_of_a_crop_factor_an_extender_and_zooms_are_tried() -> None:
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
+    tried = []
+
+    def refuse(values: Estimate) -> Orientation:
+        tried.append(values.cameras[0].value("c") / truth.cameras[0].value("c"))
+        raise GeometryError("none")
+
+    assert try_other_principal_distances(network, truth, few, refuse) == (few, ())
+    assert tried == pytest.approx([1.4, 0.7, 2.0, 0.5])
+
+
 @pytest.mark.parametrize(("times", "better"), [(1.0, True), (5.0, True), (60.0, False), (1e9, False)])
 def test_another_c_is_likelier_for_all_image_points(times: float, better: bool) -> None:
     """More photographs at residuals of 6 px are no better than some at 0.1 px, those of 0.5 px are."""

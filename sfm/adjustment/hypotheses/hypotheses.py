@@ -40,7 +40,7 @@ MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
-APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
+MIN_LEAD = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be separated
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
 
@@ -154,7 +154,11 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
         one
         for one in once.values()
         if one.kind != best.kind
-        and (most - level[id(one)] < APART if id(one) in level else abs(best.evidence - one.evidence) < APART)
+        and (
+            most - level[id(one)] < MIN_LEAD
+            if id(one) in level
+            else abs(best.evidence - one.evidence) < MIN_LEAD
+        )
     )
     return Cause(best, adjusted, near)
 

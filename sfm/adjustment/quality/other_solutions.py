@@ -38,7 +38,7 @@ WEAK_C = 5e-4  # relative standard deviation of c below which a network is not w
 FEW_PHOTOGRAPHS = 5  # from so many photographs on
 LARGE = 4000  # image points from which on a network is not weak
 BARRIER = 3e3  # times v'Pv of the result: what lies beyond is not looked for
-APART = 1.0  # standard deviations (root mean square) between solutions that are not the same
+MIN_APART_SIGMAS = 1.0  # root mean square between solutions that are not the same
 MAX_ITERATIONS = 60  # from planes, whose relief is to be found, some fifty
 NEAR = 1e-3  # |A dx| / |v| at which the network is followed to the next c
 
@@ -69,7 +69,7 @@ def other_solutions(
             at other values, and freed again from a better one.
 
     Returns:
-        None where the network is strong, the result did not converge, or nothing is redundant.
+        None of them where the network is strong, the result did not converge, or nothing is redundant.
     """
     a = adjustment
     if not a.converged or a.redundancy < 1 or len(a.network.image_points) > LARGE or not _weak(a):
@@ -88,8 +88,8 @@ def other_solutions(
     for candidate in candidates:
         points = candidate.estimate.points
         moved = _apart(points, a.estimate.points, sigma)
-        known = any(_apart(points, one.estimate.points, sigma) < APART for one in found)
-        if candidate.vPv > base.vPv * limit or not moved > APART or known:
+        known = any(_apart(points, one.estimate.points, sigma) < MIN_APART_SIGMAS for one in found)
+        if candidate.vPv > base.vPv * limit or not moved > MIN_APART_SIGMAS or known:
             continue
         camera, c, unit = _principal_distance(candidate.estimate.cameras)
         reflected = abs(np.log(c / own[1])) < np.log(STEP) / 2
@@ -122,8 +122,10 @@ def solution_before(
         return ()
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     moved = _apart(before.estimate.points, a.estimate.points, sigma)
-    known = any(_apart(before.estimate.points, one.estimate.points, sigma) < APART for one in others)
-    if not moved > APART or known:
+    known = any(
+        _apart(before.estimate.points, one.estimate.points, sigma) < MIN_APART_SIGMAS for one in others
+    )
+    if not moved > MIN_APART_SIGMAS or known:
         return ()
     camera, c, unit = _principal_distance(before.estimate.cameras)
     ratio = before.vPv / a.vPv
