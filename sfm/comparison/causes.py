@@ -307,7 +307,7 @@ def _stretches(
     stable: BoolArray,
     unit: float,
 ) -> tuple[Stretch, ...]:
-    """Return the principal strains that are significant, by the stable points, the largest first.
+    """Return the largest principal strain, and others that are significant, by the stable points.
 
     Lengths of the second are taken as so many times too large, by their unit. Where the scale is not known
     to both, they are relative to the middle one.
@@ -332,10 +332,11 @@ def _stretches(
     if pairs.scale is None:
         sigma, lengths = sigma / np.median(lengths), lengths / np.median(lengths)
     limit = math.sqrt(critical_value(ALPHA / 3, 1, pairs.redundancy))
+    order = np.argsort(-np.abs(lengths - 1))
     return tuple(
         Stretch(directions[:, k], float(lengths[k]), float(sigma[k]))
-        for k in np.argsort(-np.abs(lengths - 1))
-        if abs(lengths[k] - 1) > limit * sigma[k]
+        for k in order
+        if k == order[0] or abs(lengths[k] - 1) > limit * sigma[k]
     )
 
 

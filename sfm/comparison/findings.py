@@ -56,12 +56,9 @@ def remarks_of_cause(
         exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
         yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
     if row.strain:
-        main, *others = cause.stretches
-        across = [f"{_words(one.axis)} {one.lengths:.8g} times" for one in others]
-        numbers = {"lengths": main.lengths, "sigma": main.sigma}
-        yield remark(
-            "strained", axis=_words(main.axis), across=across or None, moved=moved, **numbers, **between
-        )
+        for one in cause.stretches:
+            numbers = {"lengths": one.lengths, "sigma": one.sigma}
+            yield remark("strained", axis=_words(one.axis), moved=moved, **numbers, **between)
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)
 

@@ -34,7 +34,7 @@ def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         adjustment: tells what sigma_px was; None to say a factor.
     """
     if test.passed is None:
-        return f"{test.of}: not tested, {test.reason}"
+        return f"{test.of}: not tested, {_why_untested(test)}"
     r = f"{test.redundancy:.1f}".removesuffix(".0")
     said = "passed" if test.passed else "NOT passed, worse than stated"
     if not test.passed and test.statistic < test.lower:
@@ -43,6 +43,12 @@ def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
     )
+
+
+def _why_untested(test: GlobalTest) -> str:
+    if test.untested == "reweighted":
+        return "the weights come from the residuals, so that v'Pv is not chi-square distributed"
+    return f"its redundancy, {test.redundancy:.2g}, is too small"
 
 
 def _fitting(test: GlobalTest, a: Adjustment | None) -> str:

@@ -60,7 +60,7 @@ def test_global_test_is_two_sided(plain: Adjustment) -> None:
     for factor in (0.8, 1.25):
         assert not global_test(replace(plain, sigma0=factor)).passed
     none = global_test(replace(plain, sigma0=np.nan, redundancy=0))
-    assert none.passed is None and "redundancy, 0, is too small" in none.reason
+    assert none.passed is None and none.untested == "redundancy"
 
 
 def test_the_component_of_a_kind_is_tested_against_what_is_stated_for_it() -> None:

@@ -10,6 +10,7 @@ NGS 1; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -22,11 +23,11 @@ from sfm.distortion.models import MODELS
 from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
-REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
 FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
 STRONG = 0.9  # correlation from which two parameters are reported
+Untested = Literal["redundancy", "reweighted"]  # too small; the weights come from the residuals
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class GlobalTest:
     lower: float  # acceptance region of v'Pv
     upper: float
     passed: bool | None  # None where it was not tested
-    reason: str = ""  # why it was not tested
+    untested: Untested | None = None  # why it was not tested
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> Globa
         alpha: probability of rejecting a right model.
     """
     test = _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
-    return replace(test, passed=None, reason=REWEIGHTED) if adjustment.reweighted else test
+    return replace(test, passed=None, untested="reweighted") if adjustment.reweighted else test
 
 
 def component_tests(
@@ -132,15 +133,14 @@ def component_tests(
         for name, sigma0, r in zip(components.names, components.sigma0, components.redundancy, strict=True)
     ]
     return tuple(
-        replace(test, passed=None, reason=REWEIGHTED) if reweighted and test.of == IMAGE_POINTS else test
+        replace(test, passed=None, untested="reweighted") if reweighted and test.of == IMAGE_POINTS else test
         for test in tests
     )
 
 
 def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> GlobalTest:
     if not np.isfinite(sigma0):
-        reason = f"its redundancy, {redundancy:.2g}, is too small"
-        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, reason)
+        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, "redundancy")
     statistic = float(sigma0**2 * redundancy)
     lower, upper = (float(x) for x in chi2_ppf([alpha / 2, 1 - alpha / 2], redundancy))
     return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)

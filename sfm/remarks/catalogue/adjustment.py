@@ -78,7 +78,7 @@ ROWS = (
         "snooping_unsolvable",
         "warning",
         "Data snooping ended early: with {more:image point} rejected in place of {rejected} the network is "
-        "not determined ({reason}).",
+        "not determined.",
         "rejections leave a photograph or a point without the rays that determine it",
         "Look at the rejected image points; add photographs.",
     ),

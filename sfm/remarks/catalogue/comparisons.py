@@ -47,7 +47,7 @@ ROWS = (
         "strained",
         "error",
         "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}"
-        "[[, along {across}]][[; {moved:point} {moved:differs|differ} besides]].",
+        "[[; {moved:point} {moved:differs|differ} besides]].",
         "an object that expanded or was loaded in one direction, or a camera that is not described well",
         "Check temperature and load of the object; adjust both with per_photograph for c, and compare again.",
     ),

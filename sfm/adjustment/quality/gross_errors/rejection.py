@@ -262,15 +262,9 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         changed = np.where(loose, 0.0, changed)
         try:
             optimum, weight = run.again(optimum, changed), changed
-        except GeometryError as error:
-            run.remarks = (
-                remark(
-                    "snooping_unsolvable",
-                    more=int((changed == 0).sum()),
-                    rejected=int((weight == 0).sum()),
-                    reason=str(error),
-                ),
-            )
+        except GeometryError:
+            more, rejected = int((changed == 0).sum()), int((weight == 0).sum())
+            run.remarks = (remark("snooping_unsolvable", more=more, rejected=rejected),)
             break
     return optimum, weight
 
