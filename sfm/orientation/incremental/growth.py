@@ -169,7 +169,12 @@ class Growth:
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
                 if not np.isfinite(position[i]).all():
-                    self.reasons[i] = remark("photograph_not_resected", reason=result.reason)
+                    self.reasons[i] = remark(
+                        "photograph_with_few_fitting",
+                        fitting=int(result.inliers.sum()),
+                        points=len(own),
+                        needed=result.needed,
+                    )
                 continue
             if np.isfinite(position[i]).all():
                 limit = self.tolerance_px[self.network.camera[i]] ** 2

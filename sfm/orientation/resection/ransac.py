@@ -49,6 +49,7 @@ class RobustResection:
     normal_matrix: FloatArray  # of X0 and a small rotation in image axes, for unit weights, (6, 6)
     trials: int  # triples tried
     reason: str  # why there is no orientation; empty if there is one
+    needed: int  # points that must fit
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -103,7 +104,7 @@ def resect_robust(
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     if n < max(min_inliers, SAMPLE + 1):
-        return _failure(n, f"{n} points, resection needs {needed}")
+        return _failure(n, needed, f"{n} points, resection needs {needed}")
     weights = np.zeros((n, 2, 2))
     weights[:, 0, 0] = weights[:, 1, 1] = 1.0
     X0, R, used, residuals, N = (
@@ -118,10 +119,15 @@ def resect_robust(
     )
     count = int(used.sum())
     if trials < 0:
-        return _failure(n, f"no orientation fits any triple of its {n} points (collinear or coincident)")
+        return _failure(
+            n, needed, f"no orientation fits any triple of its {n} points (collinear or coincident)"
+        )
     if count < needed:
         return replace(
-            _failure(n, f"only {count} of {n} points fit within the tolerance, resection needs {needed}"),
+            _failure(
+                n, needed, f"only {count} of {n} points fit within the tolerance, resection needs {needed}"
+            ),
+            inliers=used,
             trials=trials,
         )
     fitting = residuals[used]
@@ -129,7 +135,7 @@ def resect_robust(
     redundancy = 2 * count - UNKNOWNS
     sigma0 = np.sqrt(square / redundancy)
     rms, a_priori = float(np.sqrt(square / (2 * count))), sigma0 if sigma is None else sigma
-    return RobustResection(X0, R, used, residuals, rms, float(sigma0), float(a_priori), N, trials, "")
+    return RobustResection(X0, R, used, residuals, rms, float(sigma0), float(a_priori), N, trials, "", needed)
 
 
 def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAMPLE + 1) -> int:
@@ -169,11 +175,11 @@ def expected_trials(w: float, n: int) -> tuple[float, float]:
     return 1.0 / good, float(np.sqrt(1.0 - good)) / good
 
 
-def _failure(n: int, reason: str) -> RobustResection:
+def _failure(n: int, needed: int, reason: str) -> RobustResection:
     nan = np.full((n, 2), np.nan)
     return RobustResection(
         _NOWHERE.copy(), np.full((3, 3), np.nan), np.zeros(n, dtype=bool), nan, np.nan, np.nan, np.nan,
-        np.full((6, 6), np.nan), 0, reason,
+        np.full((6, 6), np.nan), 0, reason, needed,
     )  # fmt: skip
 
 

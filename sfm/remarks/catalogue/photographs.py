@@ -153,13 +153,6 @@ ROWS = (
         "Add photographs or targets.",
     ),
     Kind(
-        "photograph_not_resected",
-        "warning",
-        "Its resection failed: {reason}.",
-        "wrong names of points, another object, or a wrong principal distance",
-        "Check the names of its points and the camera.",
-    ),
-    Kind(
         "photograph_with_few_fitting",
         "warning",
         "Only {fitting} of its {points:point} fit the network; {needed} are needed.",

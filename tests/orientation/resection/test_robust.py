@@ -87,6 +87,7 @@ def test_reasons():
     assert resect_robust(uv[:3], points[:3], tolerance=1e-3).reason == "3 points, resection needs 4"
     nothing = resect_robust(seed_of("noise").uniform(-0.6, 0.6, (30, 2)), points, tolerance=1e-5)
     assert "of 30 points fit within the tolerance, resection needs 4" in nothing.reason
+    assert nothing.inliers.sum() < nothing.needed == 4
     assert np.isnan(nothing.position).all() and not nothing.found
     line = X0 + R @ np.array([0, 0, -5.0]) + np.outer(np.linspace(-1, 1, 10), R[:, 0])
     UVW = (line - X0) @ R
