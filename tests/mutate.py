@@ -77,7 +77,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/survey/hypotheses": (
         "tests/survey/test_given_thresholds.py",
         "tests/survey/test_wrong_scale.py",
-        "tests/survey/test_mistyped.py",
+        "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
     ),
     "sfm/units.py": ("tests/test_units.py",),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
