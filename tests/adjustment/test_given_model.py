@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
-from math import comb
 
 import numpy as np
 import pytest
@@ -181,7 +179,7 @@ def test_a_value_is_tested_where_the_others_check_it(r: float, rank: int) -> Non
 def test_a_judgement_fits_where_nothing_is_wrong() -> None:
     fits = Judgement(1.0, 2, 0.5)
     assert fits.fits
-    for wrong in ({"wrong": (1,)}, {"exchanged": (0, 1)}, {"doubtful": (1,)}, {"factor": 2.0}):
+    for wrong in ({"wrong": (1,)}, {"doubtful": (1,)}, {"factor": 2.0}):
         assert not replace(fits, **wrong).fits  # type: ignore[arg-type]
 
 
@@ -260,41 +258,6 @@ def exact(n: int, name: str, sigma: float = 1e-3) -> GivenPoints:
     X = seed_of(name).uniform(-1, 1, (n, 3))
     stated = np.tile(sigma**2 * np.eye(3), (n, 1, 1))
     return GivenPoints(X, stated, FRAME.apply(X), (0.1 * sigma) ** 2 * np.eye(3 * n), 500)
-
-
-def _other_exchanges(n: int, pair: tuple[int, int]) -> Iterator[list[int]]:
-    for i, j in combinations(range(n), 2):
-        if (i, j) != pair:
-            order = list(range(n))
-            order[i], order[j] = j, i
-            yield order
-
-
-def test_the_score_of_exchanged_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    one = exact(6, "score of exchanged")
-    one = replace(one, given=one.given[[0, 4, 2, 3, 1, 5]])
-    model = one.model(FRAME.inverse(), estimated=False)
-    found = given_values._exchanged(model, one.given.ravel(), 0.001)
-    assert found is not None and found[0] == (1, 4)
-    assert found[1] == pytest.approx(-model.kept().chi2 + 2 * np.log(comb(6, 2)), abs=1e-3)
-    judged = judge_values(model, 0.001, one.given.ravel())
-    assert judged.exchanged == (1, 4) and not judged.wrong
-    assert judge_values(model, 0.001).exchanged is None
-    second = min(
-        replace(one, given=one.given[list(order)]).model(FRAME.inverse(), estimated=False).kept().chi2
-        for order in _other_exchanges(6, (1, 4))
-    )
-    monkeypatch.setattr(given_values, "MARGIN", 0.99 * second)
-    assert given_values._exchanged(model, one.given.ravel(), 0.001) is not None
-    monkeypatch.setattr(given_values, "MARGIN", 1.01 * second)
-    assert given_values._exchanged(model, one.given.ravel(), 0.001) is None
-    monkeypatch.undo()
-    # a second error beside: no pair heals all
-    spoiled = replace(one, given=one.given + np.where(np.arange(6)[:, None] == 2, 0.5, 0.0))
-    model = spoiled.model(FRAME.inverse(), estimated=False)
-    assert given_values._exchanged(model, spoiled.given.ravel(), 0.001) is None
-    heights = replace(model, item=np.arange(18))
-    assert given_values._exchanged(heights, spoiled.given.ravel(), 0.001) is None
 
 
 def test_points_are_selected_and_mirrored_with_their_covariance() -> None:
@@ -390,10 +353,8 @@ def test_the_start_is_the_similarity_that_most_agree_upon(monkeypatch: pytest.Mo
     assert list(given_points._starts(line, FRAME)) == [FRAME]
 
 
-@pytest.mark.parametrize(("n", "h"), [(4, 4), (5, 4), (6, 5), (7, 5), (8, 6)])
+@pytest.mark.parametrize(("n", "h"), [(4, 3), (5, 3), (6, 4), (7, 4), (8, 5)])
 def test_the_start_minimises_the_distance_of_more_than_half(n: int, h: int) -> None:
-    """Three points that are met exactly do not count among half of them."""
-    assert h == n // 2 + (3 + 1) // 2
     one = exact(n, f"quantile {n}")
     one = replace(one, given=one.given + 0.05 * seed_of(f"quantile {n}").normal(size=(n, 3)))
     found = list(given_points._starts(one, None))[-1]

@@ -1,4 +1,4 @@
-"""Surveys with scale bars and control mistyped in many ways, and right ones, each with its truth.
+"""Surveys with scale bars, control and centres mistyped in many ways, and right ones, each with its truth.
 
 A case changes what a right survey gives; `study` runs it on several networks from scratch and shows how wrong
 the results are and what was said. Object unit m, stated standard deviations 0.1 to 0.3 mm.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,9 +23,10 @@ from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import survey_of
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import SIZE_PX, make_network, seed_of
 
 SIGMA = 2e-4  # of a coordinate of control and of the length of a bar, m
 WRONG = 5.0  # standard deviations (root mean square over the coordinates)
@@ -44,6 +45,9 @@ class Given:
     xyz: FloatArray  # (n, 3)
     sigma: float = SIGMA  # stated of control
     datum: str = "control"
+    exact: bool = False  # whether control is fixed
+    centres: FloatArray | None = None  # observed projection centres
+    upwards: bool = False  # whether y of the image points is
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,53 @@ def _too_precise(given: Given) -> None:
     given.xyz += 9.95 * SIGMA * given.rng.standard_normal(given.xyz.shape)
 
 
+def _some_off(count: int) -> Callable[[Given], None]:
+    def change(given: Given) -> None:
+        given.xyz[:count] += 0.3 * given.rng.standard_normal((count, 3))
+
+    return change
+
+
+def _axes_of_four(given: Given) -> None:
+    given.xyz[:4] = given.xyz[:4, [1, 0, 2]]
+
+
+def _next_row(given: Given) -> None:
+    """Give each point the coordinates in the next row, the last those of a point that is not in the list."""
+    other = next(j for j in range(30) if j not in given.names)
+    given.xyz = np.concatenate([given.xyz[1:], given.truth.points[[other]]])
+
+
+def _turned_rows(count: int, *, exact: bool = False) -> Callable[[Given], None]:
+    def change(given: Given) -> None:
+        given.xyz[:count] = np.roll(given.xyz[:count], 1, axis=0)
+        given.exact = exact
+
+    return change
+
+
+def _two_bars(given: Given) -> None:
+    given.lengths[:2] *= (1.1, 0.75)
+
+
+def _upwards(given: Given) -> None:
+    given.upwards = True
+
+
+def _centres(change: Callable[[FloatArray], FloatArray]) -> Callable[[Given], None]:
+    def both(given: Given) -> None:
+        centres = given.truth.position
+        given.centres = change(centres + SIGMA * given.rng.standard_normal(centres.shape))
+        given.datum = "control"
+
+    return both
+
+
+def _upwards_with_centres(given: Given) -> None:
+    _centres(np.copy)(given)
+    given.upwards = True
+
+
 def _only_checks(change: Callable[[Given], None]) -> Callable[[Given], None]:
     def both(given: Given) -> None:
         given.datum = "free"
@@ -187,6 +238,23 @@ CASES: tuple[tuple[str, int, int, Callable[[Given], None]], ...] = (
     ("twenty points too precise, bars", 2, 20, _too_precise),
     ("checking control 50 sigma", 2, 6, _only_checks(_off(50 * SIGMA))),
     ("checking control mirrored", 1, 6, _only_checks(_axes(1, 0, 2))),
+    ("two of three bars", 3, 0, _two_bars),
+    ("four control, X and Y exchanged", 0, 4, _axes(1, 0, 2)),
+    ("five control, X and Y exchanged", 0, 5, _axes(1, 0, 2)),
+    ("four of eight control, X and Y", 0, 8, _axes_of_four),
+    ("three of eight control", 0, 8, _some_off(3)),
+    ("four of ten control", 0, 10, _some_off(4)),
+    ("four of eight control", 0, 8, _some_off(4)),
+    ("control shifted by a row", 0, 8, _next_row),
+    ("control turned by a row", 0, 8, _turned_rows(8)),
+    ("fixed control turned by a row", 0, 8, _turned_rows(8, exact=True)),
+    ("checking fixed control turned", 1, 8, _only_checks(_turned_rows(8, exact=True))),
+    ("three names of eight turned", 0, 8, _turned_rows(3)),
+    ("y upwards, four control", 0, 4, _upwards),
+    ("y upwards, eight control", 2, 8, _only_checks(_upwards)),
+    ("y upwards, centres", 0, 0, _upwards_with_centres),
+    ("centres, X and Y exchanged", 0, 0, _centres(lambda X: X[:, [1, 0, 2]])),
+    ("centres turned by a row", 0, 0, _centres(lambda X: np.roll(X, 1, axis=0))),
 )
 RIGHT = ((1, 0), (2, 0), (3, 0), (6, 0), (0, 3), (0, 4), (0, 8), (0, 20), (1, 4), (2, 6), (3, 20))
 
@@ -199,6 +267,12 @@ def scene(name: str) -> tuple[Network, Estimate]:
 def outcome_of(case: str, network: Network, given: Given) -> Outcome:
     """Run a survey from scratch and hold its result against the truth."""
     parts: dict[str, object] = {"datum": {"kind": given.datum}}
+    if given.upwards:
+        seen = network.image_points
+        xy = seen.xy * (1, -1) + (0, SIZE_PX[1] - 1)
+        network = replace(network, image_points=replace(seen, xy=xy))
+    if given.centres is not None:
+        parts["exterior"] = ObservedExterior.from_arrays(network.images, given.centres, SIGMA)
     if given.ends:
         parts["scale_bars"] = tuple(
             ScaleBar(str(i + 1), str(j + 1), float(length), max(SIGMA, 1e-4 * float(length)))
@@ -206,7 +280,7 @@ def outcome_of(case: str, network: Network, given: Given) -> Outcome:
         )
     if given.names:
         names = [str(j + 1) for j in given.names]
-        parts["control"] = KnownPoints.from_arrays(names, given.xyz, given.sigma)
+        parts["control"] = KnownPoints.from_arrays(names, given.xyz, 0.0 if given.exact else given.sigma)
     try:
         result = run_survey(survey_of(network, given.truth, **parts))
     except KolinearError:

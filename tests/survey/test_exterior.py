@@ -254,7 +254,7 @@ def test_exchanged_projection_centres_are_exchanged_again(tmp_path: Path) -> Non
     (tmp_path / "exterior.csv").write_text("\n".join([head, *map(",".join, cells)]), encoding="utf-8")
     result = solved(path)
     (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
-    assert (said.kind, said.names("of")) == ("given_exchanged", ("centres",))
+    assert (said.kind, said.names("of")) == ("given_renamed", ("centres",))
     assert sorted(said.names("given")) == sorted([cells[1][0], cells[4][0]])
     error = result.estimate.points - truth_of(result.adjustment, truth)
     assert farthest(error, result.adjustment.covariance.points) < stats.chi2.ppf(1 - ANY, 3)

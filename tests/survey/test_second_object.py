@@ -195,5 +195,5 @@ def test_control_names_photographs_that_are_all_mirrored(datum: str) -> None:
         free=("c", "x0", "y0", "K1", "K2"), control=control, datum={"kind": datum},
     )  # fmt: skip
     result = run_survey(survey)
-    assert "control_mirrored" in kinds_of(result.remarks)
+    assert "given_mirrored" in kinds_of(result.remarks)
     assert findings_of(result).verdict.level == "bad"

@@ -1,7 +1,7 @@
 """Given points and lengths as differences from the free network.
 
 Points place the free network by a similarity, which most of them agree upon; lengths and placed points each
-give its scale.
+give its scale. Where points do not fit, they may be left-handed or have one another's names as well.
 
 Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984), J. Am. Stat. Assoc. 79(388).
 """
@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import comb
+from math import comb, lgamma
 
 import numpy as np
 
+from sfm.adjustment.quality.given_names import assignments
 from sfm.adjustment.quality.given_values import MARGIN, RANK, GivenModel, Judgement, judge_values
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
@@ -68,6 +69,10 @@ class GivenPoints:
         variance = decimal_step(self.given) ** 2 / 12
         return replace(self, stated=np.broadcast_to(variance * np.eye(3), self.stated.shape))
 
+    def reordered(self, order: tuple[int, ...]) -> GivenPoints:
+        """Return them with the given coordinates of others."""
+        return replace(self, given=self.given[list(order)], stated=self.stated[list(order)])
+
     def mirrored(self) -> GivenPoints:
         """Return them with the free network mirrored."""
         flip = np.tile([-1.0, 1.0, 1.0], len(self.free))
@@ -98,6 +103,7 @@ class GivenPoints:
             rows // 3,
             self.redundancy,
             estimated,
+            2 * float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1))),
         )
 
     def moved(self, placing: Similarity, model: GivenModel, without: tuple[int, ...]) -> Similarity:
@@ -152,17 +158,31 @@ class PlacedPoints:
     placing: Similarity  # given frame from that of the free network
     model: GivenModel  # at it
     unmirrored: float | None = None  # chi-square as given, where only the mirrored network fits
+    order: tuple[int, ...] = ()  # whose coordinates each has, where they fit with other names
 
     @property
     def mirrored(self) -> bool:
         """Whether they fit the mirrored network and not the network."""
         return self.unmirrored is not None
 
+    @property
+    def agreeing(self) -> Similarity | None:
+        """The similarity, if more than half of the points agree upon it."""
+        return self.placing if self.judgement.wrong else None
+
+    @property
+    def renamed(self) -> tuple[int, ...]:
+        """Those with the coordinates of another."""
+        return tuple(k for k, one in enumerate(self.order) if one != k and k not in self.judgement.wrong)
+
 
 def judge_points(
     points: GivenPoints, level: float, *, start: Similarity | None = None, estimated: bool = False
 ) -> PlacedPoints | None:
     """Return what is wrong of given points, and how the others place the free network.
+
+    The most likely explanation counts, if it is more likely than errors of single points by the margin: that
+    all are mirrored, or have one another's names.
 
     Args:
         points: given, and of the free network.
@@ -174,27 +194,39 @@ def judge_points(
         None where they do not place the network.
     """
     found = _placed(points, level, start, estimated)
-    if found is None or found.judgement.fits or found.judgement.wrong or found.judgement.exchanged:
+    if found is None or found.judgement.fits:
         return found
-    other = _placed(points.mirrored(), level, None, estimated)
-    if other is not None and (other.judgement.fits or other.judgement.wrong):
-        out, as_given = other.judgement.wrong, found.judgement.statistic
-        better = other.model.kept(out).chi2 + MARGIN < found.model.kept(out).chi2
-        if better and found.model.kept(out).probability() < level:
-            return replace(other, unmirrored=as_given)
-    return found
+    as_given = found.judgement.statistic
+    others = [(found.judgement.misfit - MARGIN, found)]
+    mirrored = _placed(points.mirrored(), level, None, estimated)
+    if mirrored is not None and not mirrored.judgement.doubtful:
+        others.append((mirrored.judgement.misfit, replace(mirrored, unmirrored=as_given)))
+    for order in assignments(points.free, points.given, found.agreeing):
+        renamed = _placed(points.reordered(order), level, None, estimated)
+        if renamed is not None and not renamed.judgement.doubtful:
+            moved = sum(one != k for k, one in enumerate(order))
+            choice = 2 * (lgamma(len(order) + 1) - lgamma(len(order) - moved + 1))
+            others.append((renamed.judgement.misfit + choice, replace(renamed, order=order)))
+    others.sort(key=lambda one: one[0])
+    best = others[0][1]
+    rivals = [one for misfit, one in others[1:] if one.order and misfit < others[0][0] + MARGIN]
+    if best.order and rivals:
+        every = tuple(range(len(points.given)))
+        return replace(
+            found, judgement=replace(found.judgement, wrong=(), factor=1.0, score=0.0, doubtful=every)
+        )
+    return best
 
 
 def _placed(
     points: GivenPoints, level: float, start: Similarity | None, estimated: bool
 ) -> PlacedPoints | None:
     """Judge points at the similarity of all, and where they do not fit, at that which most agree upon."""
-    given = points.given.ravel()[np.flatnonzero(points.known.ravel())]
     best: PlacedPoints | None = None
     for k, placing in enumerate(_starts(points, start)):
         # at what most agree upon, the others are left out before they move it
-        at_start = judge_values(points.model(placing, estimated=estimated), level, given) if k else None
-        found = _judged(points, placing, _left_out(at_start), level, estimated)
+        at_start = judge_values(points.model(placing, estimated=estimated), level) if k else None
+        found = _judged(points, placing, () if at_start is None else at_start.wrong, level, estimated)
         if found.judgement.fits:
             return found
         if best is None or found.judgement.misfit < best.judgement.misfit:
@@ -202,22 +234,16 @@ def _placed(
     return best
 
 
-def _left_out(judgement: Judgement | None) -> tuple[int, ...]:
-    """Return the points that do not take part in the similarity."""
-    return () if judgement is None else judgement.wrong or judgement.exchanged or ()
-
-
 def _judged(
     points: GivenPoints, placing: Similarity, out: tuple[int, ...], level: float, estimated: bool
 ) -> PlacedPoints:
     """Judge points at the similarity that fits them best, until it is without those that are wrong."""
-    given = points.given.ravel()[np.flatnonzero(points.known.ravel())]
     tried: set[tuple[int, ...]] = set()
     while True:
         tried.add(out)
         placing, model = _converged(points, placing, out, estimated)
-        judgement = judge_values(model, level, given)
-        out = _left_out(judgement)
+        judgement = judge_values(model, level)
+        out = judgement.wrong
         if out in tried:
             return PlacedPoints(judgement, placing, model)
 
@@ -232,8 +258,9 @@ def _converged(
     """
     model = points.model(placing, estimated=estimated)
     for _ in range(MAX_STEPS):
-        moved = points.moved(placing, model, without)
-        X, Y = placing.apply(points.free), moved.apply(points.free)
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = points.moved(placing, model, without)
+            X, Y = placing.apply(points.free), moved.apply(points.free)
         if not np.isfinite(Y).all():
             break
         placing, model = moved, points.model(moved, estimated=estimated)
@@ -245,10 +272,10 @@ def _converged(
 def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarity]:
     """Yield the similarity by all points, then that by three of them which most agree upon; else as given.
 
-    Of the triples, that with the smallest h-th distance, h = [n / 2] + [(p + 1) / 2] where p = 3 points are
-    met exactly.
+    Of the triples, that with the smallest median distance, h = [n / 2] + 1: a similarity does not meet three
+    points exactly.
 
-    Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares, remark 1 of theorem 2.
+    Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares.
     """
     at = points.complete
     X, given = points.free[at], points.given[at]
@@ -261,7 +288,7 @@ def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarit
             yield start
         return
     yield every
-    best, least, h = None, np.inf, len(at) // 2 + 2
+    best, least, h = None, np.inf, len(at) // 2 + 1
     if len(at) > 3:
         for some in _triples(len(at)):
             try:

@@ -4,7 +4,8 @@ An adjustment shares a contradiction among all observations, and weak photograph
 The free network has the shape that the image points give by themselves, with its covariance. Given values
 differ from it by v with covariance network + stated, but for the parameters A that only they determine: a
 scale (bars), a similarity (points). In what A leaves of v every error of a given value is tested, and the
-errors compared: some values are wrong, two names are exchanged, the standard deviations are too small.
+errors compared: some values are wrong, or the standard deviations are too small, by an order of magnitude at
+most. Names and handedness of points are compared with these in `given_points`.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests, external
 reliability); Schwarz (1978), Ann. Stat. 6(2) (the cost of a parameter); Patterson and Thompson (1971),
@@ -28,6 +29,10 @@ LEVEL = 0.001  # probability with which a test of a survey rejects right given v
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
 APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood ratio of two alternatives
+# An order of magnitude, mm stated for cm or the precision of an instrument alone; more are no statements of
+# precision, but errors of the values.
+MAX_FACTOR = 10.0
+UNSTATED = 0.002  # relative, of coordinates without standard deviations: paper swells by 1 to 2 permille
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
 CHECKED = RANK**0.5  # redundancy number below which nothing checks a direction
 MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value
@@ -67,6 +72,12 @@ class Kept:
         on = d > CHECKED
         w2 = np.einsum("kab,ka->kb", U, self.u[at] * s) ** 2
         return np.where(on, w2 / np.where(on, d, 1.0), 0.0).sum(axis=1), on.sum(axis=1)
+
+    def difference(self, one: int) -> tuple[FloatArray, FloatArray]:
+        """Return how far a value is from where the others have it, (k,), and its covariance, (k, k)."""
+        rows = np.flatnonzero(self.model.item == one)
+        covariance = np.linalg.pinv(self.precision[np.ix_(rows, rows)], rcond=RANK, hermitian=True)
+        return covariance @ self.u[rows], np.asarray(covariance, dtype=np.float64)
 
     def probability(self) -> float:
         """Return the probability of differences so large by chance: of all, of one value, of one coordinate.
@@ -113,6 +124,7 @@ class GivenModel:
     item: IntArray  # which given value each row is of, (m,)
     redundancy: int  # of the free network: how well its variance factor is known
     estimated: bool = False  # whether the standard deviations are unknown and come from the differences
+    extent: float = 0.0  # of the given values, of which standard deviations that are not stated are a part
 
     @cached_property
     def items(self) -> int:
@@ -167,6 +179,19 @@ class GivenModel:
         for one in without:
             out = out.without(one)
         return out
+
+    @cached_property
+    def at_worst(self) -> GivenModel:
+        """The model with the largest standard deviations that are believed."""
+        stated = self.stated
+        if self.estimated or not stated.any():
+            stated = (UNSTATED * self.extent) ** 2 * np.eye(len(self.v))
+        return replace(self, stated=MAX_FACTOR**2 * stated, estimated=False)
+
+    def fits(self, level: float, without: tuple[int, ...] = ()) -> bool:
+        """Return whether values fit, some left out; the unknown standard deviations as far as believed."""
+        fits = self.kept(without).probability() >= level
+        return fits and (not self.estimated or self.at_worst.kept(without).probability() >= level)
 
     def part(self, kept: BoolArray) -> GivenModel:
         """Return the model of some of the differences."""
@@ -239,7 +264,6 @@ class Judgement:
     dof: int  # its degrees of freedom
     probability: float  # of differences so large by chance
     wrong: tuple[int, ...] = ()  # given values without which the others fit
-    exchanged: tuple[int, int] | None = None  # two of them whose names are exchanged
     factor: float = 1.0  # on all standard deviations, with which all fit; of fixed values their sigma
     doubtful: tuple[int, ...] = ()  # given values of which nothing shows which are wrong
     score: float = 0.0  # of what is wrong: change of -2 ln likelihood, and its cost
@@ -247,7 +271,7 @@ class Judgement:
     @property
     def fits(self) -> bool:
         """Whether nothing is wrong."""
-        return not (self.wrong or self.exchanged or self.doubtful or self.factor != 1.0)
+        return not (self.wrong or self.doubtful or self.factor != 1.0)
 
     @property
     def misfit(self) -> float:
@@ -265,43 +289,34 @@ class GivenTest:
     probability: float  # of differences so large by chance
 
 
-def judge_values(model: GivenModel, level: float, exchange: FloatArray | None = None) -> Judgement:
+def judge_values(model: GivenModel, level: float) -> Judgement:
     """Return what is wrong of given values.
 
     Args:
         model: their differences from the free network.
         level: probability with which right values are said to be wrong.
-        exchange: given coordinates by rows, for the hypothesis of exchanged names, (m,); None without.
     """
     every = model.kept()
-    p = every.probability()
-    found = Judgement(every.chi2, every.dof, p)
-    if every.dof < 1 or p >= level:
+    found = Judgement(every.chi2, every.dof, every.probability())
+    if every.dof < 1 or model.fits(level):
         return found
     cost = float(np.log(max(len(model.v), 2)))
     removed = _wrong_values(model, level, cost)
-    swapped = None if exchange is None else _exchanged(model, exchange, level)
     factor, gain = (1.0, 0.0) if model.estimated else model.factor()
-    scores = {
-        "wrong": np.inf if removed is None else removed.score,
-        "exchanged": np.inf if swapped is None else swapped[1],
-        "factor": np.inf if gain <= 0 else cost - gain,
-    }
-    best = min(scores, key=lambda one: scores[one])
-    if scores[best] >= 0 or not np.isfinite(scores[best]):
+    if gain <= 0 or not model.at_worst.fits(level):
+        gain = -np.inf
+    of_wrong, of_factor = np.inf if removed is None else removed.score, cost - gain
+    if min(of_wrong, of_factor) >= 0:
         return replace(found, doubtful=_suspects(model, level))
-    found = replace(found, score=float(scores[best]))
-    if best == "exchanged" and swapped is not None:
-        return replace(found, exchanged=swapped[0])
-    if best == "factor":
+    if removed is None or of_factor < of_wrong:
         sets = _sets(model, cost)
         # one wrong value of so few would look like standard deviations that are too small, but for values of
         # which each by itself is within what its test finds
         unseen = float(np.sqrt(every.decreases()[0].max())) < NONCENTRALITY
-        if sets and (unseen or scores[best] + APART < min(one.score for one in sets)):
-            return replace(found, factor=factor)
-        return replace(found, doubtful=tuple(range(model.items)))
-    assert removed is not None
+        if sets and (unseen or of_factor + APART < min(one.score for one in sets)):
+            return replace(found, factor=factor, score=of_factor)
+        return replace(found, doubtful=tuple(range(model.items)), score=of_factor)
+    found = replace(found, score=_score_as_scatter(model, removed.values, cost))
     if removed.rivals:
         return replace(found, doubtful=tuple(sorted({*removed.values, *removed.rivals})))
     return replace(found, wrong=removed.values)
@@ -319,10 +334,9 @@ class WrongValues:
 def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
     """Return the best set of wrong values of each size up to half, where the others check one another.
 
-    As a factor makes all values scatter more than stated, so do the wrong ones: chi-square F of q differences
-    costs q (1 + ln F / q), and the choice.
+    The scores are those of scatter, as a factor is.
     """
-    every = kept = model.kept()
+    kept = model.kept()
     out: tuple[int, ...] = ()
     found: list[WrongValues] = []
     for k in range(1, (model.items + 1) // 2 + 1):
@@ -336,10 +350,18 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
             kept = model.kept(out)
         if kept.dof < 1:
             break
-        q, F = every.dof - kept.dof, every.chi2 - kept.chi2
-        scatter = cost + q * (1 + log(max(F / q, 1.0)))
-        found.append(WrongValues(out, scatter - F + 2 * log(comb(model.items, k))))
+        found.append(WrongValues(out, _score_as_scatter(model, out, cost)))
     return tuple(found)
+
+
+def _score_as_scatter(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
+    """Return the change of -2 ln likelihood where values scatter more than stated, its cost and the choice.
+
+    Chi-square F of q differences costs q (1 + ln F / q): how large errors are must be known too.
+    """
+    every, kept = model.kept(), model.kept(out)
+    q, F = every.dof - kept.dof, every.chi2 - kept.chi2
+    return cost + q * (1 + log(max(F / max(q, 1), 1.0))) - F + 2 * log(comb(model.items, len(out)))
 
 
 def _score(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
@@ -357,7 +379,7 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     """
     kept = model.kept()
     out: tuple[int, ...] = ()
-    while out == () or kept.probability() < level:
+    while out == () or not model.fits(level, out):
         if 2 * (len(out) + 1) >= model.items:
             return None
         fall, rank = kept.decreases()
@@ -403,32 +425,5 @@ def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tup
 def _suspects(model: GivenModel, level: float) -> tuple[int, ...]:
     """Return the values any of which may be wrong: those without which the others fit, else all."""
     each = [(one, model.kept((one,))) for one in range(model.items)]
-    alone = [one for one, kept in each if kept.dof > 0 and kept.probability() >= level]
+    alone = [one for one, kept in each if kept.dof > 0 and model.fits(level, (one,))]
     return tuple(alone) if len(alone) > 1 else tuple(range(model.items))
-
-
-def _exchanged(model: GivenModel, given: FloatArray, level: float) -> tuple[tuple[int, int], float] | None:
-    """Return the two values with whose names exchanged all fit, and their score; None without such."""
-    at, there = model.blocks
-    some = np.flatnonzero(there.sum(axis=1) == 3)
-    first, second = np.triu_indices(len(some), 1)
-    if not len(first):
-        return None
-    every = model.kept()
-    i, j = at[some[first]], at[some[second]]  # rows of each pair, (pairs, 3)
-    d = given[j] - given[i]
-    M = every.precision
-    both = [M[a[:, :, None], b[:, None, :]] for a, b in ((i, i), (j, j), (i, j), (j, i))]
-    falls = -2 * np.einsum("pa,pa->p", d, every.u[i] - every.u[j]) - np.einsum(
-        "pa,pab,pb->p", d, both[0] + both[1] - both[2] - both[3], d
-    )
-    order = np.argsort(falls)[::-1]
-    if len(order) > 1 and falls[order[1]] > falls[order[0]] - MARGIN:
-        return None
-    best = order[0]
-    v = model.v.copy()
-    v[i[best]] += d[best]
-    v[j[best]] -= d[best]
-    if replace(model, v=v).kept().probability() < level:
-        return None
-    return (int(some[first[best]]), int(some[second[best]])), float(2 * np.log(len(order)) - falls[best])

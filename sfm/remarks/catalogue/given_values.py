@@ -42,16 +42,17 @@ ROWS = (
         "Check these coordinates; more given points show which one is wrong.",
     ),
     Kind(
-        "given_exchanged",
+        "given_renamed",
         "warning",
-        "Of {of:@}, {given} have one another's coordinates: they were exchanged.",
-        "two names exchanged in the list of given coordinates or in the photographs",
-        "Exchange the two names.",
+        "Of {of:@}, {given} have one another's coordinates: these were reassigned.",
+        "names exchanged or a list shifted by a row, in the given coordinates or in the photographs",
+        "Correct these names.",
     ),
     Kind(
-        "control_mirrored",
+        "given_mirrored",
         "error",
-        "The control is mirrored (chi-square {chi2} as given, {mirrored} if mirrored): it was not used.",
+        "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored): they "
+        "were not used.",
         "left-handed coordinates, two axes exchanged, the sign of one axis changed, or mirrored photographs",
         "Give X, Y and Z of a right-handed system.",
     ),

@@ -25,7 +25,7 @@ ROWS = (
         "handedness_unchecked",
         "note",
         "Nothing checks whether image coordinates are mirrored: y must count downwards.",
-        "image points of a file, and neither control nor projection centres that do not lie in a plane",
+        "image points of a file, and no control points or projection centres in space that take part",
         "Compare the result with the object, or give four points that do not lie in a plane.",
     ),
 )

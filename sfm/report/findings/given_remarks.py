@@ -25,6 +25,7 @@ from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
+JUDGED_AS = {"control points": "control", "scale bars": "scale"}
 # What is left of the error of a value that is checked less is below the rounding and the neglected second
 # order of the others, and w magnifies that.
 MIN_REDUNDANCY = 1e-3
@@ -44,20 +45,26 @@ def given_remarks(
     """
     return (
         *_differing(given),
-        *_kinds(statistics),
+        *_kinds(statistics, {test.what for test in result.given_tests}),
         *_checks(checks, result.length_unit),
         *_scale(result),
     )
 
 
-def _kinds(statistics: Statistics) -> tuple[Remark, ...]:
-    """Return the remarks on kinds of given values whose residuals are larger than stated, beyond chance."""
+def _kinds(statistics: Statistics, judged: set[str]) -> tuple[Remark, ...]:
+    """Return the remarks on kinds of given values whose residuals are larger than stated, beyond chance.
+
+    Kinds that were judged against the free network have theirs.
+    """
     found = statistics.kinds
     level = LEVEL / max(len(found.names) - 1, 1)
     return tuple(
         remark("given_sigmas", of=test.of, factor=float(found.sigma0[g]))
         for g, test in enumerate(component_tests(found, alpha=2 * level))
-        if test.of not in (IMAGE_POINTS, INTERIOR) and found.count[g] > 1 and test.statistic > test.upper
+        if test.of not in (IMAGE_POINTS, INTERIOR)
+        and JUDGED_AS.get(test.of) not in judged
+        and found.count[g] > 1
+        and test.statistic > test.upper
     )
 
 

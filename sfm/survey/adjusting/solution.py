@@ -46,7 +46,6 @@ from sfm.survey.adjusting.settling import (
     settle,
     treat,
 )
-from sfm.survey.diagnosis.handedness import handedness_remarks
 from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
@@ -139,6 +138,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             *start.remarks,
             *solved.remarks,
             *_remarks(start.task.survey, told, len(whole.points), final),
+            *_handedness(start.task.survey, solved.given),
             *judged.causes,
             *judged.unchecked,
             *explain_rejections(final, unit=unit),
@@ -441,6 +441,16 @@ def _sigma_of_c(a: Adjustment) -> list[float]:
     return [float(a.interior_sigma(k)[0]) for k in range(len(a.estimate.cameras))]
 
 
+def _handedness(survey: Survey, given: JudgedGiven) -> tuple[Remark, ...]:
+    """Return the note on image points of a file that fit as well turned over.
+
+    The mirror image of an object, seen in mirrored photographs, has the residuals of the object.
+    """
+    if survey.observations is None or given.checks_handedness:
+        return ()
+    return (remark("handedness_unchecked"),)
+
+
 def _remarks(
     survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
@@ -453,5 +463,4 @@ def _remarks(
         *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
         *datum_remarks(survey, adjustment.network),
-        *handedness_remarks(survey, adjustment.network),
     )

@@ -21,7 +21,7 @@ from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
-from sfm.survey.hypotheses.given_groups import Group, Places, Task, remarks_on_unchecked
+from sfm.survey.hypotheses.given_groups import Group, Places, Task, are_in_space, remarks_on_unchecked
 from sfm.survey.hypotheses.given_scales import judge_scales
 
 MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
@@ -37,6 +37,7 @@ class JudgedGiven:
     tests: tuple[GivenTest, ...] = ()
     placing: Similarity | None = None
     """object frame from that of the free network; None where nothing says it"""
+    checks_handedness: bool = False  # whether a mirrored network would not fit
 
 
 def judge_given(
@@ -58,7 +59,8 @@ def judge_given(
         kinds = (("bars", network.scale_bars), ("control", network.control))
         of = [name for name, some in kinds if len(some)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
-        return JudgedGiven(network, datum, remarks)
+        connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
+        return JudgedGiven(network, datum, remarks, checks_handedness=connects)
     return _judged(Task(network, places, datum, unit, rescale))
 
 
@@ -105,16 +107,17 @@ def _judged(task: Task) -> JudgedGiven:
     network = replace(network, scale_bars=scales.bars)
     if control is not None:
         network = replace(network, control=_judged_control(task, control))
-        if control.placed.mirrored and datum.kind == "control" and not len(network.exterior):
-            datum = Datum("free")
-    if centres is not None and not centres.placed.mirrored:
+    if centres is not None:
         network = replace(network, exterior=_judged_centres(task, centres))
+    if any(one.placed.mirrored for one in groups) and not (len(network.control) or len(network.exterior)):
+        datum = Datum("free")
     return JudgedGiven(
         network,
         datum,
         tuple(found for one in groups for found in _remarks_on(task, one)) + scales.remarks,
         tuple(one.test for one in groups) + scales.tests,
         next((one.placed.placing for one in groups if not one.placed.mirrored), None),
+        any(one.checks_handedness for one in groups),
     )
 
 
@@ -142,6 +145,8 @@ def _judged_control(task: Task, group: Group) -> ObjectPoints:
 def _judged_centres(task: Task, group: Group) -> ExteriorObservations:
     """Return observed orientation without projection centres that do not fit, or changed."""
     seen = task.network.exterior
+    if group.placed.mirrored:
+        return ExteriorObservations()
     order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=task.rescale)
     covariance = seen.covariance[order]
     covariance[:, :3, :3] = of_centres
@@ -204,11 +209,10 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     """Yield what does not fit of points, and what nothing checks."""
     found, of = group.found, group.of
     if group.placed.mirrored:
-        if of == "control":
-            yield remark("control_mirrored", chi2=group.placed.unmirrored, mirrored=found.statistic)
+        yield remark("given_mirrored", of=of, chi2=group.placed.unmirrored, mirrored=found.statistic)
         return
-    if found.exchanged:
-        yield remark("given_exchanged", of=of, given=[group.names[k] for k in found.exchanged])
+    if group.placed.renamed:
+        yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
     if found.wrong:
         yield _left_out(group, task.unit)
     if found.doubtful:
@@ -232,23 +236,21 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
 
 def _left_out(group: Group, unit: str) -> Remark:
     model, out = group.placed.model, group.out
-    sizes = [np.linalg.norm(model.v[model.item == k]) for k in out]
-    sigmas = np.sqrt(model.kept().decreases()[0][list(out)].max())
+    others = (model.kept(tuple(j for j in out if j != k)).difference(k) for k in out)
+    d, covariance = max(others, key=lambda one: float(np.linalg.norm(one[0])))
+    distance = float(np.linalg.norm(d))
     return remark(
         "given_left_out",
         of=group.of,
         given=[group.names[k] for k in out],
-        distance=(float(max(sizes)), unit),
-        sigmas=float(sigmas),
+        distance=(distance, unit),
+        sigmas=distance**2 / float(np.sqrt(d @ covariance @ d)),
     )
 
 
 def _doubtful(group: Group) -> Remark:
     found = group.found
-    # they take part with the standard deviations that their differences show
     shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
-    if group.points.stated.any():
-        shift /= group.placed.model.factor()[0]
     return remark(
         "given_contradicted",
         of=group.of,

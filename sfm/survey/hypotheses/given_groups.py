@@ -9,14 +9,14 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints
-from sfm.adjustment.quality.given_values import LEVEL, NONCENTRALITY, GivenModel, GivenTest, Judgement
+from sfm.adjustment.quality.given_values import LEVEL, GivenModel, GivenTest, Judgement
+from sfm.comparison.congruency import extended_axes
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Network
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 
-CHECKABLE = 0.01  # redundancy number below which nothing checks a value; Foerstner (1987), CVGIP 40(3)
-UNCHECKED = NONCENTRALITY * ((1 - CHECKABLE) / CHECKABLE) ** 0.5  # the same as external reliability, 41
+MIN_IN_SPACE = 4  # points that do not lie in a plane, whose mirror image is another figure
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,12 @@ class Group:
         return not (self.placed.mirrored or self.found.doubtful)
 
     @property
+    def checks_handedness(self) -> bool:
+        """Whether they would not fit a mirrored network: as they took part they do not lie in a plane."""
+        xyz = self.points.given[[k for k in self.points.complete.tolist() if k not in self.out]]
+        return self.dependable and are_in_space(xyz)
+
+    @property
     def test(self) -> GivenTest:
         """Test of all of them."""
         return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
@@ -87,9 +93,8 @@ class Group:
     def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
         """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
         order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
-        if self.found.exchanged:
-            pair = self.rows[list(self.found.exchanged)]
-            order[pair] = pair[::-1]
+        if self.placed.order:
+            order[self.rows] = self.rows[list(self.placed.order)]
         keep[self.rows[list(self.out)]] = False
         changed = covariance[order]
         changed[self.rows] = self._confirmed(changed[self.rows], rescale)
@@ -108,13 +113,18 @@ class Group:
         return np.where(known, factor**2 * covariance, covariance)
 
 
+def are_in_space(xyz: FloatArray) -> bool:
+    """Return whether the mirror image of points is another figure."""
+    return len(xyz) >= MIN_IN_SPACE and len(extended_axes(xyz)[0]) == 3
+
+
 def remarks_on_unchecked(
     of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
 ) -> Iterator[Remark]:
     """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
     reach = model.external(without)
-    nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
+    nothing = [names[k] for k in np.flatnonzero(np.isinf(reach)).tolist()]
     if nothing:
         yield remark("given_unchecked", given=nothing, of=of)
-    for k in np.flatnonzero((reach > WRONG_SIGMAS) & (reach <= UNCHECKED)).tolist():
+    for k in np.flatnonzero((reach > WRONG_SIGMAS) & np.isfinite(reach)).tolist():
         yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))

@@ -13,7 +13,14 @@ from sfm.adjustment.quality.given_points import (
     scale_of_length,
     scale_of_points,
 )
-from sfm.adjustment.quality.given_values import LEVEL, GivenModel, GivenTest, Judgement, judge_values
+from sfm.adjustment.quality.given_values import (
+    LEVEL,
+    UNSTATED,
+    GivenModel,
+    GivenTest,
+    Judgement,
+    judge_values,
+)
 from sfm.conventions import BoolArray
 from sfm.distributions import chi2_sf
 from sfm.network import ScaleBars
@@ -22,9 +29,6 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
 from sfm.units import find_unit
 
-PRINT_SIGMA = (
-    0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
-)
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ def _scale_of(task: Task, group: Group) -> GivenScale | None:
     else:
         found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
     if task.datum.kind != "control" and not points.stated.any():
-        return replace(found, variance=found.variance + PRINT_SIGMA**2)
+        return replace(found, variance=found.variance + UNSTATED**2)
     return found
 
 
@@ -103,27 +107,29 @@ def _contradicting_scales(
     """Return bars that the others identify as wrong, or all where nothing shows which are, and remarks."""
     wrong = judgement.wrong
     if wrong and max(wrong) < len(lengths):
-        others = _mean_scale(model, [k for k in range(len(names)) if k not in wrong])
-        sigmas = np.sqrt(model.kept().decreases()[0])
-        off_of = {k: float(model.v[k]) - others for k in wrong}
-        return [b for k in wrong for b in lengths[k].bars], tuple(
-            remark(
-                "bar_left_out",
-                bar=names[k],
-                off=(100 * float(np.expm1(off)), "%"),
-                sigmas=float(sigmas[k]),
-                unit_factor=_unit_factor(off),
+        remarks = []
+        for k in wrong:
+            (off,), ((variance,),) = model.kept(tuple(j for j in wrong if j != k)).difference(k)
+            remarks.append(
+                remark(
+                    "bar_left_out",
+                    bar=names[k],
+                    off=(100 * float(np.expm1(off)), "%"),
+                    sigmas=float(abs(off) / np.sqrt(variance)),
+                    unit_factor=_unit_factor(float(off)),
+                )
             )
-            for k, off in off_of.items()
-        )
+        return [b for k in wrong for b in lengths[k].bars], tuple(remarks)
     # the control may be wrong by many bars that share their unit
-    which = range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful
-    off = float(np.ptp(model.v[list(which)]))
+    which = list(range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful)
+    v, S = model.v[which], (model.network + model.stated)[np.ix_(which, which)]
+    low, high = int(v.argmin()), int(v.argmax())
+    off = float(v[high] - v[low])
     said = remark(
         "scale_contradicted",
         given=[names[k] for k in which],
         off=(100 * float(np.expm1(off)), "%"),
-        sigmas=float(np.sqrt(judgement.statistic)),
+        sigmas=off / float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high])),
         unit_factor=_unit_factor(off),
     )
     return [b for one in lengths for b in one.bars], (said,)
@@ -165,13 +171,6 @@ def _agree(bars: ScaleBars, a: int, b: int) -> bool:
     """Return whether two lengths differ by no more than their standard deviations allow."""
     variance = float(bars.sigma[a] ** 2 + bars.sigma[b] ** 2)
     return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
-
-
-def _mean_scale(model: GivenModel, kept: list[int]) -> float:
-    """Return the mean logarithm of scales by their stated standard deviations."""
-    variance = np.diagonal(model.network + model.stated)[kept]
-    weight = 1 / np.maximum(variance, np.finfo(float).tiny)
-    return float(weight @ model.v[kept] / weight.sum())
 
 
 def _unit_factor(log: float) -> float | None:

@@ -1,0 +1,76 @@
+"""Names of given points assigned otherwise, by the shape of the free network.
+
+A list of coordinates that is shifted by a row, or two names exchanged, is the same figure of points with
+other names. Triangles of the figure that are similar place it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import permutations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.similarity import Similarity, fit_similarity
+
+MIN_POINTS = 4  # three have a similar triangle by chance too easily: two degrees of freedom
+MAX_POINTS = 40  # 59,280 triangles with their orders; of more points those that disagree are assigned only
+TRIANGLES = 20  # of the network: with half of the points right, 14 of 15 lists have a right one among them
+ALIKE = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
+MAX_ASSIGNMENTS = 3  # that are judged: the best, and those that may be as good
+
+
+def assignments(free: FloatArray, given: FloatArray, agreed: Similarity | None) -> Iterator[tuple[int, ...]]:
+    """Yield other assignments of given coordinates to points of the free network, the best first.
+
+    Args:
+        free: points of the free network, (n, 3).
+        given: coordinates, of which those that are not complete keep their names, (n, 3).
+        agreed: similarity upon which more than half of the points agree by their names, if there is one.
+    """
+    at = np.flatnonzero(np.isfinite(given).all(axis=1))
+    if len(at) < MIN_POINTS:
+        return
+    X, Y = free[at], given[at]
+    if agreed is not None:
+        placings = [agreed]
+    else:
+        placings = _placings(X, Y) if len(at) <= MAX_POINTS else []
+    found: dict[tuple[int, ...], float] = {}
+    for one in placings:
+        distance = np.linalg.norm(one.apply(X)[:, None] - Y[None], axis=2)
+        other = linear_sum_assignment(distance)[1]
+        order = np.arange(len(free))
+        order[at] = at[other]
+        median = float(np.median(distance[np.arange(len(at)), other]))
+        key = tuple(order.tolist())
+        found[key] = min(median, found.get(key, np.inf))
+    found.pop(tuple(range(len(free))), None)
+    yield from sorted(found, key=lambda one: found[one])[:MAX_ASSIGNMENTS]
+
+
+def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
+    """Return similarities that bring triangles of X onto similar ones of Y, their corners in any order."""
+    rng, n = np.random.default_rng(len(X)), len(X)
+    of_y: IntArray = np.array(list(permutations(range(n), 3)))
+    shape = _shape(Y[of_y])
+    found = []
+    for _ in range(TRIANGLES):
+        some = rng.choice(n, 3, replace=False)
+        apart = np.abs(shape - _shape(X[some])).sum(axis=1)
+        for k in np.argpartition(apart, min(ALIKE, len(apart)) - 1)[:ALIKE]:
+            try:
+                found.append(fit_similarity(X[some], Y[of_y[k]]))
+            except GeometryError:
+                continue
+    return found
+
+
+def _shape(corners: FloatArray) -> FloatArray:
+    """Return two ratios of the sides of triangles, as logarithms, (..., 2)."""
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=-2), axis=-1)
+    sides = np.log(np.maximum(sides, np.finfo(float).tiny))
+    return np.asarray(sides[..., :2] - sides[..., 2:])
