@@ -11,8 +11,8 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
-from sfm.survey.diagnosis.handedness import handedness_remarks
 from sfm.survey.inputs.checks.same_photographs import same_photographs
+from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import add_narrow_points, make_network, observed_anew, seed_of
@@ -51,14 +51,18 @@ def test_only_given_points_in_space_check_the_handedness(mirrored: bool) -> None
     names = [network.points[j] for j in chosen]
     space = KnownPoints.from_arrays(names, truth.points[chosen], 1e-4)
     plane = KnownPoints.from_arrays(names, truth.points[chosen] * (1, 1, 0), 1e-4)
-    found = run_survey(survey_of(network, truth, scale_bars=bars))
-    assert "handedness_unchecked" in kinds_of(found.remarks) and findings_of(found).verdict.level == "good"
-    judged = kinds_of(run_survey(survey_of(network, truth, control=space)).remarks)
-    assert "handedness_unchecked" not in judged and ("control_mirrored" in judged) is mirrored
-    survey = survey_of(network, truth, control=plane)
-    assert kinds_of(handedness_remarks(survey, network)) == ("handedness_unchecked",)
-    camera = survey.cameras[0].model_copy(update={"images": ("*.png",)})
-    assert handedness_remarks(replace(survey, observations=None, cameras=(camera,)), network) == ()
+    three = KnownPoints.from_arrays(names[:3], truth.points[chosen[:3]], 1e-4)
+    centres = ObservedExterior.from_arrays(network.images, truth.position, 1e-4)
+    # approximate values, and centres that are not used, place nothing
+    for given in ({}, {"start": truth}, {"exterior": centres}, {"control": three}):
+        found = run_survey(survey_of(network, truth, scale_bars=bars, **given))
+        assert "handedness_unchecked" in kinds_of(found.remarks)
+        assert findings_of(found).verdict.level == "good"
+    for given in ({"control": space}, {"exterior": centres, "datum": {"kind": "control"}}):
+        judged = kinds_of(run_survey(survey_of(network, truth, **given)).remarks)
+        assert ("handedness_unchecked" in judged) is ("given_mirrored" in judged) is mirrored
+    flat = run_survey(survey_of(network, truth, control=plane))
+    assert "handedness_unchecked" in kinds_of(flat.remarks)
 
 
 def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> None:

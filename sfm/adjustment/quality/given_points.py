@@ -199,11 +199,11 @@ def judge_points(
     as_given = found.judgement.statistic
     others = [(found.judgement.misfit - MARGIN, found)]
     mirrored = _placed(points.mirrored(), level, None, estimated)
-    if mirrored is not None and not mirrored.judgement.doubtful:
+    if mirrored is not None and mirrored.judgement.explained:
         others.append((mirrored.judgement.misfit, replace(mirrored, unmirrored=as_given)))
     for order in assignments(points.free, points.given, found.agreeing):
         renamed = _placed(points.reordered(order), level, None, estimated)
-        if renamed is not None and not renamed.judgement.doubtful:
+        if renamed is not None and renamed.judgement.explained:
             moved = sum(one != k for k, one in enumerate(order))
             choice = 2 * (lgamma(len(order) + 1) - lgamma(len(order) - moved + 1))
             others.append((renamed.judgement.misfit + choice, replace(renamed, order=order)))
@@ -254,9 +254,11 @@ def _converged(
     """Return the similarity that fits points best, some left out, and the model at it.
 
     A step that changes no coordinate beyond their linear dependence or their rounding is the last one. Points
-    that do not fit at all, mirrored ones, need not converge, and are judged where the last step ended.
+    that do not fit at all need not converge, as a larger scale makes the covariance of the network larger, and
+    are judged where they started.
     """
-    model = points.model(placing, estimated=estimated)
+    start = placing, points.model(placing, estimated=estimated)
+    placing, model = start
     for _ in range(MAX_STEPS):
         with np.errstate(over="ignore", invalid="ignore"):
             moved = points.moved(placing, model, without)
@@ -265,8 +267,8 @@ def _converged(
             break
         placing, model = moved, points.model(moved, estimated=estimated)
         if np.abs(Y - X).max() <= RANK * _centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
-            break
-    return placing, model
+            return placing, model
+    return start
 
 
 def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarity]:

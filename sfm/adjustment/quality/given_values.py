@@ -274,6 +274,11 @@ class Judgement:
         return not (self.wrong or self.doubtful or self.factor != 1.0)
 
     @property
+    def explained(self) -> bool:
+        """Whether errors of some values or of all standard deviations explain the differences."""
+        return not self.doubtful or self.score < 0
+
+    @property
     def misfit(self) -> float:
         """Chi-square with what is wrong, and its cost."""
         return self.statistic + self.score

@@ -216,7 +216,7 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     if found.wrong:
         yield _left_out(group, task.unit)
     if found.doubtful:
-        yield _doubtful(group)
+        yield _doubtful(task, group)
     if group.rounded:
         sigma = float(np.sqrt(group.points.stated.max()))
         step, used = (sigma * np.sqrt(12), task.unit), (sigma, task.unit)
@@ -248,9 +248,12 @@ def _left_out(group: Group, unit: str) -> Remark:
     )
 
 
-def _doubtful(group: Group) -> Remark:
-    found = group.found
-    shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
+def _doubtful(task: Task, group: Group) -> Remark:
+    found, model = group.found, group.placed.model
+    shift = float(_shifts(model)[list(found.doubtful)].max())
+    # they take part with the standard deviations that their differences show, if these are believed
+    if task.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
+        shift /= model.factor()[0]
     return remark(
         "given_contradicted",
         of=group.of,
