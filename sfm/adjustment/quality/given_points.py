@@ -254,8 +254,8 @@ def _converged(
     """Return the similarity that fits points best, some left out, and the model at it.
 
     A step that changes no coordinate beyond their linear dependence or their rounding is the last one. Points
-    that do not fit at all need not converge, as a larger scale makes the covariance of the network larger, and
-    are judged where they started.
+    that do not fit at all need not converge, as a larger scale makes the covariance of the network larger:
+    they are judged where they started.
     """
     start = placing, points.model(placing, estimated=estimated)
     placing, model = start
