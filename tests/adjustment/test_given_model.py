@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.quality import given_points, given_values
+from sfm.adjustment.quality import given_names, given_points, given_values
 from sfm.adjustment.quality.given_points import GivenPoints, judge_points, scale_model, scale_of_length
 from sfm.adjustment.quality.given_values import GivenModel, Judgement, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
@@ -23,6 +23,8 @@ def test_thresholds_are_those_stated() -> None:
     """Limits of effort and of rounding; the others decide tests in this folder."""
     assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
     assert given_points.MAX_STEPS == 20
+    assert given_names.MIN_POINTS == 4 and given_names.MAX_POINTS == 40 and given_names.TRIANGLES == 20
+    assert given_names.ALIKE == 60 and given_names.MAX_ASSIGNMENTS == 3
     assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
     assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
 
@@ -80,6 +82,14 @@ def test_chi_square_is_of_what_the_parameters_leave() -> None:
     for k in (1, 2, 3):
         assert misfit(many, 0, 4, k) == (pytest.approx(misfit(many, 4, 0)[0] - fall[k]), 5 - rank[k])
     assert many.blocks[0].tolist() == [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(5)]
+
+
+def test_a_difference_is_from_where_the_others_have_it() -> None:
+    one = bars(1.0, 2.0, 6.0, stated=2.0, network=2.0)
+    d, covariance = one.kept().difference(2)
+    assert d == pytest.approx([4.5]) and covariance == pytest.approx(np.array([[4 + 4 / 2]]))
+    d, covariance = one.kept((0,)).difference(2)
+    assert d == pytest.approx([4.0]) and covariance == pytest.approx(np.array([[8.0]]))
 
 
 def test_parameters_that_are_not_determined_leave_more() -> None:

@@ -129,6 +129,74 @@ def test_exchanged_names_are_identified() -> None:
     assert found is not None and found.judgement.fits and found.renamed == (1, 3)
 
 
+@pytest.mark.parametrize("count", [3, 8])
+def test_coordinates_of_the_next_row_are_reassigned(count: int) -> None:
+    for k in range(5):
+        one = points(8, f"next rows {count} {k}")
+        given = np.concatenate([np.roll(one.given[:count], 1, axis=0), one.given[count:]])
+        found = judge_points(replace(one, given=given), LEVEL)
+        assert found is not None and found.judgement.fits and found.renamed == tuple(range(count))
+        assert found.order == (*np.roll(range(count), -1).tolist(), *range(count, 8))
+
+
+def test_coordinates_of_a_point_that_is_not_in_the_list_are_left_out() -> None:
+    one = points(9, "next row")
+    shifted = replace(one.select(np.arange(8)), given=one.given[1:])
+    found = judge_points(shifted, LEVEL)
+    assert found is not None and found.judgement.wrong == (0,) and found.renamed == tuple(range(1, 8))
+    np.testing.assert_allclose(found.placing.apply(one.free)[1:8], one.given[1:8], atol=0.02)
+
+
+def test_names_that_symmetry_leaves_open_are_not_reassigned() -> None:
+    """Of a square either pair of opposite sides may be exchanged."""
+    one = points(4, "square")
+    X = np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    square = replace(one, free=FRAME.apply(X), given=X[[1, 0, 2, 3]])
+    found = judge_points(square, LEVEL)
+    assert found is not None and not found.order and found.judgement.doubtful == (0, 1, 2, 3)
+
+
+@pytest.mark.parametrize("n", [4, 5])
+def test_few_left_handed_points_are_mirrored(n: int) -> None:
+    """Three that remain lie in a plane and fit either way."""
+    for k in range(20):
+        one = points(n, f"left-handed {n} {k}")
+        found = judge_points(replace(one, given=one.given[:, [1, 0, 2]]), LEVEL)
+        assert found is not None and found.mirrored and found.judgement.fits
+
+
+def test_three_of_eight_points_are_identified() -> None:
+    for k in range(10):
+        one = points(8, f"three of eight {k}")
+        given = one.given.copy()
+        given[[0, 3, 5]] += 0.3 * seed_of(f"three wrong {k}").standard_normal((3, 3))
+        found = judge_points(replace(one, given=given), LEVEL)
+        assert found is not None and found.judgement.wrong == (0, 3, 5)
+
+
+@pytest.mark.parametrize(("factor", "believed"), [(7.0, True), (17.0, False)])
+def test_standard_deviations_may_be_too_small_by_an_order_of_magnitude(factor: float, believed: bool) -> None:
+    one = points(20, f"order {factor}", noise=factor * SIGMA)
+    found = judge_points(one, LEVEL)
+    assert found is not None and found.judgement.doubtful == (() if believed else tuple(range(20)))
+    assert (found.judgement.factor == pytest.approx(factor, rel=0.3)) is believed
+
+
+@pytest.mark.parametrize(
+    ("noise", "estimated", "believed"),
+    [(0.03, False, True), (0.075, False, False), (0.03, True, True), (0.2, True, False)],
+)
+def test_unstated_standard_deviations_are_two_percent_at_most(
+    noise: float, estimated: bool, believed: bool
+) -> None:
+    one = points(20, "unstated limit", noise=noise)
+    found = judge_points(replace(one, stated=0 * one.stated), LEVEL, estimated=estimated)
+    assert found is not None and not found.mirrored and not found.renamed
+    assert found.judgement.doubtful == (() if believed else tuple(range(20)))
+    assert found.judgement.factor == (pytest.approx(noise, rel=0.2) if believed and not estimated else 1.0)
+    assert not believed or not found.judgement.wrong
+
+
 @pytest.mark.parametrize("axes", [(1, 0, 2), (0, 2, 1), (2, 1, 0)])
 def test_left_handed_points_are_mirrored(axes: tuple[int, int, int]) -> None:
     one = points(6, "mirrored")

@@ -16,7 +16,7 @@ from math import comb, lgamma
 import numpy as np
 
 from sfm.adjustment.quality.given_names import assignments
-from sfm.adjustment.quality.given_values import MARGIN, RANK, GivenModel, Judgement, judge_values
+from sfm.adjustment.quality.given_values import MARGIN, RANK, GivenModel, Judgement, judge_values, misfit_of
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, fit_similarity, similarity_motions
@@ -166,6 +166,11 @@ class PlacedPoints:
         return self.unmirrored is not None
 
     @property
+    def misfit(self) -> float:
+        """Chi-square with what is wrong, and its cost."""
+        return misfit_of(self.model, self.judgement)
+
+    @property
     def agreeing(self) -> Similarity | None:
         """The similarity, if more than half of the points agree upon it."""
         return self.placing if self.judgement.wrong else None
@@ -197,16 +202,16 @@ def judge_points(
     if found is None or found.judgement.fits:
         return found
     as_given = found.judgement.statistic
-    others = [(found.judgement.misfit - MARGIN, found)]
+    others = [(found.misfit - MARGIN, found)]
     mirrored = _placed(points.mirrored(), level, None, estimated)
     if mirrored is not None and mirrored.judgement.explained:
-        others.append((mirrored.judgement.misfit, replace(mirrored, unmirrored=as_given)))
+        others.append((mirrored.misfit, replace(mirrored, unmirrored=as_given)))
     for order in assignments(points.free, points.given, found.agreeing):
         renamed = _placed(points.reordered(order), level, None, estimated)
         if renamed is not None and renamed.judgement.explained:
             moved = sum(one != k for k, one in enumerate(order))
             choice = 2 * (lgamma(len(order) + 1) - lgamma(len(order) - moved + 1))
-            others.append((renamed.judgement.misfit + choice, replace(renamed, order=order)))
+            others.append((renamed.misfit + choice, replace(renamed, order=order)))
     others.sort(key=lambda one: one[0])
     best = others[0][1]
     rivals = [one for misfit, one in others[1:] if one.order and misfit < others[0][0] + MARGIN]

@@ -327,6 +327,15 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
     return replace(found, wrong=removed.values)
 
 
+def misfit_of(model: GivenModel, found: Judgement) -> float:
+    """Return chi-square with what is wrong, and its cost; by the largest sigmas believed of unknown ones."""
+    if not model.estimated:
+        return found.misfit
+    worst, cost = model.at_worst, float(np.log(max(len(model.v), 2)))
+    score = _score_as_scatter(worst, found.wrong, cost) if found.wrong else 0.0
+    return worst.kept().chi2 + score
+
+
 @dataclass(frozen=True)
 class WrongValues:
     """A set of given values that may be wrong."""

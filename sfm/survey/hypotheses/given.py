@@ -37,7 +37,7 @@ class JudgedGiven:
     tests: tuple[GivenTest, ...] = ()
     placing: Similarity | None = None
     """object frame from that of the free network; None where nothing says it"""
-    checks_handedness: bool = False  # whether a mirrored network would not fit
+    checks_handedness: bool = False  # whether a mirrored network does not fit
 
 
 def judge_given(
@@ -117,7 +117,7 @@ def _judged(task: Task) -> JudgedGiven:
         tuple(found for one in groups for found in _remarks_on(task, one)) + scales.remarks,
         tuple(one.test for one in groups) + scales.tests,
         next((one.placed.placing for one in groups if not one.placed.mirrored), None),
-        any(one.checks_handedness for one in groups),
+        any(one.placed.mirrored or one.checks_handedness for one in groups),
     )
 
 
