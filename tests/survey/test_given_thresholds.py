@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.given_values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import Remark, kinds_of
+from sfm.report.findings.findings import findings_of
 from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
@@ -38,6 +40,35 @@ def test_each_weakly_checked_value_has_its_number(weaker: float) -> None:
     found = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=tuple(bars))))
     assert kinds_of(found) == ("given_weakly_checked",) and found[0].names("given") == ("9 - 20",)
     assert found[0].number("sigmas") == pytest.approx(4.13 * weaker, rel=0.02)
+
+
+def test_standard_deviations_that_are_too_small_are_named_once() -> None:
+    """Against the free network and, as stated weights remain, by the residuals."""
+    network, truth = make_network(seed_of("named once"), images=8, points=30)
+    xyz = truth.points[:20] + 1.2e-3 * seed_of("six times").standard_normal((20, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(20)], xyz, 2e-4)
+    parts = {"control": control, "datum": {"kind": "control"}, "adjust": {"weights": "stated"}}
+    result = run_survey(survey_of(network, truth, **parts))
+    (said,) = (one for one in findings_of(result).verdict.remarks if one.kind == "given_sigmas")
+    assert said.names("of") == ("control",) and said.number("factor") == pytest.approx(6, rel=0.3)
+
+
+def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
+    v, variance = np.log([1.0, 1.1, 1.02]), np.array([1e-4, 3e-4, 2e-4])
+    model = GivenModel(v, np.zeros((3, 3)), np.diag(variance), np.ones((3, 1)), np.arange(3), 100)
+    lengths = [given_scales._Length((k,), 1.0, 1e-2, False) for k in range(3)]
+
+    def said(**found: tuple[int, ...]) -> Remark:
+        judged = Judgement(30.0, 2, 1e-6, **found)
+        return given_scales._contradicting_scales(model, judged, ["a", "b", "c"], lengths)[1][0]
+
+    both = said(doubtful=(0, 1, 2))
+    assert both.number("off") == pytest.approx(10.0)
+    assert both.number("sigmas") == pytest.approx(np.log(1.1) / np.sqrt(4e-4))
+    mean = (v[0] / 1e-4 + v[2] / 2e-4) / (1 / 1e-4 + 1 / 2e-4)
+    one = said(wrong=(1,))
+    assert one.number("off") == pytest.approx(100 * np.expm1(v[1] - mean))
+    assert one.number("sigmas") == pytest.approx((v[1] - mean) / np.sqrt(3e-4 + 1 / 1.5e4))
 
 
 def test_a_bar_given_twice_counts_once() -> None:

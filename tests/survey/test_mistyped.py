@@ -7,6 +7,27 @@ import pytest
 from tests.survey.mistyped import CASES, NEVER_FOUND, mistyped, right, study
 
 REFUSED = ("refused", "bad", "fair")
+NAMED = {  # bad with the first kinds, fair with the others
+    "two of three bars": "scale_contradicted",
+    "control mirrored": "given_mirrored",
+    "four control, X and Y exchanged": "given_mirrored",
+    "five control, X and Y exchanged": "given_mirrored",
+    "y upwards, four control": "given_mirrored",
+    "y upwards, eight control": "given_mirrored",
+    "y upwards, centres": "given_mirrored",
+    "centres, X and Y exchanged": "given_mirrored",
+    "four of eight control": "given_contradicted",
+    "four of eight control, X and Y": "given_contradicted",
+    "three of eight control": "given_left_out",
+    "four of ten control": "given_left_out",
+    "control shifted by a row": "given_renamed",
+    "control turned by a row": "given_renamed",
+    "checking fixed control turned": "given_renamed",
+    "three names of eight turned": "given_renamed",
+    "two names exchanged": "given_renamed",
+    "centres turned by a row": "given_renamed",
+}
+BAD = ("scale_contradicted", "given_mirrored", "given_contradicted")
 
 
 @pytest.mark.parametrize("case", [one[0] for one in CASES if one[0] not in NEVER_FOUND])
@@ -15,6 +36,8 @@ def test_what_is_mistyped_is_found_and_named(case: str) -> None:
     assert not found.is_wrong_and_good
     assert found.level in REFUSED or case == "control 6 sigma"
     assert found.kinds or found.level in ("refused", "good")
+    if case in NAMED:
+        assert NAMED[case] in found.kinds and (found.level == "bad") is (NAMED[case] in BAD)
 
 
 def test_right_bars_and_control_are_good() -> None:
