@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from itertools import permutations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
@@ -31,6 +30,8 @@ def assignments(free: FloatArray, given: FloatArray, agreed: Similarity | None) 
         given: coordinates, of which those that are not complete keep their names, (n, 3).
         agreed: similarity upon which more than half of the points agree by their names, if there is one.
     """
+    from scipy.optimize import linear_sum_assignment  # takes half a second, which right surveys never need
+
     at = np.flatnonzero(np.isfinite(given).all(axis=1))
     if len(at) < MIN_POINTS:
         return
