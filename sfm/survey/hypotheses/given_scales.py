@@ -30,7 +30,6 @@ from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
 from sfm.units import find_unit
 
 
-
 @dataclass(frozen=True)
 class JudgedScales:
     """Scale bars as judged, and what was found of them and of the scale of given points."""
