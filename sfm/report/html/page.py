@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from scipy.special import ndtri
 
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.display import program_name
@@ -65,6 +66,7 @@ def environment() -> Environment:
     made.filters["program"] = program_name
     made.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
     made.globals |= PHRASES | {
+        "NORMAL_95": float(ndtri(0.975)),
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "strong": STRONG,
