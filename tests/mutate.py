@@ -81,6 +81,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     ),
     "sfm/units.py": ("tests/test_units.py",),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
+    "sfm/targets/codes/dot_plates.py": ("tests/targets/test_plates.py",),
 }
 COMPARED = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,

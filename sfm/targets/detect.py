@@ -12,7 +12,7 @@ from sfm.errors import KolinearError, PhotographError
 from sfm.kernels.sampling import as_grey
 from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
 from sfm.targets.codes.boards import find_crossings
-from sfm.targets.codes.dot_plates import name_dots
+from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
 from sfm.targets.codes.plates import BOARDS, PlateFamily
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
@@ -200,9 +200,7 @@ def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFam
     if not good.any():
         return np.zeros(0, dtype=np.int64)
     semi_axes, _ = axes_from_shape(fit.shape[good])
-    own = sign[good]
-    is_ring = own != (1 if (own > 0).sum() > len(own) / 2 else -1)
-    return name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), is_ring, plate)
+    return name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), rings_among(sign[good]), plate)
 
 
 def _measure_centres(

@@ -78,7 +78,7 @@ def find_outlines(
         The outlines.
     """
     # Outlines need no more than 8 bits; the measurement uses all of them.
-    image = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    image = as_bytes(photograph, scale)
     step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, MIN_STEP * scale)
     mean, band = _local_mean(image), np.empty_like(image)
     ellipses, kept_signs, rejected_xy, rejected_flag = [], [], [], []
@@ -119,6 +119,11 @@ def estimate_noise(photograph: AnyArray) -> float:
     mask = np.abs(v[:, :-2] - 2 * v[:, 1:-1] + v[:, 2:])
     # 6 = norm of the mask, 0.6745 = median of |N(0, 1)|
     return float(np.median(mask)) / (0.6745 * 6)
+
+
+def as_bytes(photograph: AnyArray, scale: float) -> AnyArray:
+    """Return intensities of up to a scale as bytes, (H, W)."""
+    return photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
 
 
 def scale_of(photograph: AnyArray) -> float:

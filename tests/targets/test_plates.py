@@ -60,6 +60,48 @@ def test_dots_are_named_by_their_marks_however_the_plate_is_seen(rings: bool) ->
     assert named >= 16
 
 
+LAYOUTS = {
+    "far apart": ((2, 2), (2, 8), (6, 2)),
+    "in the centre": ((4, 5), (4, 6), (5, 5)),
+    "in a corner": ((0, 0), (0, 1), (1, 0)),
+    "in three corners": ((0, 0), (0, 10), (8, 0)),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_three_marks_are_enough_wherever_they_are(layout: str) -> None:
+    """Whole plates, and with a column of dots beyond the plate."""
+    plate = replace(GRID, marks=LAYOUTS[layout])
+    wider = replace(GRID, columns=12)
+    is_mark = np.isin(np.arange(plate.count), [r * plate.columns + c for r, c in plate.marks])
+    for k in range(4):
+        rng = seed_of(f"{layout} {k}")
+        position, rotation = stations(rng, 4, plate)
+        xy = project(camera(), position[k], rotation[k], wider.plane(PITCH))
+        radius = 900 * 3.0 / np.linalg.norm(wider.plane(PITCH) - position[k], axis=1)
+        radius *= np.exp(0.01 * rng.standard_normal(len(radius)))
+        on_plate = np.arange(wider.count) % wider.columns < plate.columns
+        radius[np.flatnonzero(on_plate)[is_mark]] *= 1.4
+        none = np.zeros(wider.count, dtype=bool)
+        whole = name_dots(xy[on_plate], radius[on_plate], none[on_plate], plate)
+        assert (whole == np.arange(plate.count)).all()
+        larger = name_dots(xy, radius, none, plate)
+        assert (larger[on_plate] == np.arange(plate.count)).all() and (larger[~on_plate] == -1).all()
+
+
+def test_smaller_dots_are_no_marks() -> None:
+    """Three that are a fifth smaller, as the marks are arranged, where the marks are beyond the border."""
+    plate = replace(GRID, marks=LAYOUTS["in a corner"])
+    rng = seed_of("smaller")
+    position, rotation = stations(rng, 4, plate)
+    xy = project(camera(), position[0], rotation[0], plate.plane(PITCH))
+    radius = 12 * np.exp(0.01 * rng.standard_normal(plate.count))
+    row = np.arange(plate.count) // plate.columns
+    radius[[r * plate.columns + c for r, c in ((2, 0), (2, 1), (3, 0))]] *= 0.8
+    seen = row >= 2
+    assert (name_dots(xy[seen], radius[seen], np.zeros(seen.sum(), dtype=bool), plate) == -1).all()
+
+
 def test_a_plate_whose_marks_are_not_seen_gets_no_names() -> None:
     xy, radius, truth = seen(GRID, "no marks")
     kept = truth % GRID.columns > 7

@@ -231,8 +231,7 @@ def _free_network(start: _Prepared) -> _Free | None:
         GeometryError: they do not make a network by themselves.
     """
     task, estimate = start.task, start.estimate
-    plate = plate_family(task.survey.targets)
-    if plate is not None and plate.is_ambiguous:
+    if _has_no_identity(task.survey):
         return None
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations())
     task = replace(task, network=network)
@@ -249,6 +248,12 @@ def _free_network(start: _Prepared) -> _Free | None:
     return _Free(task, settled, treated, iterations)
 
 
+def _has_no_identity(survey: Survey) -> bool:
+    """Return whether points are on a plate that looks alike turned: they are no points without it."""
+    plate = plate_family(survey.targets)
+    return plate is not None and plate.is_ambiguous
+
+
 def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
     """Return the task with what was given as far as the image points confirm it."""
     task = start.task
@@ -260,6 +265,8 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
             scale_bars=network.scale_bars,
             exterior=network.exterior,
         )
+    if _has_no_identity(task.survey):
+        return task, JudgedGiven(network, task.datum)
     # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
     adjustment = None if free is None or free.settled.held else free.settled.adjustment
     given = judge_given(

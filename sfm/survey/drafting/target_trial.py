@@ -33,6 +33,7 @@ from sfm.targets.codes.tags import (
 )
 from sfm.targets.detect import Targets
 from sfm.targets.measure import shape_from_axes
+from sfm.targets.outlines import as_bytes, scale_of
 
 TRIED, PLATES_TRIED = 3, 8  # photographs, spread over the folder
 MIN_READABLE = 2
@@ -160,7 +161,7 @@ def _dots(
 
 def _as_bytes(photograph: AnyArray) -> AnyArray:
     """Return the intensities of a photograph as bytes."""
-    return photograph if photograph.dtype == np.uint8 else (photograph >> 8).astype(np.uint8)
+    return as_bytes(photograph, scale_of(photograph))
 
 
 def _spread(count: int, tried: int) -> list[int]:

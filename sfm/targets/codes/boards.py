@@ -15,6 +15,7 @@ from sfm.targets.codes.cut_boards import name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
 from sfm.targets.fits.saddle import Saddles, measure_saddles
+from sfm.targets.outlines import as_bytes
 
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
@@ -37,7 +38,7 @@ def find_crossings(
     Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for place and name; measured by
     `measure_saddles`.
     """
-    grey = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    grey = as_bytes(photograph, scale)
     if plate.name == "charuco":
         xy, code = _charuco(grey, plate)
     else:

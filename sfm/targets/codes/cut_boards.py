@@ -51,7 +51,7 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
     for turn in range(4):
         turned = quarter_turn(lattice.place, turn)
         turned = turned - turned.min(axis=0)
-        ends = _ends(lattice.xy, turned, grey.shape)
+        ends = board_ends(lattice.xy, turned, grey.shape)
         size = turned.max(axis=0) + 1
         offsets = [_offset(int(size[k]), (rows, columns)[k], ends[k]) for k in range(2)]
         if offsets[0] is None or offsets[1] is None:
@@ -107,7 +107,7 @@ def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
     return None if abs(even - odd) < LEAST_CONTRAST * np.ptp(grey) else np.array(squares[int(even > odd)])
 
 
-def _ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[tuple[bool, bool]]:
+def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[tuple[bool, bool]]:
     """Return for rows and columns whether the board ends before the first and behind the last of them."""
     height, width = shape[:2]
     at = {(int(r), int(c)): k for k, (r, c) in enumerate(place)}

@@ -22,8 +22,9 @@ LEAST_DOTS, LEAST_BENT = 9, 20  # that show a plate, and the bend of the trend o
 # Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
 ROUNDS, BIWEIGHT, MAD = 20, 4.685, 1.4826
 LEAST_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
-# A dot is anything with this probability, spread over so many standard deviations.
-STRANGE, RANGE = 0.01, 50.0
+# A dot is anything with this probability at least, spread over so many standard deviations, and where more of
+# them lie so far off, with theirs. A plate is larger than its table with the same probability.
+STRANGE, RANGE, OUTLYING = 0.01, 50.0, 5.0
 RING = 10.0  # standard deviations of a ring: never taken for a dot
 CERTAIN = 0.999  # probability of a placement
 
@@ -100,16 +101,21 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
     marked = np.zeros(plate.count + 1, dtype=bool)
     marked[[row * plate.columns + column for row, column in plate.marks]] = True
     found: list[tuple[float, IntArray]] = []
-    plain = _log_likelihood(size)
+    outlying = float((np.abs(size) > OUTLYING).sum() - len(plate.marks)) / len(size)
+    strange = max(STRANGE, outlying)
+    plain = _log_likelihood(size, strange)
     for place in placements(lattice, plate):
         low, high = place.min(axis=0), place.max(axis=0)
         for offset in itertools.product(*(range(-high[k], table.shape[k] - low[k]) for k in range(2))):
             code = _codes(place + np.array(offset), table)
             here = marked[code]
-            if not here.any() or (code != UNCODED).sum() < LEAST_DOTS:
+            if not here.any() or (code != UNCODED).sum() < max(LEAST_DOTS, len(code) / 2):
                 continue
-            gain = _log_likelihood(size[here] - np.median(size[here])) - plain[here]
-            found.append((float(gain.sum()), code))
+            larger = max(float(np.median(size[here])), 0.0)
+            gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())
+            if (code == UNCODED).any():  # few plates are larger than is said
+                gain += math.log(STRANGE)
+            found.append((gain, code))
     if not found:
         return None
     best, code = max(found, key=lambda one: one[0])
@@ -151,7 +157,12 @@ def _codes(place: IntArray, table: IntArray) -> IntArray:
     return code
 
 
-def _log_likelihood(z: FloatArray) -> FloatArray:
-    """Return the logarithm of the density of normal deviates of which some are anything."""
+def rings_among(polarity: IntArray) -> BoolArray:
+    """Return which circles are the insides of rings: those of the other polarity than most, (k,)."""
+    return np.asarray(polarity != (1 if (polarity > 0).sum() > len(polarity) / 2 else -1))
+
+
+def _log_likelihood(z: FloatArray, strange: float) -> FloatArray:
+    """Return the logarithm of the density of normal deviates of which this share are anything."""
     normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-    return np.asarray(np.log((1 - STRANGE) * normal + STRANGE / RANGE))
+    return np.asarray(np.log((1 - strange) * normal + strange / RANGE))

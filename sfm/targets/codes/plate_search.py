@@ -16,7 +16,8 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.targets.codes.boards import find_crossings
-from sfm.targets.codes.dot_plates import placements, size_of_marks
+from sfm.targets.codes.cut_boards import board_ends
+from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
 from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plates import GRIDS, PlateFamily, quarter_turn, refuse_unusable_plate
 from sfm.targets.codes.tags import opencv_dictionary
@@ -41,17 +42,19 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     sizes = Counter[tuple[int, int]]()
     for grey in photographs:
         scale = min(1.0, SEARCHED_PX / max(grey.shape))
-        small = (
-            cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
-        )
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
-        if found and meta is not None and min(meta.shape[:2]) >= LEAST_SIDE:
+        height, width = (max(1, round(scale * side)) for side in grey.shape)
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
+        if not found or meta is None or min(meta.shape[:2]) < LEAST_SIDE:
+            continue
+        place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
+        ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
+        if all(all(both) for both in ends):
             sizes[min(meta.shape[:2]), max(meta.shape[:2])] += 1
     for (rows, columns), count in sizes.most_common():
-        if count > 1 and rows * columns >= LEAST_CROSSINGS:
-            plate = PlateFamily("checkerboard", rows, columns)
-            if _named(photographs, plate):
-                return plate
+        plate = PlateFamily("checkerboard", rows, columns)
+        if count > 1 and plate.count >= LEAST_CROSSINGS and _named(photographs, plate):
+            return plate
     return None
 
 
@@ -93,7 +96,7 @@ def search_dots(
     """
     seen: dict[tuple[str, int, int], list[tuple[IntArray, FloatArray]]] = {}
     for xy, radius, polarity in photographs:
-        is_ring = polarity != (1 if (polarity > 0).sum() > len(polarity) / 2 else -1)
+        is_ring = rings_among(polarity)
         lattice = find_lattice(xy, ~is_ring)
         if lattice is None or len(lattice.rows) < LEAST_DOTS:
             continue

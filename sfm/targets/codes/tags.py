@@ -16,6 +16,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.flags import Flag
+from sfm.targets.outlines import as_bytes
 
 # OpenCV's dictionary behind each name that a survey file uses.
 DICTIONARIES = {
@@ -115,7 +116,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
 
     Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
     """
-    grey = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    grey = as_bytes(photograph, scale)
     settings = _reading_settings()
     settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / max(grey.shape)
     detector = cv2.aruco.ArucoDetector(opencv_dictionary(family.name), settings)
