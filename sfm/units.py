@@ -15,11 +15,10 @@ SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 
 
 @dataclass(frozen=True)
 class UnitFactor:
-    """A factor of lengths as that of two units, and what is left of it."""
+    """A factor of lengths as that of two units."""
 
     factor: float  # of UNITS, or 1 over it
     units: tuple[str, str]  # the finer and the coarser one
-    rest: float  # lengths over the factor
 
 
 def find_unit(lengths: float) -> UnitFactor | None:
@@ -27,5 +26,5 @@ def find_unit(lengths: float) -> UnitFactor | None:
     for size, units in UNITS.items():
         for factor in (size, 1 / size):
             if abs(lengths / factor - 1) < SAME_UNIT:
-                return UnitFactor(factor, units, lengths / factor)
+                return UnitFactor(factor, units)
     return None

@@ -99,6 +99,7 @@ def make_network(
     model: str = "brown",
     cameras: int = 1,
     free: tuple[str, ...] | None = None,
+    figure: FloatArray | None = None,
 ) -> tuple[Network, Estimate]:
     """Return a convergent network with noisy image points, and its truth.
 
@@ -111,10 +112,13 @@ def make_network(
         model: distortion model of all cameras.
         cameras: number of cameras, taking turns.
         free: parameters to adjust; FREE[model] if not given, () for calibrated cameras.
+        figure: the first object points, (n, 3).
     """
     free = FREE[model] if free is None else free
     made = tuple(_camera(f"camera {a + 1}", model, free, scale=1 + 0.02 * a) for a in range(cameras))
     xyz = rng.uniform(-0.7, 0.7, (points, 3)) * np.array([1, 1, 0 if planar else 1])
+    if figure is not None:
+        xyz[: len(figure)] = figure
     position, rotation = _stations(rng, images, planar=planar)
     truth = Estimate(made, position, rotation, xyz)
     camera = np.arange(images, dtype=np.int64) % cameras

@@ -24,7 +24,7 @@ def test_thresholds_are_those_stated() -> None:
     assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
     assert given_points.MAX_STEPS == 20
     assert given_names.MIN_POINTS == 4 and given_names.MAX_POINTS == 40 and given_names.TRIANGLES == 20
-    assert given_names.ALIKE == 60 and given_names.MAX_ASSIGNMENTS == 3
+    assert given_names.ALIKE == 60 and given_names.MAX_ASSIGNMENTS == 8
     assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
     assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
 

@@ -18,6 +18,7 @@ from sfm.adjustment.quality.given_points import (
 from sfm.adjustment.quality.given_values import LEVEL, GivenModel, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.similarity import Similarity
+from tests.survey.mistyped import BOX, PYRAMID
 from tests.synthetic import seed_of
 
 SIGMA = 1e-3
@@ -154,6 +155,50 @@ def test_names_that_symmetry_leaves_open_are_not_reassigned() -> None:
     square = replace(one, free=FRAME.apply(X), given=X[[1, 0, 2, 3]])
     found = judge_points(square, LEVEL)
     assert found is not None and not found.order and found.judgement.doubtful == (0, 1, 2, 3)
+
+
+def figure(X: FloatArray, order: list[int], name: str) -> GivenPoints:
+    """Return given points of a figure, with the coordinates of others."""
+    one = points(len(X), name)
+    noise = SIGMA * seed_of(f"noise of {name}").standard_normal(X.shape)
+    return replace(one, free=FRAME.apply(X), given=(X + noise)[order])
+
+
+def test_two_names_of_a_pyramid_may_be_exchanged_in_several_ways() -> None:
+    """Three right names agree upon the base turned over; four orders place it as well."""
+    for k in range(8):
+        found = judge_points(figure(PYRAMID, [1, 0, 2, 3, 4], f"pyramid {k}"), LEVEL)
+        assert found is not None and not found.order and found.judgement.wrong == ()
+        assert found.judgement.doubtful == found.exchangeable == (0, 1, 2, 3)
+
+
+def test_a_pyramid_as_named_is_right_and_one_wrong_point_is_identified() -> None:
+    for k in range(5):
+        one = figure(PYRAMID, list(range(5)), f"right pyramid {k}")
+        right, wrong = judge_points(one, LEVEL), judge_points(moved(one, 1, np.array([0.05, 0, 0])), LEVEL)
+        assert right is not None and right.judgement.fits and not right.exchangeable
+        assert wrong is not None and wrong.judgement.wrong == (1,) and not wrong.order
+
+
+@pytest.mark.parametrize(
+    ("X", "order", "names"),
+    [(PYRAMID, [2, 1, 0, 3, 4], (0, 1, 2, 3)), (BOX, [4, 5, 6, 7, 0, 1, 2, 3], tuple(range(8)))],
+)
+def test_names_whose_exchange_mirrors_a_figure_are_named(
+    X: FloatArray, order: list[int], names: tuple[int, ...]
+) -> None:
+    for k in range(5):
+        found = judge_points(figure(X, order, f"mirrored figure {k}"), LEVEL)
+        assert found is not None and found.mirrored and set(found.exchangeable) == set(names)
+
+
+def test_points_most_of_which_are_wrong_diverge_to_no_infinite_scale() -> None:
+    for k in range(2):
+        one = points(20, f"half of twenty {k}")
+        given = one.given.copy()
+        given[:11] += 0.6 * seed_of(f"wrong half {k}").standard_normal((11, 3))
+        found = judge_points(replace(one, given=given), LEVEL)
+        assert found is not None and len(found.judgement.doubtful) == 20
 
 
 @pytest.mark.parametrize("n", [4, 5])

@@ -31,6 +31,8 @@ from tests.synthetic import SIZE_PX, make_network, seed_of
 SIGMA = 2e-4  # of a coordinate of control and of the length of a bar, m
 WRONG = 5.0  # standard deviations (root mean square over the coordinates)
 NEVER_FOUND = ("bars in inches", "bars in millimetres", "the only bar 10 %")  # nothing contradicts them
+PYRAMID = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [0, 0, 0.4]])
+BOX = np.stack(np.meshgrid((-0.5, 0.5), (-0.4, 0.4), (-0.3, 0.3), indexing="ij"), axis=-1).reshape(8, 3)
 
 
 @dataclass
@@ -143,6 +145,13 @@ def _names(given: Given) -> None:
     given.names[0], given.names[1] = given.names[1], given.names[0]
 
 
+def _order(*order: int) -> Callable[[Given], None]:
+    def change(given: Given) -> None:
+        given.names = [given.names[k] for k in order]
+
+    return change
+
+
 def _too_precise(given: Given) -> None:
     given.xyz += 9.95 * SIGMA * given.rng.standard_normal(given.xyz.shape)
 
@@ -230,6 +239,11 @@ CASES: tuple[tuple[str, int, int, Callable[[Given], None]], ...] = (
     ("control, X and Y exchanged", 0, 8, _axes(1, 0, 2)),
     ("one control point, X and Y", 0, 8, _axes_of_one),
     ("two names exchanged", 0, 8, _names),
+    ("two names of a pyramid", 0, 5, _names),
+    ("opposite names of a pyramid", 0, 5, _order(2, 1, 0, 3, 4)),
+    ("one point of a pyramid", 0, 5, _off(50 * SIGMA)),
+    ("two names of a box", 0, 8, _names),
+    ("left and right names of a box", 0, 8, _order(4, 5, 6, 7, 0, 1, 2, 3)),
     ("control in kilometres", 0, 6, _times(1e-3)),
     ("control in millimetres, bars not", 2, 6, _times(1e3)),
     ("control 1 %, two bars", 2, 6, _times(1.01)),
@@ -259,9 +273,9 @@ CASES: tuple[tuple[str, int, int, Callable[[Given], None]], ...] = (
 RIGHT = ((1, 0), (2, 0), (3, 0), (6, 0), (0, 3), (0, 4), (0, 8), (0, 20), (1, 4), (2, 6), (3, 20))
 
 
-def scene(name: str) -> tuple[Network, Estimate]:
-    """Return the network of this name."""
-    return make_network(seed_of(name), images=8, points=30, visibility=0.8)
+def scene(name: str, figure: FloatArray | None = None) -> tuple[Network, Estimate]:
+    """Return the network of this name, the first points of which are those of a figure."""
+    return make_network(seed_of(name), images=8, points=30, visibility=0.8, figure=figure)
 
 
 def outcome_of(case: str, network: Network, given: Given) -> Outcome:
@@ -304,8 +318,13 @@ def _error(result: SurveyResult, network: Network, truth: Estimate) -> float:
 def mistyped(case: str, number: int) -> Outcome:
     """Return what a survey of a case gave, on the network of this number."""
     bars, control, change = next(one[1:] for one in CASES if one[0] == case)
-    network, truth = scene(f"mistyped {number}")
-    given = given_of(seed_of(f"mistyped {case} {number}"), truth, bars, control)
+    figure = next((xyz for word, xyz in (("pyramid", PYRAMID), ("box", BOX)) if case.endswith(word)), None)
+    network, truth = scene(f"mistyped {number}", figure)
+    rng = seed_of(f"mistyped {case} {number}")
+    given = given_of(rng, truth, bars, control)
+    if figure is not None:
+        given.names = list(range(control))
+        given.xyz = figure + SIGMA * rng.standard_normal(figure.shape)
     change(given)
     return outcome_of(case, network, given)
 

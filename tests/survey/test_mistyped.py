@@ -25,6 +25,10 @@ NAMED = {  # bad with the first kinds, fair with the others
     "checking fixed control turned": "given_renamed",
     "three names of eight turned": "given_renamed",
     "two names exchanged": "given_renamed",
+    "two names of a pyramid": "given_contradicted",
+    "opposite names of a pyramid": "given_mirrored",
+    "one point of a pyramid": "given_left_out",
+    "left and right names of a box": "given_mirrored",
     "centres turned by a row": "given_renamed",
 }
 BAD = ("scale_contradicted", "given_mirrored", "given_contradicted")

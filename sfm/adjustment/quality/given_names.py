@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import permutations
+from math import lgamma
 
 import numpy as np
 
@@ -19,16 +20,22 @@ MIN_POINTS = 4  # three have a similar triangle by chance too easily: two degree
 MAX_POINTS = 40  # 59,280 triangles with their orders; of more points those that disagree are assigned only
 TRIANGLES = 20  # of the network: with half of the points right, 14 of 15 lists have a right one among them
 ALIKE = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
-MAX_ASSIGNMENTS = 3  # that are judged: the best, and those that may be as good
+MAX_ASSIGNMENTS = 8  # that are judged: the likeliest, and rivals of it
 
 
-def assignments(free: FloatArray, given: FloatArray, agreed: Similarity | None) -> Iterator[tuple[int, ...]]:
-    """Yield other assignments of given coordinates to points of the free network, the best first.
+def assignments(
+    free: FloatArray, given: FloatArray, variance: tuple[FloatArray, FloatArray], agreed: Similarity | None
+) -> Iterator[tuple[int, ...]]:
+    """Yield other assignments of given coordinates to points of the free network, the likeliest first.
+
+    Each costs what its distances do as errors whose size is unknown, and its choice.
 
     Args:
         free: points of the free network, (n, 3).
         given: coordinates, of which those that are not complete keep their names, (n, 3).
-        agreed: similarity upon which more than half of the points agree by their names, if there is one.
+        variance: of a coordinate of the free points in their frame, and of the given ones, (n,) each.
+        agreed: similarity upon which more than half of the points agree by their names, if there is one;
+            three may agree by chance, so that it is not the only one that is tried.
     """
     from scipy.optimize import linear_sum_assignment  # takes half a second, which right surveys never need
 
@@ -36,21 +43,34 @@ def assignments(free: FloatArray, given: FloatArray, agreed: Similarity | None) 
     if len(at) < MIN_POINTS:
         return
     X, Y = free[at], given[at]
-    if agreed is not None:
-        placings = [agreed]
-    else:
-        placings = _placings(X, Y) if len(at) <= MAX_POINTS else []
+    of_x, of_y = variance[0][at], variance[1][at]
+    placings = [] if agreed is None else [agreed]
+    if len(at) <= MAX_POINTS:
+        placings += _placings(X, Y)
     found: dict[tuple[int, ...], float] = {}
     for one in placings:
-        distance = np.linalg.norm(one.apply(X)[:, None] - Y[None], axis=2)
-        other = linear_sum_assignment(distance)[1]
+        distance2 = ((one.apply(X)[:, None] - Y[None]) ** 2).sum(axis=2)
+        expected = 3 * (one.scale**2 * of_x[:, None] + of_y)
+        misfit = 3 * np.log(np.maximum(distance2 / np.maximum(expected, np.finfo(float).tiny), 1.0))
+        other = linear_sum_assignment(misfit)[1]
         order = np.arange(len(free))
         order[at] = at[other]
-        median = float(np.median(distance[np.arange(len(at)), other]))
         key = tuple(order.tolist())
-        found[key] = min(median, found.get(key, np.inf))
+        cost = float(misfit[np.arange(len(at)), other].sum()) + cost_of_choice(key)
+        found[key] = min(cost, found.get(key, np.inf))
     found.pop(tuple(range(len(free))), None)
     yield from sorted(found, key=lambda one: found[one])[:MAX_ASSIGNMENTS]
+
+
+def cost_of_choice(order: tuple[int, ...]) -> float:
+    """Return -2 ln of the share of an assignment among those that move as many names."""
+    n, moved = len(order), len(moved_by(order))
+    return 2 * (lgamma(n + 1) - lgamma(n - moved + 1))
+
+
+def moved_by(order: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the points that have the coordinates of another."""
+    return tuple(k for k, one in enumerate(order) if one != k)
 
 
 def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:

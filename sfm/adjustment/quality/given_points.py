@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import comb, lgamma
+from math import comb
 
 import numpy as np
 
-from sfm.adjustment.quality.given_names import assignments
+from sfm.adjustment.quality.given_names import assignments, cost_of_choice, moved_by
 from sfm.adjustment.quality.given_values import MARGIN, RANK, GivenModel, Judgement, judge_values, misfit_of
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
@@ -68,6 +68,12 @@ class GivenPoints:
         """
         variance = decimal_step(self.given) ** 2 / 12
         return replace(self, stated=np.broadcast_to(variance * np.eye(3), self.stated.shape))
+
+    @property
+    def variances(self) -> tuple[FloatArray, FloatArray]:
+        """Mean variance of a coordinate of free points, in their frame, and of given ones, (n,) each."""
+        of_free = np.diagonal(self.joint).reshape(-1, 3).mean(axis=1)
+        return of_free, np.einsum("nii->n", self.stated) / 3
 
     def reordered(self, order: tuple[int, ...]) -> GivenPoints:
         """Return them with the given coordinates of others."""
@@ -159,6 +165,7 @@ class PlacedPoints:
     model: GivenModel  # at it
     unmirrored: float | None = None  # chi-square as given, where only the mirrored network fits
     order: tuple[int, ...] = ()  # whose coordinates each has, where they fit with other names
+    exchangeable: tuple[int, ...] = ()  # those whose names, if exchanged, explain the differences as well
 
     @property
     def mirrored(self) -> bool:
@@ -171,6 +178,11 @@ class PlacedPoints:
         return misfit_of(self.model, self.judgement)
 
     @property
+    def cost(self) -> float:
+        """Their misfit, and that of the choice of other names."""
+        return self.misfit + cost_of_choice(self.order)
+
+    @property
     def agreeing(self) -> Similarity | None:
         """The similarity, if more than half of the points agree upon it."""
         return self.placing if self.judgement.wrong else None
@@ -178,7 +190,7 @@ class PlacedPoints:
     @property
     def renamed(self) -> tuple[int, ...]:
         """Those with the coordinates of another."""
-        return tuple(k for k, one in enumerate(self.order) if one != k and k not in self.judgement.wrong)
+        return tuple(k for k in moved_by(self.order) if k not in self.judgement.wrong)
 
 
 def judge_points(
@@ -186,8 +198,9 @@ def judge_points(
 ) -> PlacedPoints | None:
     """Return what is wrong of given points, and how the others place the free network.
 
-    The most likely explanation counts, if it is more likely than errors of single points by the margin: that
-    all are mirrored, or have one another's names.
+    The most likely explanation counts: errors of single points, that all are mirrored, or have one another's
+    names. Where it is not more likely than others by the margin, they contradict one another, but for what
+    may be mirrored: that is no figure to be placed.
 
     Args:
         points: given, and of the free network.
@@ -201,26 +214,46 @@ def judge_points(
     found = _placed(points, level, start, estimated)
     if found is None or found.judgement.fits:
         return found
-    as_given = found.judgement.statistic
-    others = [(found.misfit - MARGIN, found)]
+    others = list(_renamed(points, level, found.agreeing, estimated))
     mirrored = _placed(points.mirrored(), level, None, estimated)
     if mirrored is not None and mirrored.judgement.explained:
-        others.append((mirrored.misfit, replace(mirrored, unmirrored=as_given)))
-    for order in assignments(points.free, points.given, found.agreeing):
-        renamed = _placed(points.reordered(order), level, None, estimated)
-        if renamed is not None and renamed.judgement.explained:
-            moved = sum(one != k for k, one in enumerate(order))
-            choice = 2 * (lgamma(len(order) + 1) - lgamma(len(order) - moved + 1))
-            others.append((renamed.misfit + choice, replace(renamed, order=order)))
-    others.sort(key=lambda one: one[0])
-    best = others[0][1]
-    rivals = [one for misfit, one in others[1:] if one.order and misfit < others[0][0] + MARGIN]
-    if best.order and rivals:
-        every = tuple(range(len(points.given)))
-        return replace(
-            found, judgement=replace(found.judgement, wrong=(), factor=1.0, score=0.0, doubtful=every)
-        )
-    return best
+        others.append(replace(mirrored, unmirrored=found.judgement.statistic))
+    if not others or min(one.cost for one in others) >= found.misfit:
+        return found
+    best = min(others, key=lambda one: one.cost)
+    like = [one for one in others if one.cost < best.cost + MARGIN]
+    if best.cost >= found.misfit - MARGIN:
+        return _contradiction(found, [found, *like])
+    either = next((one for one in like if one.mirrored), None)
+    if either is not None:
+        # as a whole left and right may be exchanged, which is no choice among all orders
+        like = [one for one in others if one.order and one.misfit < either.misfit + MARGIN]
+        return replace(either, exchangeable=_points_of(like))
+    return best if len(like) == 1 else _contradiction(found, like)
+
+
+def _renamed(
+    points: GivenPoints, level: float, agreed: Similarity | None, estimated: bool
+) -> Iterator[PlacedPoints]:
+    """Yield points with other names, where these explain the differences."""
+    for order in assignments(points.free, points.given, points.variances, agreed):
+        one = _placed(points.reordered(order), level, None, estimated)
+        if one is not None and one.judgement.explained:
+            yield replace(one, order=order)
+
+
+def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:
+    """Return the points whose names explanations exchange."""
+    return tuple(sorted({k for one in explanations for k in one.renamed}))
+
+
+def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
+    """Return points as given, of which nothing shows which of several explanations is right."""
+    some = {k for one in like for k in (*moved_by(one.order), *one.judgement.wrong, *one.judgement.doubtful)}
+    if not some or any(one.mirrored for one in like):
+        some = set(range(found.model.items))
+    judgement = replace(found.judgement, wrong=(), factor=1.0, score=0.0, doubtful=tuple(sorted(some)))
+    return replace(found, judgement=judgement, exchangeable=_points_of(like))
 
 
 def _placed(
@@ -268,8 +301,8 @@ def _converged(
         with np.errstate(over="ignore", invalid="ignore"):
             moved = points.moved(placing, model, without)
             X, Y = placing.apply(points.free), moved.apply(points.free)
-        if not np.isfinite(Y).all():
-            break
+            if not np.isfinite((Y / ROUNDING) ** 2).all():  # nor would its weights be
+                break
         placing, model = moved, points.model(moved, estimated=estimated)
         if np.abs(Y - X).max() <= RANK * _centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
             return placing, model

@@ -328,12 +328,15 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
 
 
 def misfit_of(model: GivenModel, found: Judgement) -> float:
-    """Return chi-square with what is wrong, and its cost; by the largest sigmas believed of unknown ones."""
-    if not model.estimated:
-        return found.misfit
-    worst, cost = model.at_worst, float(np.log(max(len(model.v), 2)))
-    score = _score_as_scatter(worst, found.wrong, cost) if found.wrong else 0.0
-    return worst.kept().chi2 + score
+    """Return chi-square with what is wrong, and its cost; by the largest sigmas believed of unknown ones.
+
+    Without wrong values it is that of the others: a difference of two of 1e29 has their rounding.
+    """
+    if not found.wrong:
+        return model.at_worst.kept().chi2 if model.estimated else found.misfit
+    model = model.at_worst if model.estimated else model
+    others = model.part(~np.isin(model.item, found.wrong))
+    return others.kept().chi2 + _cost_as_scatter(model, found.wrong, float(np.log(max(len(model.v), 2))))
 
 
 @dataclass(frozen=True)
@@ -369,13 +372,18 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
 
 
 def _score_as_scatter(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
-    """Return the change of -2 ln likelihood where values scatter more than stated, its cost and the choice.
+    """Return the change of -2 ln likelihood where values scatter more than stated, and its cost."""
+    return _cost_as_scatter(model, out, cost) - (model.kept().chi2 - model.kept(out).chi2)
+
+
+def _cost_as_scatter(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
+    """Return the cost of values that scatter more than stated, and of their choice.
 
     Chi-square F of q differences costs q (1 + ln F / q): how large errors are must be known too.
     """
     every, kept = model.kept(), model.kept(out)
     q, F = every.dof - kept.dof, every.chi2 - kept.chi2
-    return cost + q * (1 + log(max(F / max(q, 1), 1.0))) - F + 2 * log(comb(model.items, len(out)))
+    return cost + q * (1 + log(max(F / max(q, 1), 1.0))) + 2 * log(comb(model.items, len(out)))
 
 
 def _score(model: GivenModel, out: tuple[int, ...], cost: float) -> float:

@@ -37,7 +37,8 @@ ROWS = (
         "given_contradicted",
         DETECTED,
         "Some of {of:@} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
-        "wrong[[, and shift coordinates by up to {shift} standard deviations]].",
+        "wrong[[, and shift coordinates by up to {shift} standard deviations]].[[ The names of "
+        "{exchanged} may be exchanged, in more than one way.]]",
         CHECK_THE_LIST,
         "Check these coordinates; more given points show which one is wrong.",
     ),
@@ -51,10 +52,11 @@ ROWS = (
     Kind(
         "given_mirrored",
         "error",
-        "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored): they "
-        "were not used.",
-        "left-handed coordinates, two axes exchanged, the sign of one axis changed, or mirrored photographs",
-        "Give X, Y and Z of a right-handed system.",
+        "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored)[[, or "
+        "the names of {exchanged} are exchanged]]: they were not used.",
+        "left-handed coordinates, two axes exchanged, the sign of one axis changed, mirrored photographs, or "
+        "the names of left and right exchanged",
+        "Give X, Y and Z of a right-handed system; check the names of the points.",
     ),
     Kind(
         "given_sigmas",

@@ -25,7 +25,7 @@ from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
-JUDGED_AS = {"control points": "control", "scale bars": "scale"}
+JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # What is left of the error of a value that is checked less is below the rounding and the neglected second
 # order of the others, and w magnifies that.
 MIN_REDUNDANCY = 1e-3

@@ -208,8 +208,10 @@ def _rounded(group: Group, start: Similarity | None, level: float) -> Group:
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     """Yield what does not fit of points, and what nothing checks."""
     found, of = group.found, group.of
+    exchanged = [group.names[k] for k in group.placed.exchangeable] or None
     if group.placed.mirrored:
-        yield remark("given_mirrored", of=of, chi2=group.placed.unmirrored, mirrored=found.statistic)
+        chi2, mirrored = group.placed.unmirrored, found.statistic
+        yield remark("given_mirrored", of=of, chi2=chi2, mirrored=mirrored, exchanged=exchanged)
         return
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
@@ -258,6 +260,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
         "given_contradicted",
         of=group.of,
         given=[group.names[k] for k in found.doubtful],
+        exchanged=[group.names[k] for k in group.placed.exchangeable] or None,
         chi2=found.statistic,
         dof=found.dof,
         shift=shift if np.isfinite(shift) else None,
