@@ -106,7 +106,7 @@ def test_short_ways_of_saying_it_work() -> None:
         (lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), codes=14), "codes 14, expected the name"),  # type: ignore
         (
             lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), min_diameter_px=-1),
-            "diameters from -1 to 250",
+            "diameters from -1 to inf",
         ),
         (lambda: sfm.fit_similarity(np.zeros((3, 2)), np.zeros((3, 2))), r"points \(3, 2\) and \(3, 2\)"),
         (lambda: sfm.fit_similarity(np.full((3, 3), np.nan), np.zeros((3, 3))), "NaN or infinity"),
