@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -82,7 +82,8 @@ def try_targets(
     if len(counts[best]) < MIN_REPEATED:
         refused = {name for name, _ in unreadable}
         more = [paths[k] for k in _spread(len(paths), PLATES_TRIED) if paths[k].name not in refused]
-        tags, plate = _tags_and_boards(list(map(_as_bytes, photographs)), more, progress)
+        read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
+        tags, plate = _tags_and_boards(read_already, more, progress)
         if plate is None and tags:
             measured = [_measure(path, tags, store) for path in tried]
             counts[tags], best = _repeated([one.code for one in measured]), tags
@@ -115,14 +116,16 @@ def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray
 
 
 def _tags_and_boards(
-    tried: Sequence[AnyArray], more: Sequence[Path], progress: Progress
+    read_already: Mapping[Path, AnyArray], more: Sequence[Path], progress: Progress
 ) -> tuple[str, PlateFamily | None]:
     """Return the dictionary of tags that photographs have in common, "" without, and their board.
 
     A checkerboard may be a ChArUco board, which its tags show.
     """
-    none = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
-    plate = search_checkerboard([_as_bytes(read_photograph(path)) for path in more])
+    none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
+    plate = search_checkerboard(
+        [read_already[path] if path in read_already else _as_bytes(read_photograph(path)) for path in more]
+    )
     progress.advance("boards")
     read = [read_dictionaries(photograph) for photograph in (tried if plate is None else tried[:1])]
     if plate is not None and read[0]:

@@ -17,10 +17,9 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.targets.codes.lattice import Lattice, find_lattice
 from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
+from sfm.targets.fits.damage import BIWEIGHT, MAD, ROUNDS
 
 LEAST_DOTS, LEAST_BENT = 9, 20  # that show a plate, and the bend of the trend of their sizes
-# Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
-ROUNDS, BIWEIGHT, MAD = 20, 4.685, 1.4826
 LEAST_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
 # A dot is anything with this probability at least, spread over so many standard deviations, and where more of
 # them lie so far off, with theirs. A plate is larger than its table with the same probability.
@@ -68,11 +67,11 @@ def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> F
     if len(row) >= LEAST_BENT:
         trend += [row * row, row * column, column * column]
     design, weight = np.stack(trend, axis=1), (~ring).astype(float)
-    for k in range(ROUNDS):
+    for k in range(2 * ROUNDS):
         root = np.sqrt(weight)[:, None]
         larger = log - design @ np.linalg.lstsq(root * design, root[:, 0] * log, rcond=None)[0]
         scatter = max(MAD * float(np.median(np.abs(larger[~ring]))), LEAST_SCATTER)
-        if k < ROUNDS // 2:
+        if k < ROUNDS:
             weight = ~ring / np.maximum(np.abs(larger), LEAST_SCATTER)
         else:
             weight = ~ring * np.maximum(1 - (larger / (BIWEIGHT * scatter)) ** 2, 0.0) ** 2
