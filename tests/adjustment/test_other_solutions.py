@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality import other_solutions as searched
+from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from tests.synthetic import make_network, seed_of
 
 
 def stub(images: int = 8, share: float = 0.0, **parts: object) -> Any:
@@ -56,9 +59,12 @@ def test_stated_weights_count_as_ten_observations(redundancy: int, vPv: float, a
 def test_solutions_are_others_from_one_standard_deviation_on(
     sigmas: float, other: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    a = stub(redundancy=20, vPv=20.0)
+    network, truth = make_network(seed_of("apart"), images=3, points=20, free=("c",))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    other_place = searched._Candidate(a.estimate, a.vPv)
+    monkeypatch.setattr(searched._Search, "candidates", lambda *_, **__: [other_place])
     monkeypatch.setattr(searched, "_apart", lambda *_: sigmas)
-    assert bool(searched.solution_before(a, a, ())) == other
+    assert bool(searched.other_solutions(a)) == other
 
 
 @pytest.mark.parametrize(("height", "length"), [(2500.0, 3), (3500.0, 2)])
@@ -78,8 +84,30 @@ def test_c_is_followed_from_a_fifth_to_the_fivefold() -> None:
     assert searched.STEPS == 6 and searched.MAX_ITERATIONS == 60 and searched.NEAR == 1e-3
 
 
-def test_the_principal_distance_of_other_solutions_is_of_the_first_free_camera() -> None:
+def test_each_c_is_tried_from_the_one_before_and_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The valley that is followed is at 3 and 5; from the start another one is found, at 2."""
+    heights = iter([1.0, 3.0, 5.0, 2.0, 7.0, 8.0])
+    start = stub().estimate
+
+    def scaled(one: Any, factor: float) -> Any:
+        camera = one.cameras[0]
+        return SimpleNamespace(cameras=(camera.with_parameters(camera.parameters * factor),))
+
+    monkeypatch.setattr(searched, "scaled", scaled)
+    search: Any = SimpleNamespace(adjusted=lambda one, held: searched._Candidate(one, next(heights)))
+    track = searched._Search._along(search, start, 2.0, 3, 1.0)
+    assert [one.vPv for one in track] == [1.0, 3.0, 2.0, 7.0]
+    assert [one.estimate.cameras[0].parameters[0] for one in track] == [20.0, 40.0, 80.0, 160.0]
+
+
+def test_other_solutions_are_described_by_the_first_camera_whose_c_is_free() -> None:
     free = stub().estimate.cameras[0]
     held = replace(free, name="B", free=np.zeros_like(free.free))
-    assert searched._principal_distance((held, free)) == ("A", 20.0, "mm")
-    assert searched._principal_distance((held,)) == ("B", 20.0, "mm")
+    for cameras, name in (((held, free), "A"), ((held,), "B")):
+        a = stub(share=0.1)
+        a.estimate.cameras = cameras
+        scaled = tuple(one.with_parameters(one.parameters * 1.5) for one in cameras)
+        other: Any = SimpleNamespace(cameras=scaled, points=np.eye(3))
+        found = searched._Place(a).describe(other, 1.0)
+        assert (found.camera, found.c, found.unit) == (name, pytest.approx(30.0), "mm")
+        assert found.c_moved == pytest.approx(5.0) and not found.reflected

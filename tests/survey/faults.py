@@ -27,6 +27,7 @@ class Planted:
     states: tuple[FloatArray, ...]  # object points of each state of the object, (n, 3)
     cause: str  # kind of the remark that is right; empty where no alternative is
     exact: Network  # the same without noise
+    unknowns: int  # of the fault, for who knows which it is
 
 
 @dataclass
@@ -41,6 +42,7 @@ class _Scene:
     names: FloatArray  # measured point of each image point, (k,)
     extra: FloatArray  # what comes on top of each image point, px, (k, 2)
     noise_px: float = NOISE_PX
+    unknowns: int = 1  # of what is planted
 
     @property
     def m(self) -> int:
@@ -166,6 +168,7 @@ def _drift(scene: _Scene) -> str:
 def _stabiliser(scene: _Scene) -> str:
     """A stabiliser that moves the principal point in every photograph."""
     size = abs(_size(scene, 1, 10)) * PIXEL_MM[0]
+    scene.unknowns = 2 * scene.m
     for i in range(scene.m):
         for name in ("x0", "y0"):
             scene.change(i, name, by=size * scene.rng.standard_normal())
@@ -174,6 +177,7 @@ def _stabiliser(scene: _Scene) -> str:
 
 def _autofocus(scene: _Scene) -> str:
     size = abs(_size(scene, 1e-3, 1e-2))
+    scene.unknowns = scene.m
     for i in range(scene.m):
         scene.change(i, "c", factor=1 + size * scene.rng.standard_normal())
     return "camera_varies"
@@ -220,6 +224,7 @@ def _some_moved(scene: _Scene) -> str:
     count = max(2, round(0.1 * scene.n))
     moved = scene.rng.choice(scene.n, count, replace=False)
     by = scene.rng.standard_normal((count, 3)) * abs(_size(scene, 2e-4, 4e-3))
+    scene.unknowns = by.size
     for i in _split(scene):
         scene.points[i][moved] += by
     return "points_moved"
@@ -228,6 +233,7 @@ def _some_moved(scene: _Scene) -> str:
 def _one_moved(scene: _Scene) -> str:
     j = int(scene.rng.integers(scene.n))
     by = scene.rng.standard_normal(3) * abs(_size(scene, 5e-4, 2e-2))
+    scene.unknowns = by.size
     for i in _split(scene):
         scene.points[i][j] += by
     return "points_moved"
@@ -236,6 +242,7 @@ def _one_moved(scene: _Scene) -> str:
 def _half_moved(scene: _Scene) -> str:
     moved = scene.rng.choice(scene.n, scene.n // 3, replace=False)
     by = np.array([1.0, 0.5, 0.2]) * _size(scene, 3e-4, 3e-3)
+    scene.unknowns = 3 * len(moved)
     for i in _split(scene):
         scene.points[i][moved] += by
     return "points_moved"
@@ -257,10 +264,16 @@ def _held(name: str, low: float, high: float, *, relative: bool = False) -> Call
 
 
 def _names_exchanged(scene: _Scene) -> str:
-    p, q = scene.rng.choice(scene.n, 2, replace=False)
-    photographs = scene.rng.choice(scene.m, max(2, scene.m // 4), replace=False)
-    on = np.isin(scene.network.image_points.image, photographs)
-    point = scene.network.image_points.point
+    """Exchange two names in fewer than half of the photographs of each point, or the others were wrong."""
+    image, point = scene.network.image_points.image, scene.network.image_points.point
+    sees = np.zeros((scene.m, scene.n), dtype=bool)
+    sees[image, point] = True
+    rays = sees.sum(axis=0)
+    p, q = scene.rng.choice(np.flatnonzero(rays >= np.sort(rays)[-max(2, scene.n // 2)]), 2, replace=False)
+    both = np.flatnonzero(sees[:, p] & sees[:, q])
+    most = (min(rays[p], rays[q]) - 1) // 2
+    photographs = scene.rng.choice(both, min(max(2, scene.m // 4), most, len(both)), replace=False)
+    on = np.isin(image, photographs)
     scene.names[on & (point == p)], scene.names[on & (point == q)] = q, p
     return "names_exchanged"
 
@@ -427,4 +440,5 @@ def planted(kind: str, number: int) -> Planted:
     scene = scene_of(kind, number)
     cause = EVERY[kind](scene)
     states = tuple(np.unique(scene.points, axis=0))
-    return Planted(scene.measured(), scene.truth, states, cause, scene.measured(exact=True))
+    exact = scene.measured(exact=True)
+    return Planted(scene.measured(), scene.truth, states, cause, exact, scene.unknowns)

@@ -6,7 +6,9 @@ runs surveys from scratch on the networks of `tests.survey.faults` from number F
 ordinary, faults, rowless, and prints for each kind how often it is called bad or fair, and which is named.
 A result is wrong where a coordinate is more than 5 of its standard deviations from the truth. Its fault can
 be detected where a test that knew it would find it with 80 % probability at the level 0.001: where v'Pv of
-the same survey without noise, in which the fault is all that is left, exceeds Baarda's 17.07.
+the same survey without noise, in which the fault is all that is left, exceeds Baarda's 17.07. It is found
+surely where a test of as many unknowns as it has, one among a thousand that share that level, finds it with
+99.9 %: below, chance decides whether anything is said.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
@@ -30,9 +33,13 @@ from sfm.similarity import fit_similarity
 from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted
 from tests.surveys import survey_of
 
-COLUMNS = "wrong, detectable, named first, untold; wrong and not named first, said unchecked; false"
+COLUMNS = (
+    "wrong, detectable, named first, untold (surely found, of them untold); "
+    "wrong and not named first, said unchecked; false"
+)
 WRONG = 5.0  # standard deviations, of the worst coordinate
 DETECTABLE = 17.07  # noncentrality that one test at the level 0.001 finds with 80 %; Baarda (1968)
+SURE_LEVEL, SURE_POWER = 1e-6, 0.999
 UNCHECKED = {
     *("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested"),
     *("assumptions_untested", "photographs_untested", "too_many_to_test"),
@@ -63,6 +70,7 @@ class Outcome:
     level: str  # good, fair, bad; none where the survey ended without a result
     over_sigma: float  # of the worst coordinate
     detectable: bool
+    sure: bool  # whether it is found surely
     named: tuple[str, ...]  # causes, in the order of the verdict, notes included
     first: str  # kind of the first remark that is no note
     unchecked: bool = False  # whether it says that an assumption is hardly checked
@@ -98,12 +106,12 @@ def outcome_of(kind: str, number: int) -> Outcome:
     try:
         result = run_survey(survey_of(one.network, one.start, free=free, adjust={"reject": "tau"}))
     except KolinearError as error:
-        return Outcome(kind, number, one.cause, "none", np.nan, True, (), str(error))
+        return Outcome(kind, number, one.cause, "none", np.nan, True, True, (), str(error))
     verdict = findings_of(result).verdict
     named = tuple(remark.kind for remark in verdict.remarks if remark.kind in CAUSES)
     serious = [remark.kind for remark in verdict.remarks if remark.severity != "note"]
     return Outcome(
-        *(kind, number, one.cause, verdict.level, _over_sigma(result, one), _is_detectable(one)),
+        *(kind, number, one.cause, verdict.level, _over_sigma(result, one), *_detectable(one)),
         *(named, serious[0] if serious else ""),
         any(remark.kind in UNCHECKED for remark in verdict.remarks),
         tuple(kind for one in verdict.remarks if one.kind in CAUSES for kind in one.names("instead")),
@@ -123,13 +131,17 @@ def _over_sigma(result: SurveyResult, one: Planted) -> float:
     return min(worst)
 
 
-def _is_detectable(one: Planted) -> bool:
-    """Return whether the fault shows in the image points, by what it leaves of v'Pv without noise."""
+def _detectable(one: Planted) -> tuple[bool, bool]:
+    """Return whether the fault shows in the image points, by its v'Pv without noise, and surely."""
     try:
         found = adjust(one.exact, one.start, datum=Datum("free"), reject="none")
     except KolinearError:
-        return True
-    return not found.converged or found.vPv > DETECTABLE
+        return True, True
+    if not found.converged:
+        return True, True
+    critical = stats.chi2.isf(SURE_LEVEL, one.unknowns)
+    power = stats.ncx2.sf(critical, one.unknowns, found.vPv) if found.vPv > 0 else SURE_LEVEL
+    return found.vPv > DETECTABLE, bool(power > SURE_POWER)
 
 
 def study(names: Iterable[str], first: int, processes: int = 2) -> list[Outcome]:
@@ -158,15 +170,16 @@ def _row(some: list[Outcome]) -> str:
     wrong = [one for one in some if one.is_wrong and one.cause]
     seen = [one for one in wrong if one.detectable]
     right = sum(one.is_right_cause for one in seen)
-    untold = sum(not one.named and not one.first for one in seen)
+    untold = [one for one in seen if not one.named and not one.first]
+    sure = sum(one.sure for one in seen), sum(one.sure for one in untold)
     others = [one for one in wrong if not one.is_right_cause]
     said = sum(one.unchecked or bool(one.first) for one in others)
     false = sum(one.is_false for one in some)
+    found = f"{len(wrong):3} {len(seen):3} {right:3} {len(untold):3} ({sure[0]}, {sure[1]})"
     counts = " ".join(f"{levels[level]:3}" for level in ("bad", "fair", "good", "none"))
     believed = sum(one.is_wrong and one.level == "good" for one in some)
     return (
-        f"{len(some):3}  {counts}   {len(wrong):3} {len(seen):3} {right:3} {untold:3}   "
-        f"{len(others):3} {said:3}   {false:3}, "
+        f"{len(some):3}  {counts}   {found}   {len(others):3} {said:3}   {false:3}, "
         f"wrong and called good {believed}"
     )
 

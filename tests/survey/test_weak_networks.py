@@ -96,6 +96,12 @@ def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> Non
     assert contradicted((), (cause,)) == contradicted(("A",), ()) == ()
 
 
+def test_a_solution_that_no_valley_leads_to_is_found_from_the_start() -> None:
+    """c 60 % too short and fair, 17 sigma wrong: along c the network turned back before the true one."""
+    found = outcome_of(1344)
+    assert found.level == "bad" and found.kinds[0] == "other_solution"
+
+
 def test_a_pair_does_not_determine_the_c_that_was_found_for_it() -> None:
     """c 40 % too long, found because the pair could be oriented with it: 18 sigma wrong and called fair."""
     found = outcome_of(1321)

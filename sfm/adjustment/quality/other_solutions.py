@@ -4,7 +4,7 @@ In weak networks the sum of squares has several minima: of few photographs with 
 distance go together, and relief or tilt can be turned inside out as in a drawing of a cube. Each minimum has
 a small standard deviation of its own, which says nothing of the others. The network is therefore followed
 along c in both directions, from the result and from its reflection in depth, with c held; where v'Pv is as
-small as that of the result, c is freed and the network adjusted.
+small as that of the result, or at a minimum, c is freed and the network adjusted.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8 (approximate values); Luhmann
 et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlated interior and exterior orientation); Szeliski
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -52,6 +53,7 @@ class OtherSolution:
     unit: str  # of c
     reflected: bool  # whether it is another one than the result in depth rather than in c
     moved: float  # by how much points differ, over their standard deviations in the result, RMS
+    c_moved: float  # by how much c differs, over its standard deviation in the result; 0 of a c that is held
     vPv: float  # over that of the result
     estimate: Estimate
     converges: bool  # whether an adjustment of all observations from there ends
@@ -80,56 +82,22 @@ def other_solutions(
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
     limit = 1 + _allowed(base) / base.vPv
-    sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
-    own = _principal_distance(a.estimate.cameras)
+    result = _Place(a)
     found: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
-    candidates = sorted(tried, key=lambda one: one.vPv)
-    for candidate in candidates:
-        points = candidate.estimate.points
-        moved = _apart(points, a.estimate.points, sigma)
-        known = any(_apart(points, one.estimate.points, sigma) < MIN_APART_SIGMAS for one in found)
-        if candidate.vPv > base.vPv * limit or not moved > MIN_APART_SIGMAS or known:
+    for candidate in sorted(tried, key=lambda one: one.vPv):
+        known = any(result.distance(candidate.estimate, one.estimate) < MIN_APART_SIGMAS for one in found)
+        if candidate.vPv > base.vPv * limit or known:
             continue
-        camera, c, unit = _principal_distance(candidate.estimate.cameras)
-        reflected = abs(np.log(c / own[1])) < np.log(STEP) / 2
-        found.append(
-            OtherSolution(
-                camera,
-                c,
-                unit,
-                reflected=bool(reflected),
-                moved=moved,
-                vPv=candidate.vPv / base.vPv,
-                estimate=candidate.estimate,
-                converges=False,
-            )
-        )
+        one = result.describe(candidate.estimate, candidate.vPv / base.vPv)
+        if one.moved > MIN_APART_SIGMAS:
+            found.append(one)
     if found and found[0].vPv < 1:
         best = _with_c_freed(found[0].estimate, had_to_be_held)
         ended = search.adjusted(best, tolerance=TOLERANCE)
         if ended is not None and ended.converged:
             found[0] = replace(found[0], estimate=ended.estimate, converges=True)
     return tuple(found)
-
-
-def solution_before(
-    adjustment: Adjustment, before: Adjustment, others: tuple[OtherSolution, ...]
-) -> tuple[OtherSolution, ...]:
-    """Return the solution that was left for a better one, if it is hardly worse and none of the others."""
-    a, limit = adjustment, 1 + _allowed(adjustment) / adjustment.vPv if adjustment.vPv > 0 else 1.0
-    if len(a.network.points) != len(before.network.points) or before.vPv > limit * a.vPv:
-        return ()
-    sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
-    moved = _apart(before.estimate.points, a.estimate.points, sigma)
-    known = any(
-        _apart(before.estimate.points, one.estimate.points, sigma) < MIN_APART_SIGMAS for one in others
-    )
-    if not moved > MIN_APART_SIGMAS or known:
-        return ()
-    camera, c, unit = _principal_distance(before.estimate.cameras)
-    ratio = before.vPv / a.vPv
-    return (OtherSolution(camera, c, unit, False, moved, ratio, before.estimate, converges=False),)
 
 
 def _allowed(base: Adjustment) -> float:
@@ -221,11 +189,17 @@ class _Search:
                             yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
 
     def _along(self, start: Estimate, factor: float, steps: int, vPv: float) -> list[_Candidate]:
-        """Follow the network with c held at multiples of the start's, while v'Pv is not too large."""
+        """Follow the network with c held at multiples of the start's, while v'Pv is not too large.
+
+        Each is adjusted from the one before it, which stays in one valley, and from the start, which finds
+        others; the smaller v'Pv is taken.
+        """
         track: list[_Candidate] = []
         estimate = start
         for k in range(steps + 1):
-            found = self.adjusted(scaled(estimate, factor) if k else estimate, held=steps > 0)
+            starts = (scaled(estimate, factor), scaled(start, factor**k))[: min(k, 2)] or (start,)
+            ended = [self.adjusted(one, held=steps > 0) for one in starts]
+            found = min((one for one in ended if one is not None), key=lambda one: one.vPv, default=None)
             if found is None:
                 break
             estimate = found.estimate
@@ -267,10 +241,43 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
     return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))
 
 
-def _principal_distance(cameras: tuple[Camera, ...]) -> tuple[str, float, str]:
-    """Return name, principal distance and its unit of the first camera whose c is free, else of the first."""
-    camera = next((one for one in cameras if one.free[0]), cameras[0])
-    return camera.name, float(camera.parameters[0]), camera.units[0]
+@dataclass(frozen=True)
+class _Place:
+    """The result, from which others are so many standard deviations away."""
+
+    adjustment: Adjustment
+
+    def describe(self, other: Estimate, vPv: float) -> OtherSolution:
+        """Return another solution as it differs from the result."""
+        own, number = self.adjustment.estimate, self._number
+        camera = other.cameras[number]
+        c, sigma = float(camera.parameters[0]), float(self.adjustment.interior_sigma(number)[0])
+        return OtherSolution(
+            camera.name,
+            c,
+            camera.units[0],
+            reflected=bool(abs(np.log(c / own.cameras[number].parameters[0])) < np.log(STEP) / 2),
+            moved=self.distance(other, own),
+            c_moved=abs(c - own.cameras[number].parameters[0]) / sigma if sigma > 0 else 0.0,
+            vPv=vPv,
+            estimate=other,
+            converges=False,
+        )
+
+    def distance(self, one: Estimate, other: Estimate) -> float:
+        """Return by how many standard deviations of the result the points of two solutions differ, RMS."""
+        return _apart(one.points, other.points, self._sigma)
+
+    @cached_property
+    def _sigma(self) -> FloatArray:
+        variance: FloatArray = np.trace(self.adjustment.covariance.points, axis1=1, axis2=2) / 3
+        return np.sqrt(variance)
+
+    @cached_property
+    def _number(self) -> int:
+        """The first camera whose c is free, else the first."""
+        cameras = self.adjustment.estimate.cameras
+        return next((k for k, one in enumerate(cameras) if one.free[one.parts[0]].any()), 0)
 
 
 def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:

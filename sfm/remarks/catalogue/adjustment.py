@@ -117,7 +117,7 @@ ROWS = (
         "other_solution",
         SOLUTION,
         "The image points allow another solution with c of camera {camera} at {c} (v'Pv {vPv} times that of "
-        "the result); points differ by {moved} standard deviations (RMS).",
+        "the result); points differ by {moved} standard deviations (RMS)[[, c by {c_moved}]].",
         "a flat object or a narrow range of angles: the photographs allow two shapes",
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),

@@ -94,6 +94,7 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
                 c=(other.c, other.unit),
                 vPv=other.vPv,
                 moved=other.moved,
+                **({"c_moved": other.c_moved} if other.c_moved else {}),
             )
         )
         if all(one.kind != before.kind for before in found):

@@ -10,7 +10,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.quality.given_values import GivenTest
-from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
+from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -331,9 +331,8 @@ def _solved(start: _Prepared) -> _Solved:
         final, check = _placed(start, task, settled)
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
-        others = other_solutions(final, starts=_of_pair(final), had_to_be_held=c_held)
-        if first is not None and final.converged:
-            others = (*others, *solution_before(final, first[1], others))
+        starts = (*_of_pair(final), *(() if first is None else _left(final, first[1])))
+        others = other_solutions(final, starts=starts, had_to_be_held=c_held)
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break
@@ -385,6 +384,11 @@ def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     return pair_solutions(
         accepted, final.estimate, tolerance_px=PAIR_TOLERANCE * max(final.sigma0, 1.0) * final.sigma_px
     )
+
+
+def _left(final: Adjustment, before: Adjustment) -> tuple[Estimate, ...]:
+    """Return the solution that was left for a better one, where it has the same points."""
+    return (before.estimate,) if len(before.network.points) == len(final.network.points) else ()
 
 
 def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment, ControlCheck | None]:
