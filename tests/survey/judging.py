@@ -122,12 +122,13 @@ def _over_sigma(result: SurveyResult, one: Planted) -> float:
     """Return the largest error of a coordinate in its standard deviations, by the nearest state."""
     a = result.adjustment
     index = [one.network.point_index(name) for name in a.network.points]
-    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     worst = []
     for state in one.states:
         placing = fit_similarity(a.estimate.points, state[index])
         error = placing.apply(a.estimate.points) - state[index]
-        worst.append(float((np.abs(error) / (placing.scale * sigma)).max()))
+        of_axes = placing.rotation @ a.covariance.points @ placing.rotation.T
+        sigma = placing.scale * np.sqrt(np.diagonal(of_axes, axis1=1, axis2=2))
+        worst.append(float((np.abs(error) / sigma).max()))
     return min(worst)
 
 
