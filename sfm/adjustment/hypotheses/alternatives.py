@@ -30,9 +30,9 @@ from sfm.adjustment.hypotheses.families import (
     format_columns,
 )
 from sfm.adjustment.hypotheses.score import (
-    DETERMINED,
     Gain,
     Reduced,
+    determined_inverse,
     gain_of,
     gains_of,
     least_share,
@@ -263,9 +263,7 @@ def _each(
         if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
             continue
         cross = H[:, rest][:, :, :, some].reshape(p, q)
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(own), np.finfo(float).tiny))
-        inverse = np.linalg.pinv(own * scale[:, None] * scale, rcond=DETERMINED, hermitian=True)
-        inverse *= scale[:, None] * scale
+        inverse = determined_inverse(own, squares[:, some].ravel())
         others = gain_of(
             H[:, rest][:, :, :, rest].reshape(p, p) - cross @ inverse @ cross.T,
             g[:, rest].ravel() + cross @ gain.beta,

@@ -315,6 +315,19 @@ def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = DE
     return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
 
 
+def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
+    """Return the inverse of normal equations in the directions of which `gain_of` takes the gain.
+
+    Args:
+        H: normal equations, (q, q).
+        squares: of the columns before the elimination, (q,).
+    """
+    values, vectors, scale = directions_of(H, squares)
+    good = values > DETERMINED
+    half = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
+    return np.asarray(half @ half.T)
+
+
 def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return the gains (n,) and ranks (n,) of n alternatives that do not concern one another.
 

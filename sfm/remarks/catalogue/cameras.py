@@ -71,7 +71,7 @@ ROWS = (
     ),
     Kind(
         "c_hardly_determined",
-        Grade("share", warning=0.05, error=1.0),  # a standard deviation as large as c determines nothing
+        Grade("share", warning=0.05, error=1 / 3),  # three standard deviations reach c = 0
         "{parameter} of camera {camera} is known to {share:%} only[[, strongly correlated with {partners}]].",
         "a long lens, few photographs, or small angles between them",
         "Hold it fixed at a calibrated value, or add photographs at larger angles and other distances.",
