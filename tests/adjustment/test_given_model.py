@@ -121,6 +121,15 @@ def test_the_probability_shares_the_level_among_three_tests() -> None:
     assert other.kept().probability() == pytest.approx(6 * stats.chi2.sf(27, 3), rel=1e-4)
 
 
+@pytest.mark.parametrize("estimated", [False, True])
+def test_values_none_of_which_is_checked_alone_contradict_nothing(
+    estimated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(given_values, "CHECKED", 1.1)  # beyond every redundancy number
+    one = replace(bars(0.0, 0.1, -0.1), estimated=estimated)
+    assert one.kept().dof == 2 and one.kept().probability() == 1.0
+
+
 def test_the_probability_without_a_value_is_that_of_the_others() -> None:
     many = replace(of_points("without"), network=np.zeros((15, 15)))
     many = replace(many, v=3 * many.v)

@@ -20,7 +20,7 @@ from sfm.adjustment.hypotheses.columns import (
     interior_step,
     object_fields,
 )
-from sfm.adjustment.hypotheses.families import GIVEN
+from sfm.adjustment.hypotheses.families import GIVEN, HELD
 from sfm.adjustment.hypotheses.hypotheses import Judged, contradicted_parameters, judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
@@ -329,6 +329,23 @@ def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda *_: SimpleNamespace(redundancy=1))
     assert hypotheses._best(SimpleNamespace(), ()) is None  # type: ignore[arg-type]
     assert tried == [*every[:2], *every[5:7]]
+
+
+def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does() -> None:
+    network, truth = make_network(seed_of("refit"), images=8, points=40, free=("c",))
+    a = solved(network, truth, "none")
+    free = truth.cameras[0].free.copy()
+    s = truth.cameras[0].names.index("K1")
+    free[s] = True
+    freed = solved(network, replace(a.estimate, cameras=(replace(a.estimate.cameras[0], free=free),)), "none")
+    reduced = reduce_adjustment(a, columns_of(a))
+    one = next(one for one in interiors(a, reduced, HELD) if [k for _, k in one.parameters] == [s])
+    half = replace(one, gain=replace(one.gain, beta=one.gain.beta / 2))  # further steps end at the optimum
+    for start in (one, half):
+        found = refitting.refit(a, start, a)
+        assert found is not None and found.adjustment.vPv == pytest.approx(freed.vPv, rel=1e-4)
+        change = freed.estimate.cameras[0].parameters[s] - a.estimate.cameras[0].parameters[s]
+        assert found.beta[0] * interior_step(a, 0, s) == pytest.approx(change, rel=1e-2)
 
 
 def test_a_step_is_halved_three_times(clean: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -199,6 +199,12 @@ def test_given_unknowns_are_standardised_by_hand() -> None:
         assert np.isfinite(w[0, 0]) == checked
 
 
+def test_the_level_of_single_tests_is_that_of_all() -> None:
+    """Pope (1976) and Sidak (1967): 5 % that any of them rejects what is good."""
+    assert numbers.level_of_single(numbers.FALSE_ALARM, 1) == pytest.approx(0.05)
+    assert numbers.level_of_single(numbers.FALSE_ALARM, 1000) == pytest.approx(5.129e-5, rel=1e-4)
+
+
 def test_tau_by_students_t() -> None:
     assert numbers.tau_critical(0.05, 1) == np.inf
     t = stats.t.ppf(0.975, 1)

@@ -16,7 +16,8 @@ from sfm.errors import SurveyFileError
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
-from sfm.targets.codes.dot_plates import name_dots
+from sfm.targets.codes.dot_plates import name_dots, placements
+from sfm.targets.codes.lattice import Lattice
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets
 from tests.plates import BOARD, GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
@@ -35,6 +36,17 @@ def seen(plate: PlateFamily, name: str) -> tuple[FloatArray, FloatArray, IntArra
     is_mark = np.isin(np.arange(plate.count), [r * plate.columns + c for r, c in plate.marks])
     radius[is_mark] *= 1.5
     return xy + 0.3 * rng.standard_normal(xy.shape), radius, np.arange(plate.count)
+
+
+def test_shifted_rows_are_placed_in_twelve_ways_none_of_them_mirrored() -> None:
+    """A hexagonal grid looks the same after each of its own turns, which the lattice may be sheared by."""
+    lattice = Lattice(np.arange(3), np.array([[0, 0], [0, 1], [1, 0]]), np.zeros((3, 2)))
+    ways = placements(lattice, PlateFamily("hexagonal-grid", 5, 4))
+    found = {tuple(map(tuple, way.tolist())) for way in ways}
+    assert len(found) == len(ways)
+    for _, across, down in ways:
+        assert down[0] * across[1] - down[1] * across[0] == 2  # area of a cell, half columns by rows
+        assert all(int(step.sum()) % 2 == 0 for step in (down, across))  # from dot to dot
 
 
 @pytest.mark.parametrize("rings", [False, True])

@@ -139,8 +139,7 @@ class CameraFamily(OfPhotographs):
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return by how much c and the principal point differ."""
-        first = 0 if one.pattern == "each" else int(one.photographs[0])
-        half = max(a.estimate.cameras[a.network.camera[first]].size_px) / 2
+        half = max(a.estimate.cameras[a.network.camera[one.photographs[0]]].size_px) / 2
         if one.pattern == "each":
             return self._of_each(beta.reshape(-1, len(self.places)), half)
         linear = one.pattern == "linear"

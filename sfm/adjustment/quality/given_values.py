@@ -88,13 +88,14 @@ class Kept:
             return 1.0
         fall, rank = self.decreases()
         of_rank = [self._sf_of_one(float(fall[rank == r].max()), int(r)) for r in np.unique(rank[rank > 0])]
-        single = int((rank > 0).sum()) * min(of_rank, default=1.0)
+        single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked alone
         if self.model.estimated:
             return min(1.0, single)
         of_one, u = np.diagonal(self.precision) * self.model.size**2, self.u * self.model.size
         on = of_one > CHECKED
         largest = float((u[on] ** 2 / of_one[on]).max(initial=0.0))
-        together, coordinate = self._sf(self.chi2, self.dof), int(on.sum()) * self._sf(largest, 1)
+        together = self._sf(self.chi2, self.dof)
+        coordinate = int(on.sum()) * self._sf(largest, 1) if on.any() else np.inf
         return min(1.0, 3 * together, 3 * single, 3 * coordinate)
 
     def _sf(self, chi2: float, dof: int) -> float:

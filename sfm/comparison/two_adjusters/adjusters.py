@@ -152,9 +152,12 @@ def compare_adjusters(
         further = _adjusted(network, theirs.estimate, adjustment.sigma_px)
         ended = compare(ours.estimate, further.estimate, network, covariance=ours.covariance)
         stopped_early = further.converged and ended.agree
-        if stopped_early or held or not (rational and further.undetermined):
+        if stopped_early or held or not rational:
             break
-        held = further.undetermined  # where one ends they are, where the other ends they hardly are not
+        held = further.undetermined or (
+            "k1 to k6 end in different minima, numerator and denominator of the rational distortion "
+            "nearly cancelling",
+        )
     conditional = theirs.point_covariance
     return AdjusterComparison(
         name,

@@ -134,7 +134,7 @@ def _placed_whole(lattice: Lattice, plate: PlateFamily) -> IntArray | None:
         if (code == UNCODED).any():
             continue
         x = lattice.xy[:, 0] - lattice.xy[:, 0].mean()
-        upright = float(x @ (place[:, 1] - place[:, 1].mean()))  # columns to the right
+        upright = float(x @ place[:, 1])  # columns to the right
         if best is None or upright > best[0]:
             best = upright, code
     return None if best is None else best[1]
