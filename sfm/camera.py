@@ -112,6 +112,15 @@ class Camera:
         focal = float(np.mean(self.parameters[self.plays(Role.FOCAL)]))
         return focal / float(np.mean(self.pixel_mm)) if self.in_mm else focal
 
+    @property
+    def principal_point_px(self) -> FloatArray:
+        """Principal point from the upper left corner of the photograph, px, (2,)."""
+        x, y = self.parameters[self.plays(Role.X0)][0], self.parameters[self.plays(Role.Y0)][0]
+        if not self.in_mm:
+            return np.array([x + 0.5, y + 0.5])
+        width, height = self.size_px
+        return np.array([width / 2 + x / self.pixel_mm[0], height / 2 - y / self.pixel_mm[1]])
+
     def value(self, name: str) -> float:
         """Value of one parameter in its unit; KeyError if the model has none of that name."""
         if name not in self.names:

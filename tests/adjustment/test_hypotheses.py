@@ -182,6 +182,11 @@ def test_a_planted_fault_is_named_first(kind: str) -> None:
     pytest.fail(f"{kind} was not found in four networks")
 
 
+def test_what_photographs_do_not_determine_is_not_left_to_their_other_freedoms() -> None:
+    """Principal points of 11 photographs, 7 of whose 22 coordinates a rotation takes up nearly."""
+    assert causes_of("stabiliser", 16011) == ("camera_varies",)
+
+
 @pytest.mark.parametrize("kind", [kind for kind in EVERY if kind not in FAULTS])
 def test_no_cause_is_named_where_none_is_one(kind: str) -> None:
     assert "held_parameter" not in causes_of(kind, 3)

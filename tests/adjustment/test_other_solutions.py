@@ -13,6 +13,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality import other_solutions as searched
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from sfm.distortion.models import MODELS as CAMERA_MODELS
 from tests.synthetic import make_network, seed_of
 
 
@@ -65,6 +66,31 @@ def test_solutions_are_others_from_one_standard_deviation_on(
     monkeypatch.setattr(searched._Search, "candidates", lambda *_, **__: [other_place])
     monkeypatch.setattr(searched, "_apart", lambda *_: sigmas)
     assert bool(searched.other_solutions(a)) == other
+
+
+def camera_at(model: str, x: float, y: float, *, free: bool = True) -> Any:
+    """Return the estimate of a camera of 2000 x 1500 pixels with its principal point there, px."""
+    names = CAMERA_MODELS[model].names
+    place = (x - 1000, 750 - y) if model == "brown" else (x - 0.5, y - 0.5)
+    camera = camera_from_values(
+        *("A", model, (2000, 1500), (1.0, 1.0)),
+        c_mm=3000.0,
+        free=names[1:3] if free and model == "brown" else names[:4] if free else (),
+        values=tuple(zip(("x0", "y0") if model == "brown" else ("cx", "cy"), place, strict=True)),
+    )
+    assert camera.principal_point_px == pytest.approx([x, y])
+    return SimpleNamespace(cameras=(camera,))
+
+
+@pytest.mark.parametrize("model", ["brown", "opencv"])
+def test_a_principal_point_beyond_the_photograph_is_no_other_solution(model: str) -> None:
+    centre, cropped = camera_at(model, 1000.0, 750.0), camera_at(model, -300.0, 750.0)
+    for x, y in ((-10.0, 750.0), (2010.0, 750.0), (1000.0, -10.0), (1000.0, 1510.0)):
+        assert searched._impossible(camera_at(model, x, y), centre)
+        assert not searched._impossible(camera_at(model, x, y), cropped)  # so are all of it
+        assert not searched._impossible(camera_at(model, x, y, free=False), centre)  # given
+    for x, y in ((10.0, 1490.0), (1990.0, 10.0)):
+        assert not searched._impossible(camera_at(model, x, y), centre)
 
 
 @pytest.mark.parametrize(("height", "length"), [(2500.0, 3), (3500.0, 2)])

@@ -86,6 +86,8 @@ def other_solutions(
     found: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
     for candidate in sorted(tried, key=lambda one: one.vPv):
+        if _impossible(candidate.estimate, result.adjustment.estimate):
+            continue
         known = any(result.distance(candidate.estimate, one.estimate) < MIN_APART_SIGMAS for one in found)
         if candidate.vPv > base.vPv * limit or known:
             continue
@@ -120,6 +122,20 @@ def _weak(a: Adjustment) -> bool:
         if camera.free[0] and not a.interior_sigma(number)[0] < WEAK_C * abs(camera.parameters[0]):
             return True
     return False
+
+
+def _impossible(other: Estimate, result: Estimate) -> bool:
+    """Return whether a solution has a principal point beyond its photograph, where no lens draws a picture.
+
+    Of photographs that were cropped the result has it there too, or it is given.
+    """
+    pairs = zip(other.cameras, result.cameras, strict=True)
+    return any(one.free[one.parts[1]].any() and _is_beyond(one) and not _is_beyond(own) for one, own in pairs)
+
+
+def _is_beyond(camera: Camera) -> bool:
+    at = camera.principal_point_px
+    return bool((at < 0).any() or (at > camera.size_px).any())
 
 
 @dataclass(frozen=True)

@@ -37,16 +37,9 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
     """Return adjusted principal points where no lens has them, and the format of which they are centres."""
     remarks: list[Remark] = []
     for camera in result.adjustment.estimate.cameras:
-        names = ("x0", "y0") if camera.in_mm else ("cx", "cy")
-        free = camera.free[[camera.names.index(name) for name in names]]
-        if not free.any():
+        if not camera.free[camera.parts[1]].any():
             continue
-        x, y = (camera.value(name) for name in names)
-        width, height = camera.size_px
-        if camera.in_mm:
-            at = np.array([x / camera.pixel_mm[0] + width / 2, height / 2 - y / camera.pixel_mm[1]])
-        else:
-            at = np.array([x + 0.5, y + 0.5])
+        at, (width, height) = camera.principal_point_px, camera.size_px
         diagonal = float(np.hypot(width, height))
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
         far = unless_note(remark("principal_point_far", camera=camera.name, share=away))
