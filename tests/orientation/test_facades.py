@@ -1,6 +1,8 @@
 """Shallow façades, whose two solutions a start tolerance hardly tells apart, also beside a mirror."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from sfm.camera import project
 from sfm.depth_reversal import reverse_depth
 from sfm.network import ImagePoints, empty_estimate
+from sfm.orientation.incremental import misfits
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.rivals import bounded_costs
 from sfm.orientation.incremental.sequence import orient
@@ -128,3 +131,16 @@ def test_facades_from_twenty_start_situations(relief, arc_deg, sigma_px):
         f"\nrelief {relief} m, arc {arc_deg} deg, sigma {sigma_px} px:", sorted(one[1] for one in found)[-3:]
     )
     assert all(oriented == 8 and worst < 0.1 and rms < 0.2 for oriented, worst, rms in found)
+
+
+@pytest.mark.parametrize(("turned", "mirrored"), [(0.7, True), (1.0, False), (300.0, False)])
+def test_what_fits_turned_over_by_chance_is_no_mirrored_picture(
+    turned: float, mirrored: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of another scene: no resection as it is, and one of some points turned over."""
+    monkeypatch.setattr(
+        misfits, "_median_px", lambda *_, turned_over=False: turned if turned_over else np.inf
+    )
+    monkeypatch.setattr(misfits, "_medians_px", lambda _: np.array([np.nan, 0.1, 0.1, 0.2]))
+    growth: Any = SimpleNamespace(reasons={})
+    assert misfits._is_mirrored(growth, 0) == mirrored == bool(growth.reasons)

@@ -286,6 +286,14 @@ def _second_place(scene: _Scene) -> str:
     return "two_places"
 
 
+def _names_shifted(scene: _Scene) -> str:
+    """The list of one photograph slipped by a row: each image point has the name of the next."""
+    image = scene.network.image_points.image
+    rows = np.flatnonzero(image == scene.rng.integers(scene.m))
+    scene.names[rows] = np.roll(scene.names[rows], 1)
+    return ""
+
+
 def _gross(share: float, size_px: float) -> Callable[[_Scene], str]:
     """Return what displaces a share of the image points, which is no fault of the survey."""
 
@@ -431,6 +439,7 @@ ROWLESS: dict[str, Callable[[_Scene], str]] = {
     "breathing": _breathing,
     "pattern": _tilted_pixels,
     "correlated 0.02 px": _correlated(0.02),
+    "names shifted": _names_shifted,
 }
 EVERY = FAULTS | RIGHT | ROWLESS
 

@@ -76,6 +76,18 @@ def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool)
     assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.parametrize("number", [215, 219])
+def test_a_photograph_with_the_names_of_other_points_is_left_out(number: int) -> None:
+    """A camera of its own left residuals of 200 px, and was believed; c was -106 %."""
+    one = planted("names shifted", number)
+    camera = one.start.cameras[0]
+    free = tuple(name for name, on in zip(camera.names, camera.free, strict=True) if on)
+    result = run_survey(survey_of(one.network, one.start, free=free, adjust=TAU))
+    assert len(result.failed) == 1 and result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
+    assert result.failed[0].reason.kind in ("photograph_not_explained", "photograph_with_few_fitting")
+    assert not of_kind(result.remarks, "camera_per_photograph")
+
+
 @pytest.mark.parametrize(("kind", "cause"), [("held b1", "held_parameter"), ("autofocus", "camera_varies")])
 def test_what_all_photographs_share_is_no_camera_of_one(kind: str, cause: str) -> None:
     """A photograph lost points, and another c explained them; what explains all photographs is likelier."""

@@ -58,7 +58,8 @@ def residual_weights(complement: FloatArray, whitening: FloatArray) -> FloatArra
         whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
     """
     F = whitening_matrix(whitening)
-    return np.diagonal(np.swapaxes(F, 1, 2) @ complement @ F, axis1=1, axis2=2).copy()
+    with np.errstate(invalid="ignore"):  # the cofactors of a ray that nothing determines are infinite
+        return np.diagonal(np.swapaxes(F, 1, 2) @ complement @ F, axis1=1, axis2=2).copy()
 
 
 UNCONTROLLED = 1e-6  # redundancy number below which an observation has no check

@@ -59,7 +59,8 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
 def _is_mirrored(growth: Growth, i: int) -> bool:
     """Return whether a photograph fits the others far better turned over, and give that as its reason."""
     as_it_is, turned = _median_px(growth, i), _median_px(growth, i, turned_over=True)
-    mirrored = FAR_BETTER * turned < as_it_is
+    others = np.delete(_medians_px(growth), i)
+    mirrored = FAR_BETTER * turned < as_it_is and bool(turned < FAR_BETTER * np.nanmedian(others))
     if mirrored:
         before = (as_it_is, "px") if np.isfinite(as_it_is) else None
         growth.reasons[i] = remark("photograph_mirrored", before=before, turned=(turned, "px"))
