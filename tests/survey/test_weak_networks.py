@@ -89,6 +89,12 @@ def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:
     assert outcome_of(918).over_sigma < 2
 
 
+def test_undamped_steps_that_do_not_converge_are_followed_by_damped_ones() -> None:
+    """The last round of data snooping went to and fro across a valley: bad, 1.6 sigma wrong."""
+    found = outcome_of(1252)
+    assert found.level == "fair" and found.over_sigma < 2
+
+
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
     cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0, rms=2.0)
     (found,) = contradicted(("A",), (cause,))

@@ -76,6 +76,8 @@ def find_optimum(
     if run.tolerance > wanted:
         run.tolerance = wanted
         optimum = run.again(optimum, weight)
+        if not optimum.converged:  # near it undamped steps may go to and fro across a valley
+            optimum = run.start(optimum.state, weight)
     return optimum, weight
 
 
