@@ -56,19 +56,28 @@ def test_standard_deviations_that_are_too_small_are_named_once() -> None:
 def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     v, variance = np.log([1.0, 1.1, 1.02]), np.array([1e-4, 3e-4, 2e-4])
     model = GivenModel(v, np.zeros((3, 3)), np.diag(variance), np.ones((3, 1)), np.arange(3), 100)
-    lengths = [given_scales._Length((k,), 1.0, 1e-2, False) for k in range(3)]
 
-    def said(**found: tuple[int, ...]) -> Remark:
-        judged = Judgement(30.0, 2, 1e-6, **found)
-        return given_scales._contradicting_scales(model, judged, ["a", "b", "c"], lengths)[1][0]
+    def said(bars: int = 3, *, on_points: bool = False, **found: tuple[int, ...]) -> tuple[set[int], Remark]:
+        judged, names = Judgement(30.0, 2, 1e-6, **found), ["a", "b", "control"]
+        out, remarks = given_scales._contradicting_scales(model, judged, names, bars, on_points=on_points)
+        return set(out), remarks[0]
 
-    both = said(doubtful=(0, 1, 2))
+    out, both = said(doubtful=(0, 1, 2))
+    assert out == {0, 1, 2}
     assert both.number("off") == pytest.approx(10.0)
     assert both.number("sigmas") == pytest.approx(np.log(1.1) / np.sqrt(4e-4))
     mean = (v[0] / 1e-4 + v[2] / 2e-4) / (1 / 1e-4 + 1 / 2e-4)
-    one = said(wrong=(1,))
+    out, one = said(wrong=(1,))
+    assert out == {1}
     assert one.number("off") == pytest.approx(100 * np.expm1(v[1] - mean))
     assert one.number("sigmas") == pytest.approx((v[1] - mean) / np.sqrt(3e-4 + 1 / 1.5e4))
+    mean = (v[0] / 1e-4 + v[1] / 3e-4) / (1 / 1e-4 + 1 / 3e-4)
+    for on_points, wrong, kind in ((False, {2}, "scale_left_out"), (True, {0, 1, 2}, "scale_contradicted")):
+        out, one = said(2, on_points=on_points, wrong=(2,))
+        assert (out, one.kind, one.names("given")) == (wrong, kind, ("control",))
+        assert abs(one.number("off")) == pytest.approx(
+            100 * np.expm1(v[2] - mean if v[2] > mean else mean - v[2]), rel=0.02
+        )
 
 
 def test_a_bar_given_twice_counts_once() -> None:
@@ -99,7 +108,7 @@ def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:
     one = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, others[0]))))
     assert kinds_of(one) == ("scale_contradicted",) and one[0].names("given") == ("9 - 20", "4 - 13")
     both = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, *others))))
-    assert kinds_of(both)[0] == "bar_left_out" and both[0].names("bar") == ("9 - 20",)
+    assert kinds_of(both)[0] == "bar_left_out" and both[0].names("given") == ("9 - 20",)
     differ = (replace(wrong[0], length=right[0]), wrong[1])
     alone = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=differ)))
     assert kinds_of(alone) == ("scale_contradicted",) and len(set(alone[0].names("given"))) == 2

@@ -8,6 +8,7 @@ import pytest
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
+from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, seed_of
@@ -84,7 +85,7 @@ def test_of_three_bars_the_wrong_one_is_left_out(factor: float) -> None:
     network, truth = _scene("three bars")
     result = run_survey(survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor, 1.0])))
     (said,) = remarks_on_given(result)
-    assert said.kind == "bar_left_out" and said.names("bar") == ("2 - 12",)
+    assert said.kind == "bar_left_out" and said.names("given") == ("2 - 12",)
     assert said.number("off") == pytest.approx(100 * (factor - 1), rel=0.01)
     assert (said.number("unit_factor") == factor) == (factor > 1)
     assert result.network.points[result.network.scale_bars.start[0]] == "1"
@@ -112,8 +113,38 @@ def test_control_that_is_too_large_for_both_bars_is_bad(reject: str) -> None:
     result = run_survey(survey)
     (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
     assert said.kind == "scale_contradicted" and said.number("off") == pytest.approx(1.0, rel=0.1)
-    assert said.names("given") == ("1 - 11", "2 - 12", "control")
+    assert said.names("given") == ("control",) and said.number("agreeing") == 2
     assert findings_of(result).verdict.level == "bad"
+    assert not result.has_scale and result.adjustment.datum == "free"
+
+
+@pytest.mark.parametrize("factor", [1.01, 1000.0])
+def test_control_that_only_checks_does_not_replace_bars_that_agree(factor: float) -> None:
+    """Before, all bars were left out, and lengths were as many times too long."""
+    network, truth = _scene("large checks")
+    names = [str(k + 1) for k in range(20, 26)]
+    control = KnownPoints.from_arrays(names, factor * truth.points[20:26], factor * 1e-4)
+    bars = _bars(truth, [1.0, 1.0, 1.0])
+    result = run_survey(survey_of(network, truth, control=control, scale_bars=bars, datum={"kind": "free"}))
+    (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
+    assert said.kind == "scale_left_out" and said.names("given") == ("control",)
+    assert said.number("off") == pytest.approx(100 * (factor - 1), rel=0.1)
+    assert len(result.network.scale_bars) == 3 and not len(result.network.control) and result.has_scale
+    index = [network.point_index(name) for name in result.network.points]
+    assert fit_similarity(result.estimate.points, truth.points[index]).scale == pytest.approx(1, abs=1e-3)
+    assert findings_of(result).verdict.level == "fair"
+
+
+def test_control_and_one_bar_that_contradict_leave_no_scale() -> None:
+    network, truth = _scene("large checks")
+    names = [str(k + 1) for k in range(20, 26)]
+    control = KnownPoints.from_arrays(names, 1.01 * truth.points[20:26], 1e-4)
+    for datum in ("free", "control"):
+        parts = {"control": control, "scale_bars": _bars(truth, [1.0]), "datum": {"kind": datum}}
+        result = run_survey(survey_of(network, truth, **parts))
+        (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
+        assert said.kind == "scale_contradicted" and said.names("given") == ("control", "1 - 11")
+        assert not result.has_scale and findings_of(result).verdict.level == "bad"
 
 
 @pytest.mark.parametrize("reject", ["tau", "none"])

@@ -12,16 +12,24 @@ ROWS = (
     Kind(
         "bar_left_out",
         "warning",
-        "Scale bar {bar} differs by {off:+} from the other given values, {sigmas} standard deviations[[, "
+        "Scale bar {given} differs by {off:+} from the other given values, {sigmas} standard deviations[[, "
         "and fits with the factor {unit_factor} of another unit]]: it was left out.",
         CHECK_THE_LIST,
         "Correct the length of this bar or remove it.",
     ),
     Kind(
+        "scale_left_out",
+        "warning",
+        "The scale of {given:@} differs by {off:+} from the other given values, {sigmas} standard "
+        "deviations[[, and fits with the factor {unit_factor} of another unit]]: they were left out.",
+        "coordinates in another unit or of another temperature, a print that shrank, or points that moved",
+        "Correct these coordinates or remove them.",
+    ),
+    Kind(
         "scale_contradicted",
         "error",
-        "No dependable scale: {given:@bar} contradict one another by {off}, {sigmas} standard deviations[[, "
-        "the factor {unit_factor} of another unit]].",
+        "No dependable scale: {given:@bar}[[ and {agreeing:scale bar}]] contradict one another by {off}, "
+        "{sigmas} standard deviations[[, the factor {unit_factor} of another unit]].",
         CHECK_THE_LIST,
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),

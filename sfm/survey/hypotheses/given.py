@@ -104,19 +104,22 @@ def _judged(task: Task) -> JudgedGiven:
     control, centres = _control_of(task), _centres_of(task)
     groups = [one for one in (control, centres) if one is not None]
     scales = judge_scales(task, [one for one in groups if one.dependable])
+    used = [one for one in groups if not one.placed.mirrored and one.of not in scales.left_out]
     network = replace(network, scale_bars=scales.bars)
     if control is not None:
-        network = replace(network, control=_judged_control(task, control))
+        taken = _judged_control(task, control) if control in used else ObjectPoints()
+        network = replace(network, control=taken)
     if centres is not None:
-        network = replace(network, exterior=_judged_centres(task, centres))
-    if any(one.placed.mirrored for one in groups) and not (len(network.control) or len(network.exterior)):
+        seen = _judged_centres(task, centres) if centres in used else ExteriorObservations()
+        network = replace(network, exterior=seen)
+    if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
     return JudgedGiven(
         network,
         datum,
         tuple(found for one in groups for found in _remarks_on(task, one)) + scales.remarks,
         tuple(one.test for one in groups) + scales.tests,
-        next((one.placed.placing for one in groups if not one.placed.mirrored), None),
+        next((one.placed.placing for one in used), None),
         any(one.placed.mirrored or one.checks_handedness for one in groups),
     )
 
@@ -136,8 +139,6 @@ def _centres_of(task: Task) -> Group | None:
 def _judged_control(task: Task, group: Group) -> ObjectPoints:
     """Return control without what does not fit, or changed."""
     control = task.network.control
-    if group.placed.mirrored:
-        return ObjectPoints()
     order, keep, covariance = group.as_judged(control.covariance, rescale=task.rescale)
     return ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep])
 
@@ -145,8 +146,6 @@ def _judged_control(task: Task, group: Group) -> ObjectPoints:
 def _judged_centres(task: Task, group: Group) -> ExteriorObservations:
     """Return observed orientation without projection centres that do not fit, or changed."""
     seen = task.network.exterior
-    if group.placed.mirrored:
-        return ExteriorObservations()
     order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=task.rescale)
     covariance = seen.covariance[order]
     covariance[:, :3, :3] = of_centres

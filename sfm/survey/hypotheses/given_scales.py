@@ -37,6 +37,7 @@ class JudgedScales:
     bars: ScaleBars  # that take part
     remarks: tuple[Remark, ...] = ()
     tests: tuple[GivenTest, ...] = ()
+    left_out: frozenset[str] = frozenset()  # kinds of given points that do not take part
 
 
 def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
@@ -72,11 +73,12 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
         used = judgement.factor if task.rescale else None
         said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
         return JudgedScales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
-    out, remarks = _contradicting_scales(model, judgement, names, lengths)
+    on_points = task.datum.kind == "control"
+    out, remarks = _contradicting_scales(model, judgement, names, len(lengths), on_points=on_points)
     keep: BoolArray = np.ones(len(bars), dtype=bool)
-    keep[out] = False
+    keep[[b for k in out if k < len(lengths) for b in lengths[k].bars]] = False
     kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return JudgedScales(kept, remarks, tests)
+    return JudgedScales(kept, remarks, tests, frozenset(names[k] for k in out if k >= len(lengths)))
 
 
 def _scale_of(task: Task, group: Group) -> GivenScale | None:
@@ -101,37 +103,57 @@ def _scale_of(task: Task, group: Group) -> GivenScale | None:
 
 
 def _contradicting_scales(
-    model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
-) -> tuple[list[int], tuple[Remark, ...]]:
-    """Return bars that the others identify as wrong, or all where nothing shows which are, and remarks."""
-    wrong = judgement.wrong
-    if wrong and max(wrong) < len(lengths):
-        remarks = []
-        for k in wrong:
-            (off,), ((variance,),) = model.kept(tuple(j for j in wrong if j != k)).difference(k)
-            remarks.append(
-                remark(
-                    "bar_left_out",
-                    bar=names[k],
-                    off=(100 * float(np.expm1(off)), "%"),
-                    sigmas=float(abs(off) / np.sqrt(variance)),
-                    unit_factor=_unit_factor(float(off)),
-                )
-            )
-        return [b for k in wrong for b in lengths[k].bars], tuple(remarks)
-    # the control may be wrong by many bars that share their unit
-    which = list(range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful)
-    v, S = model.v[which], (model.network + model.stated)[np.ix_(which, which)]
-    low, high = int(v.argmin()), int(v.argmax())
-    off = float(v[high] - v[low])
+    model: GivenModel, judgement: Judgement, names: list[str], bars: int, *, on_points: bool
+) -> tuple[tuple[int, ...], tuple[Remark, ...]]:
+    """Return which scales the others identify as wrong, or all where nothing shows which are, and remarks.
+
+    Args:
+        model: differences of the scales, those of bars first.
+        judgement: what is wrong of them.
+        names: of the bars, and kinds of the given points.
+        bars: how many of them are lengths of bars.
+        on_points: whether given points hold the datum. Bars, which may share their unit, do not replace them.
+    """
+    wrong, every = judgement.wrong, range(model.items)
+    if wrong and not (on_points and max(wrong) >= bars and {*every[bars:]} <= {*wrong}):
+        return wrong, tuple(_left_out(model, wrong, names, k, bars) for k in wrong)
+    which = sorted(wrong or judgement.doubtful or every, key=lambda k: (k < bars, k))
+    if wrong:
+        off, sigma = _difference(model, wrong, which[0])
+        agreeing = bars - sum(k < bars for k in wrong)
+    else:
+        v, S = model.v[which], (model.network + model.stated)[np.ix_(which, which)]
+        low, high = int(v.argmin()), int(v.argmax())
+        off = float(v[high] - v[low])
+        sigma = float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high]))
+        agreeing = None
     said = remark(
         "scale_contradicted",
         given=[names[k] for k in which],
-        off=(100 * float(np.expm1(off)), "%"),
-        sigmas=off / float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high])),
+        agreeing=agreeing,
+        off=(100 * float(np.expm1(abs(off))), "%"),
+        sigmas=abs(off) / sigma,
         unit_factor=_unit_factor(off),
     )
-    return [b for one in lengths for b in one.bars], (said,)
+    return (*every[:bars], *(k for k in which if k >= bars)), (said,)
+
+
+def _left_out(model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, bars: int) -> Remark:
+    """Return the remark that a bar, or given points by their scale, were left out."""
+    off, sigma = _difference(model, wrong, k)
+    return remark(
+        "bar_left_out" if k < bars else "scale_left_out",
+        given=names[k],
+        off=(100 * float(np.expm1(off)), "%"),
+        sigmas=abs(off) / sigma,
+        unit_factor=_unit_factor(off),
+    )
+
+
+def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
+    """Return the logarithm of a wrong scale over that of those that are not wrong, and its sigma."""
+    (off,), ((variance,),) = model.kept(tuple(j for j in wrong if j != k)).difference(k)
+    return float(off), float(np.sqrt(variance))
 
 
 @dataclass(frozen=True)
