@@ -462,3 +462,33 @@ def test_coordinates_have_the_rounding_of_the_largest() -> None:
     largest = float(np.abs(one.given).max())
     sigma = np.sqrt(np.diagonal(one.model(placing, estimated=False).network))
     np.testing.assert_allclose(sigma, 16 * 2.0**-52 * largest)
+
+
+def test_a_bias_explains_what_parameters_more_would() -> None:
+    """Its chi-square is the fall between two models, its parameters those of least squares."""
+    model = of_points("bias")
+    second = (model.item > 2)[:, None] * model.A
+    found, each = model.kept().bias(second), replace(model, A=np.hstack([model.A, second]))
+    before, after = misfit(model), misfit(each)
+    assert found.dof == before[1] - after[1] == 4
+    assert found.statistic == pytest.approx(before[0] - after[0])
+    S = np.linalg.inv(model.network + model.stated)
+    x = np.linalg.solve(each.A.T @ S @ each.A, each.A.T @ S @ model.v)
+    np.testing.assert_allclose(found.parameters, x[4:], rtol=1e-9)
+    none = model.kept().bias(model.A)
+    assert (none.dof, none.statistic, none.probability) == (0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_bias_is_tested_by_all_its_parameters_and_by_each(shared: bool) -> None:
+    """Half of the level each, that of single ones divided by their number."""
+    n = 4
+    model = replace(bars(*np.zeros(2 * n), redundancy=10**9), A=np.tile(np.eye(n), (2, 1)))
+    v = np.full(n, 3.0) if shared else 6.0 * np.eye(n)[0]  # differences of variance 2
+    model = replace(model, v=np.concatenate([np.zeros(n), v]))
+    found = model.kept().bias(np.concatenate([np.zeros((n, n)), np.eye(n)]))
+    assert found.statistic == pytest.approx(18.0) and found.dof == n
+    together = stats.chi2.sf(18.0, n)
+    single = n * stats.chi2.sf(4.5 if shared else 18.0, 1)
+    assert (together < single) == shared
+    assert found.probability == pytest.approx(2 * min(together, single), rel=1e-3)

@@ -211,6 +211,11 @@ def _only_checks(change: Callable[[Given], None]) -> Callable[[Given], None]:
     return both
 
 
+def _turned(radians: float) -> Callable[[FloatArray], FloatArray]:
+    c, s = np.cos(radians), np.sin(radians)
+    return lambda X: X @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
 # name, bars, control points, what is changed
 CASES: tuple[tuple[str, int, int, Callable[[Given], None]], ...] = (
     ("the only bar 10 %", 1, 0, _bar(1.1)),
@@ -269,6 +274,11 @@ CASES: tuple[tuple[str, int, int, Callable[[Given], None]], ...] = (
     ("y upwards, centres", 0, 0, _upwards_with_centres),
     ("centres, X and Y exchanged", 0, 0, _centres(lambda X: X[:, [1, 0, 2]])),
     ("centres turned by a row", 0, 0, _centres(lambda X: np.roll(X, 1, axis=0))),
+    ("centres 2 mm off, control", 0, 6, _centres(lambda X: X + np.array([2e-3, 0, 0]))),
+    ("centres 100 m off, control, bars", 2, 6, _centres(lambda X: X + np.array([100, 0, 0]))),
+    ("centres turned, control", 0, 6, _centres(_turned(0.01))),
+    ("centres turned, two control", 0, 2, _centres(_turned(0.01))),
+    ("centres 1 %, control, bars", 2, 6, _centres(lambda X: 1.01 * X)),
 )
 RIGHT = ((1, 0), (2, 0), (3, 0), (6, 0), (0, 3), (0, 4), (0, 8), (0, 20), (1, 4), (2, 6), (3, 20))
 
@@ -336,6 +346,8 @@ def right(number: int) -> Outcome:
     given = given_of(seed_of(f"right given {number}"), truth, bars, control)
     if control and number % 2:
         given.datum = "free"
+    elif control and number % 4:
+        _centres(np.copy)(given)
     return outcome_of(f"{bars} bars, {control} control points, {given.datum}", network, given)
 
 

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from tests.survey.mistyped import CASES, NEVER_FOUND, mistyped, right, study
+from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
+from sfm.survey.inputs.exterior_table import ObservedExterior
+from sfm.survey.inputs.given import KnownPoints
+from tests.survey.mistyped import CASES, NEVER_FOUND, SIGMA, given_of, mistyped, right, scene, study
+from tests.surveys import remarks_on_given, survey_of
+from tests.synthetic import seed_of
 
 REFUSED = ("refused", "bad", "fair")
 NAMED = {  # bad with the first kinds, fair with the others
@@ -30,8 +37,13 @@ NAMED = {  # bad with the first kinds, fair with the others
     "one point of a pyramid": "given_left_out",
     "left and right names of a box": "given_mirrored",
     "centres turned by a row": "given_renamed",
+    "centres 2 mm off, control": "datum_contradicted",
+    "centres 100 m off, control, bars": "datum_contradicted",
+    "centres turned, control": "datum_contradicted",
+    "centres turned, two control": "datum_contradicted",
+    "centres 1 %, control, bars": "scale_left_out",
 }
-BAD = ("scale_contradicted", "given_mirrored", "given_contradicted")
+BAD = ("datum_contradicted", "scale_contradicted", "given_mirrored", "given_contradicted")
 
 
 @pytest.mark.parametrize("case", [one[0] for one in CASES if one[0] not in NEVER_FOUND])
@@ -46,6 +58,27 @@ def test_what_is_mistyped_is_found_and_named(case: str) -> None:
 
 def test_right_bars_and_control_are_good() -> None:
     assert [one.level for one in map(right, range(1000, 1011))] == ["good"] * 11
+
+
+def test_neither_control_nor_centres_are_used_where_they_contradict() -> None:
+    network, truth = scene("both")
+    given = given_of(seed_of("both"), truth, 0, 6)
+    centres = truth.position + SIGMA * seed_of("centres").standard_normal(truth.position.shape)
+    for shift, kinds in ((0.0, ()), (0.02, ("datum_contradicted",))):
+        seen = centres + np.array([shift, 0, 0])
+        parts = {
+            "control": KnownPoints.from_arrays([str(j + 1) for j in given.names], given.xyz, SIGMA),
+            "exterior": ObservedExterior.from_arrays(network.images, seen, SIGMA),
+            "datum": {"kind": "control"},
+        }
+        result = run_survey(survey_of(network, truth, **parts))
+        said = [one for one in remarks_on_given(result) if one.severity != "note"]
+        assert kinds_of(said) == kinds and result.has_scale == (not shift)
+        assert len(result.adjustment.network.control) == (0 if shift else 6)
+        assert len(result.adjustment.network.exterior) == (0 if shift else 8)
+        assert ("scale_undefined" in kinds_of(result.remarks)) == (shift > 0)
+    assert said[0].names("given") == ("control", "centres") and said[0].number("dof") == 7
+    assert said[0].number("distance") == pytest.approx(shift, rel=0.2)
 
 
 @pytest.mark.slow

@@ -40,6 +40,16 @@ FACTORS = np.geomspace(1.0, 1e6, 241)  # on standard deviations
 
 
 @dataclass(frozen=True)
+class Bias:
+    """Further parameters of the differences, and the test that they are 0."""
+
+    parameters: FloatArray  # (q,)
+    statistic: float  # chi-square that they explain
+    dof: int
+    probability: float  # of all or of one so large by chance; both tests share the level
+
+
+@dataclass(frozen=True)
 class Kept:
     """Given values some of which are left out: what is left of the differences of the others."""
 
@@ -78,6 +88,29 @@ class Kept:
         rows = np.flatnonzero(self.model.item == one)
         covariance = np.linalg.pinv(self.precision[np.ix_(rows, rows)], rcond=RANK, hermitian=True)
         return covariance @ self.u[rows], np.asarray(covariance, dtype=np.float64)
+
+    def bias(self, columns: FloatArray) -> Bias:
+        """Return what parameters beside those of the model would explain, by the score test.
+
+        Args:
+            columns: derivatives of the differences by them, none of them 0, (m, q). What cannot be told from
+                the parameters of the model explains nothing.
+
+        Source: Rao (1948), Math. Proc. Camb. Phil. Soc. 44(1) (score test).
+        """
+        # in parts of what the differences would say of each, were they independent and nothing else unknown
+        scale = 1 / np.linalg.norm(columns / self.model.size[:, None], axis=0)
+        g, H = scale * (columns.T @ self.u), scale[:, None] * (columns.T @ self.precision @ columns) * scale
+        d, U = np.linalg.eigh((H + H.T) / 2)
+        on, alone = d > CHECKED, np.diagonal(H) > CHECKED
+        if not on.any():
+            return Bias(np.zeros(len(g)), 0.0, 0, 1.0)
+        w = U[:, on].T @ g
+        fall, rank = float((w**2 / d[on]).sum()), int(on.sum())
+        largest = float((g[alone] ** 2 / np.diagonal(H)[alone]).max())
+        single = int(alone.sum()) * self._sf(largest, 1)
+        probability = min(1.0, 2 * self._sf(fall, rank), 2 * single)
+        return Bias(scale * (U[:, on] @ (w / d[on])), fall, rank, probability)
 
     def probability(self) -> float:
         """Return the probability of differences so large by chance: of all, of one value, of one coordinate.

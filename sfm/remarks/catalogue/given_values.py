@@ -34,6 +34,15 @@ ROWS = (
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),
     Kind(
+        "datum_contradicted",
+        "error",
+        "No dependable datum: {given:@} fit the network of the image points each by themselves, but place it "
+        "up to {distance} apart (chi-square {chi2}, {dof} degrees of freedom): neither was used.",
+        "coordinates of two systems or epochs, or antennas or prisms that are not in the projection centres",
+        "Find out which of them are wrong; give projection centres in the system of the control, reduced by "
+        "the offset from antenna or prism to camera.",
+    ),
+    Kind(
         "given_left_out",
         "warning",
         "Of {of:@}, {given} {given:does|do} not fit the network of the image points, by up to "

@@ -82,7 +82,7 @@ def place_on_frame(
         return estimate
 
 
-def datum_remarks(survey: Survey, network: Network) -> tuple[Remark, ...]:
+def datum_remarks(survey: Survey, network: Network, datum: str) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing scale."""
     remarks, known = [], set(network.points)
     control = [name for name in survey.control.names if name not in known] if survey.control else []
@@ -91,6 +91,6 @@ def datum_remarks(survey: Survey, network: Network) -> tuple[Remark, ...]:
     bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
         remarks.append(remark("scale_bars_missing", bars=bars))
-    if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 2:
+    if datum != "control" and not len(network.scale_bars) and len(network.control) < 2:
         remarks.append(remark("scale_undefined", unit=survey.unit))
     return tuple(remarks)

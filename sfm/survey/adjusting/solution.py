@@ -473,5 +473,5 @@ def _remarks(
         *([remark("datum_points_missing", points=absent)] if absent else []),
         *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
-        *datum_remarks(survey, adjustment.network),
+        *datum_remarks(survey, adjustment.network, adjustment.datum),
     )

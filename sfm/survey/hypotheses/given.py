@@ -21,7 +21,14 @@ from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
-from sfm.survey.hypotheses.given_groups import Group, Places, Task, are_in_space, remarks_on_unchecked
+from sfm.survey.hypotheses.given_groups import (
+    Group,
+    Places,
+    Task,
+    are_in_space,
+    contradiction_of,
+    remarks_on_unchecked,
+)
 from sfm.survey.hypotheses.given_scales import judge_scales
 
 MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
@@ -105,6 +112,9 @@ def _judged(task: Task) -> JudgedGiven:
     groups = [one for one in (control, centres) if one is not None]
     scales = judge_scales(task, [one for one in groups if one.dependable])
     used = [one for one in groups if not one.placed.mirrored and one.of not in scales.left_out]
+    contradiction = contradiction_of(task, used)
+    if contradiction is not None:
+        used = []
     network = replace(network, scale_bars=scales.bars)
     if control is not None:
         taken = _judged_control(task, control) if control in used else ObjectPoints()
@@ -117,7 +127,11 @@ def _judged(task: Task) -> JudgedGiven:
     return JudgedGiven(
         network,
         datum,
-        tuple(found for one in groups for found in _remarks_on(task, one)) + scales.remarks,
+        (
+            *(found for one in groups for found in _remarks_on(task, one)),
+            *scales.remarks,
+            *(() if contradiction is None else (contradiction,)),
+        ),
         tuple(one.test for one in groups) + scales.tests,
         next((one.placed.placing for one in used), None),
         any(one.placed.mirrored or one.checks_handedness for one in groups),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,6 +90,15 @@ class Group:
         """Test of all of them."""
         return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
 
+    def taking_part(self, *, rescale: bool) -> tuple[GivenPoints, IntArray]:
+        """Return those that take part, with the covariance with which they do, and their places."""
+        kept = np.setdiff1d(np.arange(len(self.names)), self.out)
+        order = np.array(self.placed.order or range(len(self.names)), dtype=np.int64)
+        points = self.points.reordered(tuple(order.tolist())).select(kept)
+        if self.found.doubtful and rescale and self.points.stated.any():
+            points = replace(points, stated=self.placed.model.factor()[0] ** 2 * points.stated)
+        return points, self.places[kept]
+
     def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
         """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
         order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
@@ -111,6 +120,41 @@ class Group:
             return covariance
         factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
         return np.where(known, factor**2 * covariance, covariance)
+
+
+def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
+    """Return the remark that control and projection centres place the network differently; None if not.
+
+    Each by itself fits the network with a similarity. Both have the errors of one network, and with their
+    joint covariance one similarity is tested against two: what seven parameters more explain.
+    """
+    if len(groups) < 2:
+        return None
+    parts = [one.taking_part(rescale=task.rescale) for one in groups]
+    index, coordinates = task.places.at(np.concatenate([at for _, at in parts]).tolist())
+    points = GivenPoints(
+        np.concatenate([one.given for one, _ in parts]),
+        np.concatenate([one.stated for one, _ in parts]),
+        task.places.xyz[index],
+        task.places.joint[np.ix_(coordinates, coordinates)],
+        task.places.redundancy,
+    )
+    model = points.model(groups[0].placed.placing, estimated=False)
+    second = model.item >= len(parts[0][0].given)
+    columns = second[:, None] * model.A
+    columns = columns[:, columns.any(axis=0)]
+    apart = model.kept().bias(columns)
+    if apart.probability >= task.level:
+        return None
+    moved = np.zeros(points.given.shape)
+    moved[points.known] = columns @ apart.parameters
+    return remark(
+        "datum_contradicted",
+        given=[one.of for one in groups],
+        distance=(float(np.linalg.norm(moved, axis=1).max()), task.unit),
+        chi2=apart.statistic,
+        dof=apart.dof,
+    )
 
 
 def are_in_space(xyz: FloatArray) -> bool:
