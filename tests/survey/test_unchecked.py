@@ -65,6 +65,16 @@ def test_only_given_points_in_space_check_the_handedness(mirrored: bool) -> None
     assert "handedness_unchecked" in kinds_of(flat.remarks)
 
 
+def test_control_of_which_one_point_is_doubtful_checks_the_handedness() -> None:
+    """Fixed control, one point 5 mm off, is far from the mirrored network too: it had counted as nothing."""
+    network, truth = _scene("doubtful handedness")
+    xyz = truth.points[:8] + 2e-4 * seed_of("doubtful handedness").standard_normal((8, 3))
+    xyz[0, 0] += 5e-3
+    control = KnownPoints.from_arrays(network.points[:8], xyz, 0.0)
+    found = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})).remarks
+    assert "given_contradicted" in kinds_of(found) and "handedness_unchecked" not in kinds_of(found)
+
+
 def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> None:
     network, truth = _scene("worse bar")
     worse = replace(_bar(truth, 1, 8), sigma=5e-4)

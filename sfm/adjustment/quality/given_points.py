@@ -232,6 +232,30 @@ def judge_points(
     return best if len(like) == 1 else _contradiction(found, like)
 
 
+def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
+    """Return whether points, those left out that are wrong, fit the network and not the mirrored one.
+
+    Of n differences the mirror image is less likely by n ln of the ratio of chi-square over n, in -2 ln
+    likelihood with a variance factor that is not known, and at least 1: where some contradict one another,
+    both have their misfit.
+
+    Args:
+        points: given, and of the free network.
+        found: the same, judged and not mirrored.
+
+    Source: Seber and Wild (1989), Nonlinear Regression, sec. 2.2.
+    """
+    kept = np.setdiff1d(np.arange(len(points.given)), found.judgement.wrong)
+    mirrored = (points.reordered(found.order) if found.order else points).select(kept).mirrored()
+    start = next(_starts(mirrored, None), None)
+    if start is None:
+        return False
+    like = found.model.part(np.isin(found.model.item, kept)).all_kept
+    unlike = mirrored.model(start, estimated=False).all_kept
+    n = like.dof
+    return n > 0 and n * float(np.log(max(unlike.chi2, n) / max(like.chi2, n))) > MARGIN
+
+
 def _renamed(
     points: GivenPoints, level: float, agreed: Similarity | None, estimated: bool
 ) -> Iterator[PlacedPoints]:

@@ -134,7 +134,7 @@ def _judged(task: Task) -> JudgedGiven:
         ),
         tuple(one.test for one in groups) + scales.tests,
         next((one.placed.placing for one in used), None),
-        any(one.placed.mirrored or one.checks_handedness for one in groups),
+        any(one.checks_handedness for one in groups),
     )
 
 

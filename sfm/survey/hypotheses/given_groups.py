@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints
+from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints, excludes_mirror
 from sfm.adjustment.quality.given_values import LEVEL, GivenModel, GivenTest, Judgement
 from sfm.comparison.congruency import extended_axes
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -81,9 +81,8 @@ class Group:
 
     @property
     def checks_handedness(self) -> bool:
-        """Whether they would not fit a mirrored network: as they took part they do not lie in a plane."""
-        xyz = self.points.given[[k for k in self.points.complete.tolist() if k not in self.out]]
-        return self.dependable and are_in_space(xyz)
+        """Whether they fit the network or its mirror image, and not both."""
+        return self.placed.mirrored or excludes_mirror(self.points, self.placed)
 
     @property
     def test(self) -> GivenTest:
