@@ -10,7 +10,9 @@ UNITS = {
     **{304.8: ("mm", "foot"), 30.48: ("cm", "foot"), 1 / 0.3048: ("foot", "m")},
 }
 """factors of lengths by what the finer and the coarser unit are"""
-SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
+POWERS_OF_TEN = (10.0, 100.0, 1e3, 1e6)
+SAME_POWER = 0.02  # relative: a wrong scale beside a power of ten; no length is near one by chance
+SWELLING = 0.002  # relative, of prints: paper swells by 1 to 2 permille
 
 
 @dataclass(frozen=True)
@@ -21,10 +23,19 @@ class UnitFactor:
     units: tuple[str, str]  # the finer and the coarser one
 
 
-def find_unit(lengths: float) -> UnitFactor | None:
-    """Return the factor between two units that a factor of lengths is nearly; None if it is none."""
+def find_unit(lengths: float, rest: float) -> UnitFactor | None:
+    """Return the factor between two units that a factor of lengths is; None if it is none.
+
+    Args:
+        lengths: factor.
+        rest: relative difference from the factor of two units that is no contradiction; from a power of
+            ten it may be SAME_POWER.
+    """
+    found: list[tuple[float, UnitFactor]] = []
     for size, units in UNITS.items():
+        most = max(rest, SAME_POWER) if size in POWERS_OF_TEN else rest
         for factor in (size, 1 / size):
-            if abs(lengths / factor - 1) < SAME_UNIT:
-                return UnitFactor(factor, units)
-    return None
+            off = abs(lengths / factor - 1)
+            if off < most:
+                found.append((off, UnitFactor(factor, units)))
+    return min(found, key=lambda one: one[0])[1] if found else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sfm.units import UNITS, find_unit
+from sfm.units import SWELLING, UNITS, find_unit
 
 MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
 
@@ -16,17 +16,27 @@ def test_factors_are_those_between_their_units() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lengths", "factor"),
+    ("lengths", "rest", "factor"),
     [
-        (1015.0, 1e3),
-        (1 / 985.0, 1e-3),
-        (1030.0, None),
-        (970.0, None),
-        (25.0, 25.4),
-        (11.0, None),
-        (1.0, None),
+        (1015.0, 0.0, 1e3),  # a wrong scale beside a power of ten
+        (1 / 985.0, 0.0, 1e-3),
+        (1030.0, 0.0, None),
+        (970.0, 0.0, None),
+        (25.0, 0.01, None),
+        (2.5, 0.01, None),  # no inch
+        (25.41, 0.001, 25.4),
+        (25.41, 0.0003, None),
+        (11.2, 0.2, 12.0),  # the nearest one
+        (10.8, 0.2, 10.0),
+        (1.0, 0.1, None),
     ],
 )
-def test_a_factor_is_that_of_a_unit_within_two_percent(lengths: float, factor: float | None) -> None:
-    found = find_unit(lengths)
+def test_a_factor_is_that_of_a_unit_where_the_rest_is_no_contradiction(
+    lengths: float, rest: float, factor: float | None
+) -> None:
+    found = find_unit(lengths, rest)
     assert (found and found.factor) == (factor and pytest.approx(factor))
+
+
+def test_paper_swells_by_one_to_two_permille() -> None:
+    assert SWELLING == 0.002

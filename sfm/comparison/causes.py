@@ -48,7 +48,7 @@ from sfm.comparison.stable_points import (
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, mean_distance
-from sfm.units import UnitFactor, find_unit
+from sfm.units import SWELLING, UnitFactor, find_unit
 
 ALPHA = 0.001  # probability of a cause where there is none, of all rows together
 PERMUTATIONS = 999  # of the names; with as many the level of the permutation test is 0.001
@@ -230,7 +230,6 @@ def _fitted(
         T = replace(T, rotation=T.rotation @ MIRROR)
     if whole:  # large ones too
         T = fit_affinity(T, pairs.a, pairs.b, reference)
-    unit = None if pairs.scale is None else find_unit(pairs.scale / T.scale)
     d, Q = pairs.differences(T)
     similarity = motions(pairs.a)
     G = similarity[:, : MOTIONS["similarity" if estimated else "rigid"]]
@@ -244,7 +243,7 @@ def _fitted(
         searched = exchanged * math.log(len(other))
     penalty = lost * cost + parameters / 2 * math.log(3 * n) + searched
     nobody = np.zeros(n, dtype=bool)
-    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, nobody, (1.0, 0.0), unit, (), other)
+    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, nobody, (1.0, 0.0), None, (), other)
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
     if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
         return failed
@@ -266,6 +265,11 @@ def _fitted(
     moved = candidates - int(found.stable.sum())
     penalty += moved * cost + math.log(math.comb(candidates, moved))
     lengths = _lengths(pairs, T, d, Q, similarity, found.stable) if row.scale else (1.0, 0.0)
+    unit = None
+    if pairs.scale is not None:
+        size, sigma = lengths if row.scale else (pairs.scale / T.scale, 0.0)
+        beside = max(SWELLING, math.sqrt(critical_value(ALPHA, 1, r)) * sigma / size)
+        unit = find_unit(size, beside)  # what is beside it is reported
     factor = unit.factor if unit else 1.0
     stretches = _stretches(pairs, T, d, Q, similarity, found.stable, factor) if row.strain else ()
     return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, unit, stretches, other)

@@ -44,20 +44,25 @@ def remarks_of_cause(
         yield remark("another_object", points=points, **between)
     if row.mirror:
         yield remark("mirrored", **between)
-    factor = cause.unit.factor if cause.unit else 1.0
-    units = dict(zip(("finer", "coarser"), cause.unit.units, strict=True)) if cause.unit else {}
-    if units:
-        last = not (cause.rest or row.strain or row.bending)
-        yield remark("unit_differs", factor=factor, moved=moved if last else None, **units, **between)
-    if row.scale and cause.rest:
-        numbers = {"lengths": cause.lengths / factor, "sigma": cause.lengths_sigma / factor}
-        yield remark("lengths_differ", moved=moved, **numbers, **units, **between)
+    if cause.unit is not None:
+        factor, (finer, coarser) = cause.unit.factor, cause.unit.units
+        of_unit = {"factor": factor, "lengths": factor}
+        if row.scale and cause.rest:
+            rest, sigma = cause.lengths / factor, cause.lengths_sigma / factor
+            of_unit |= {"lengths": cause.lengths, "rest": rest, "sigma": sigma}
+        last = None if row.strain or row.bending else moved
+        yield remark("unit_differs", moved=last, finer=finer, coarser=coarser, **of_unit, **between)
+    elif row.scale:
+        numbers = {"lengths": cause.lengths, "sigma": cause.lengths_sigma}
+        yield remark("lengths_differ", moved=moved, **numbers, **between)
     if row.names:
         exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
         yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
     if row.strain:
         for one in cause.stretches:
             numbers = {"lengths": one.lengths, "sigma": one.sigma}
+            if cause.unit is not None:
+                numbers["factor"] = cause.unit.factor
             yield remark("strained", axis=_words(one.axis), moved=moved, **numbers, **between)
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)

@@ -24,6 +24,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
+from sfm.units import SWELLING
 
 LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
@@ -32,7 +33,7 @@ APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood
 # An order of magnitude, mm stated for cm or the precision of an instrument alone; more are no statements of
 # precision, but errors of the values.
 MAX_FACTOR = 10.0
-UNSTATED = 0.002  # relative, of coordinates without standard deviations: paper swells by 1 to 2 permille
+UNSTATED = SWELLING  # relative, of coordinates without standard deviations
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
 CHECKED = RANK**0.5  # redundancy number below which nothing checks a direction
 MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value

@@ -8,17 +8,17 @@ ROWS = (
     Kind(
         "lengths_differ",
         "error",
-        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[, beside "
-        "the factor between {finer} and {coarser}]][[; {moved:point} {moved:differs|differ} besides]].",
+        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[; {moved:point} "
+        "{moved:differs|differ} besides]].",
         "a scale bar or control that is wrong in one of them, or an object that expanded, as warmth does",
         "Check the lengths of the scale bars, and the temperature of both surveys.",
     ),
     Kind(
         "unit_differs",
         "error",
-        "Lengths in {second} are {factor:.8g} times those in {first}, the factor between {finer} "
-        "and {coarser}"
-        "[[; {moved:point} {moved:differs|differ} besides]].",
+        "Lengths in {second} are {lengths:.8g} times those in {first}[[, {rest:.8g} +- {sigma:.2g} beside "
+        "the factor {factor:.8g}]], as between {finer} and {coarser}[[; {moved:point} {moved:differs|differ} "
+        "besides]].",
         "lengths of bars or control were entered in another unit than the survey states",
         "Enter them in the object unit of the survey, or correct the unit.",
     ),
@@ -46,8 +46,8 @@ ROWS = (
     Kind(
         "strained",
         "error",
-        "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}"
-        "[[; {moved:point} {moved:differs|differ} besides]].",
+        "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[ beside "
+        "the factor {factor:.8g}]][[; {moved:point} {moved:differs|differ} besides]].",
         "an object that expanded or was loaded in one direction, or a camera that is not described well",
         "Check temperature and load of the object; adjust both with per_photograph for c, and compare again.",
     ),

@@ -13,7 +13,7 @@ ROWS = (
         "bar_left_out",
         "warning",
         "Scale bar {given} differs by {off:+} from the other given values, {sigmas} standard deviations[[, "
-        "and fits with the factor {unit_factor} of another unit]]: it was left out.",
+        "nearly a factor of {unit_factor}, as between {finer} and {coarser}]]: it was left out.",
         CHECK_THE_LIST,
         "Correct the length of this bar or remove it.",
     ),
@@ -21,7 +21,8 @@ ROWS = (
         "scale_left_out",
         "warning",
         "The scale of {given:@} differs by {off:+} from the other given values, {sigmas} standard "
-        "deviations[[, and fits with the factor {unit_factor} of another unit]]: they were left out.",
+        "deviations[[, nearly a factor of {unit_factor}, as between {finer} and {coarser}]]: they were left "
+        "out.",
         "coordinates in another unit or of another temperature, a print that shrank, or points that moved",
         "Correct these coordinates or remove them.",
     ),
@@ -29,7 +30,8 @@ ROWS = (
         "scale_contradicted",
         "error",
         "No dependable scale: {given:@bar}[[ and {agreeing:scale bar}]] contradict one another by {off}, "
-        "{sigmas} standard deviations[[, the factor {unit_factor} of another unit]].",
+        "{sigmas} standard deviations[[, nearly a factor of {unit_factor}, as between {finer} and "
+        "{coarser}]].",
         CHECK_THE_LIST,
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from sfm.adjustment.quality.given_values import (
     judge_values,
 )
 from sfm.conventions import BoolArray
-from sfm.distributions import chi2_sf
+from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import ScaleBars
 from sfm.remarks.kind import significant
 from sfm.remarks.remark import Remark, remark
@@ -127,27 +128,15 @@ def _contradicting_scales(
         off = float(v[high] - v[low])
         sigma = float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high]))
         agreeing = None
-    said = remark(
-        "scale_contradicted",
-        given=[names[k] for k in which],
-        agreeing=agreeing,
-        off=(100 * float(np.expm1(abs(off))), "%"),
-        sigmas=abs(off) / sigma,
-        unit_factor=_unit_factor(off),
-    )
+    given = [names[k] for k in which]
+    said = remark("scale_contradicted", given=given, agreeing=agreeing, **_by(abs(off), sigma))
     return (*every[:bars], *(k for k in which if k >= bars)), (said,)
 
 
 def _left_out(model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, bars: int) -> Remark:
     """Return the remark that a bar, or given points by their scale, were left out."""
     off, sigma = _difference(model, wrong, k)
-    return remark(
-        "bar_left_out" if k < bars else "scale_left_out",
-        given=names[k],
-        off=(100 * float(np.expm1(off)), "%"),
-        sigmas=abs(off) / sigma,
-        unit_factor=_unit_factor(off),
-    )
+    return remark("bar_left_out" if k < bars else "scale_left_out", given=names[k], **_by(off, sigma))
 
 
 def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
@@ -194,7 +183,11 @@ def _agree(bars: ScaleBars, a: int, b: int) -> bool:
     return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
 
 
-def _unit_factor(log: float) -> float | None:
-    """Return the factor between two units that a difference of scale is; None if it is none."""
-    found = find_unit(float(np.exp(abs(log))))
-    return found.factor if found else None
+def _by(log: float, sigma: float) -> dict[str, Any]:
+    """Return the numbers of a difference of scale, and the units whose factor it is, if it is one."""
+    unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(LEVEL, 1))) * sigma)
+    found: dict[str, Any] = {"off": (100 * float(np.expm1(log)), "%"), "sigmas": abs(log) / sigma}
+    if unit is not None:
+        finer, coarser = unit.units
+        found |= {"unit_factor": unit.factor, "finer": finer, "coarser": coarser}
+    return found
