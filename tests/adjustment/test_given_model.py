@@ -413,14 +413,25 @@ def test_centre_and_size() -> None:
 def test_scales_of_lengths_are_compared_with_their_covariance() -> None:
     free: FloatArray = np.array([[0.0, 0, 0], [3, 4, 0], [0, 0, 2]])
     one = scale_of_length(10.0, 0.02, free, 0, 1)
-    assert (one.log, one.variance) == (pytest.approx(np.log(2)), pytest.approx(4e-6))
+    assert (one.scale, one.sigma) == (pytest.approx(2), pytest.approx(4e-3))
     assert one.rows.tolist() == pytest.approx([3 / 25, 4 / 25, 0, -3 / 25, -4 / 25, 0, 0, 0, 0])
     other = scale_of_length(4.1, 0.02, free, 0, 2)
     model = scale_model((one, other), 1e-4 * np.eye(9), 77)
     np.testing.assert_allclose(model.v, [np.log(2), np.log(2.05)])
     np.testing.assert_allclose(model.network, 1e-4 * np.array([[2 / 25, 0], [0, 0.5]]), atol=1e-18)
-    np.testing.assert_allclose(model.stated, np.diag([4e-6, (0.02 / 4.1) ** 2]))
+    np.testing.assert_allclose(model.stated, np.diag([4e-6, (0.02 / 4.1) ** 2]), rtol=0.03)
     assert model.A.tolist() == [[1], [1]] and model.item.tolist() == [0, 1] and model.redundancy == 77
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.5, 1.0, 30.0])
+def test_a_mistyped_length_is_as_many_standard_deviations_off_as_its_logarithm(factor: float) -> None:
+    """By the length that the others predict; by itself, a short bar would have little weight."""
+    scales = tuple(given_points.GivenScale(scale, np.zeros(3), 1e-4) for scale in (2.0, 2.0 * factor, 2.0))
+    model = scale_model(scales, np.zeros((3, 3)), 77)
+    sigma = np.sqrt(np.diagonal(model.stated))
+    np.testing.assert_allclose(sigma[[0, 2]], 1e-4 / 2)
+    off = model.v[1] - model.v[0]
+    assert off / sigma[1] == pytest.approx(2 * (factor - 1) / 1e-4) and sigma[1] > 0
 
 
 def test_mirrored_points_state_what_was_wrong_as_given() -> None:

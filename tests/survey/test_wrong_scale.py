@@ -7,6 +7,7 @@ import pytest
 
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import Remark
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
@@ -28,6 +29,11 @@ def _bars(truth: Estimate, factors: list[float]) -> tuple[ScaleBar, ...]:
     )
 
 
+def _factor(said: Remark) -> float:
+    """Return by which factor lengths differ, of a remark that reports it or per cent."""
+    return said.number("times") if "times" in said.numbers else 1 + said.number("off") / 100
+
+
 @pytest.mark.parametrize("reject", ["tau", "none"])
 @pytest.mark.parametrize("factor", [0.1, 1.02, 10.0, 1000.0])
 def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
@@ -38,7 +44,7 @@ def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
     assert verdict.level == "bad" and result.adjustment.converged
     (said,) = remarks_on_given(result)
     assert said.kind == "scale_contradicted" and said.names("given") == ("1 - 11", "2 - 12")
-    assert said.number("off") == pytest.approx(100 * (max(factor, 1 / factor) - 1), rel=0.01)
+    assert _factor(said) == pytest.approx(max(factor, 1 / factor), rel=1e-3)
     assert said.number("unit_factor") == (factor if factor > 2 else 10) or factor == 1.02
     assert len(result.network.scale_bars) == 0 and not result.has_scale
     assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
@@ -86,7 +92,7 @@ def test_of_three_bars_the_wrong_one_is_left_out(factor: float) -> None:
     result = run_survey(survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor, 1.0])))
     (said,) = remarks_on_given(result)
     assert said.kind == "bar_left_out" and said.names("given") == ("2 - 12",)
-    assert said.number("off") == pytest.approx(100 * (factor - 1), rel=0.01)
+    assert _factor(said) == pytest.approx(factor, rel=2e-3)
     unit = {10.15: 10.0, 1000.0: 1000.0}.get(factor)  # 2.5 is no inch
     assert said.number("unit_factor") == unit if unit else "unit_factor" not in said.numbers
     assert result.network.points[result.network.scale_bars.start[0]] == "1"
@@ -129,7 +135,7 @@ def test_control_that_only_checks_does_not_replace_bars_that_agree(factor: float
     result = run_survey(survey_of(network, truth, control=control, scale_bars=bars, datum={"kind": "free"}))
     (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
     assert said.kind == "scale_left_out" and said.names("given") == ("control",)
-    assert said.number("off") == pytest.approx(100 * (factor - 1), rel=0.1)
+    assert _factor(said) == pytest.approx(factor, rel=1e-3)
     assert len(result.network.scale_bars) == 3 and not len(result.network.control) and result.has_scale
     index = [network.point_index(name) for name in result.network.points]
     assert fit_similarity(result.estimate.points, truth.points[index]).scale == pytest.approx(1, abs=1e-3)

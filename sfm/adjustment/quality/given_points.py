@@ -380,9 +380,9 @@ def _triples(n: int) -> Iterator[list[int]]:
 class GivenScale:
     """Object units per unit of the free network, by one bar or by all given points together."""
 
-    log: float  # natural logarithm
-    rows: FloatArray  # its derivative by the points of the free network, (3 n,)
-    variance: float  # of the logarithm, by what was stated
+    scale: float
+    rows: FloatArray  # derivative of its logarithm by the points of the free network, (3 n,)
+    sigma: float  # of the scale, by what was stated
 
 
 def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, end: int) -> GivenScale:
@@ -391,7 +391,7 @@ def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, e
     found = float(np.linalg.norm(apart))
     rows = np.zeros(free.shape)
     rows[end], rows[start] = -apart / found**2, apart / found**2
-    return GivenScale(float(np.log(length / found)), rows.ravel(), (sigma / length) ** 2)
+    return GivenScale(length / found, rows.ravel(), sigma / found)
 
 
 def scale_of_points(
@@ -412,18 +412,27 @@ def scale_of_points(
     axis = (np.flatnonzero(points.known.ravel()) % 3)[kept]
     rows = np.zeros((count, 3))
     np.subtract.at(rows, at[model.item[kept]], G[:, None] * placing.scale * placing.rotation[axis])
-    return GivenScale(
-        float(np.log(placing.scale)), rows.ravel(), float(G @ model.stated[np.ix_(kept, kept)] @ G)
-    )
+    variance = float(G @ model.stated[np.ix_(kept, kept)] @ G)
+    return GivenScale(placing.scale, rows.ravel(), placing.scale * float(np.sqrt(variance)))
 
 
 def scale_model(scales: tuple[GivenScale, ...], joint: FloatArray, redundancy: int) -> GivenModel:
-    """Return the differences of scales, with the covariance of the points of the free network, (3 n, 3 n)."""
+    """Return the differences of scales, with the covariance of the points of the free network, (3 n, 3 n).
+
+    A standard deviation of a length is that of its logarithm over the logarithmic mean of the length and of
+    what the median of the scales predicts: a difference has as many of them in both, however large it is.
+
+    Source: Stolarsky (1975), Generalizations of the logarithmic mean, Math. Mag. 48(2), 87-92.
+    """
     H = np.stack([one.rows for one in scales])
+    v = np.log([one.scale for one in scales])
+    off = v - np.median(v)
+    # (e^x - 1) / x of a difference x in logarithms
+    mean = np.exp(v - off) * np.where(off == 0, 1.0, np.expm1(off) / np.where(off == 0, 1.0, off))
     return GivenModel(
-        np.array([one.log for one in scales]),
+        v,
         H @ joint @ H.T,
-        np.diag([one.variance for one in scales]),
+        np.diag((np.array([one.sigma for one in scales]) / mean) ** 2),
         np.ones((len(scales), 1)),
         np.arange(len(scales)),
         redundancy,

@@ -12,26 +12,27 @@ ROWS = (
     Kind(
         "bar_left_out",
         "warning",
-        "Scale bar {given} differs by {off:+} from the other given values, {sigmas} standard deviations[[, "
-        "nearly a factor of {unit_factor}, as between {finer} and {coarser}]]: it was left out.",
+        "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length by the other given "
+        "values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} "
+        "and {coarser}]]. It was left out.",
         CHECK_THE_LIST,
         "Correct the length of this bar or remove it.",
     ),
     Kind(
         "scale_left_out",
         "warning",
-        "The scale of {given:@} differs by {off:+} from the other given values, {sigmas} standard "
-        "deviations[[, nearly a factor of {unit_factor}, as between {finer} and {coarser}]]: they were left "
-        "out.",
+        "The scale of {given:@} [[differs by {off:+} from]][[is {times} times]] that of the other given "
+        "values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} "
+        "and {coarser}]]. They were left out.",
         "coordinates in another unit or of another temperature, a print that shrank, or points that moved",
         "Correct these coordinates or remove them.",
     ),
     Kind(
         "scale_contradicted",
         "error",
-        "No dependable scale: {given:@bar}[[ and {agreeing:scale bar}]] contradict one another by {off}, "
-        "{sigmas} standard deviations[[, nearly a factor of {unit_factor}, as between {finer} and "
-        "{coarser}]].",
+        "No dependable scale: {given:@bar}[[ and {agreeing:scale bar}]] contradict one another by "
+        "[[{off}]][[a factor of {times}]], {sigmas} standard deviations[[; nearly a factor of "
+        "{unit_factor}, as between {finer} and {coarser}]].",
         CHECK_THE_LIST,
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),

@@ -30,6 +30,8 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
 from sfm.units import find_unit
 
+MAX_PERCENT = 2.0  # factor of lengths beyond which it is reported as such, and not in per cent
+
 
 @dataclass(frozen=True)
 class JudgedScales:
@@ -99,7 +101,7 @@ def _scale_of(task: Task, group: Group) -> GivenScale | None:
     else:
         found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
     if task.datum.kind != "control" and not points.stated.any():
-        return replace(found, variance=found.variance + UNSTATED**2)
+        return replace(found, sigma=float(np.hypot(found.sigma, UNSTATED * found.scale)))
     return found
 
 
@@ -186,7 +188,11 @@ def _agree(bars: ScaleBars, a: int, b: int) -> bool:
 def _by(log: float, sigma: float) -> dict[str, Any]:
     """Return the numbers of a difference of scale, and the units whose factor it is, if it is one."""
     unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(LEVEL, 1))) * sigma)
-    found: dict[str, Any] = {"off": (100 * float(np.expm1(log)), "%"), "sigmas": abs(log) / sigma}
+    found: dict[str, Any] = {"sigmas": abs(log) / sigma}
+    if abs(log) > np.log(MAX_PERCENT):
+        found["times"] = float(np.exp(log))
+    else:
+        found["off"] = (100 * float(np.expm1(log)), "%")
     if unit is not None:
         finer, coarser = unit.units
         found |= {"unit_factor": unit.factor, "finer": finer, "coarser": coarser}
