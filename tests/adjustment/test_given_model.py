@@ -222,7 +222,11 @@ def test_the_score_of_wrong_values() -> None:
     assert found is not None
     assert found.values == (1, 3) and found.rivals == ()
     T = one.kept().chi2
-    assert found.score == pytest.approx(one.kept((1, 3)).chi2 - T + 2 * cost + 2 * np.log(10), rel=1e-9)
+    fall = T - one.kept((1, 3)).chi2
+    of_scatter = cost + 2 * (1 + np.log(fall / 2)) + 2 * np.log(10)
+    assert found.score == pytest.approx(of_scatter - fall, rel=1e-9)
+    by_each = given_values._score(one, (1, 3), scatter=False)
+    assert by_each == pytest.approx(2 * cost + 2 * np.log(10) - fall, rel=1e-9)
     assert one.kept((1, 3)).chi2 == pytest.approx(2 / 3)
     assert given_values._wrong_values(bars(0.0, 300.0), 0.001, cost) is None
     assert given_values._wrong_values(bars(0.0, 0.0, 300.0, 300.0), 0.001, cost) is None
@@ -257,13 +261,13 @@ def test_a_factor_must_beat_wrong_values_by_the_margin(monkeypatch: pytest.Monke
     assert judge_values(one, 0.001).doubtful == tuple(range(30))
 
 
-def test_what_is_left_out_by_itself() -> None:
-    one = bars(0.0, 9.0, 10.0, 1.0, -1.0)
-    cost = np.log(5)
-    # the two check each other: chi-square 1 / 2, three others are wrong then
-    by_hand = 0.5 - one.kept().chi2 + 3 * cost + 2 * np.log(10)
-    assert given_values._score_of_others(one, (1, 2), cost) == pytest.approx(by_hand)
-    assert given_values._score_of_others(one, (1,), cost) == np.inf
+@pytest.mark.parametrize(("apart", "rivals"), [(4.8, (0, 3, 4)), (5.1, ())])
+def test_those_left_out_may_be_the_right_ones(apart: float, rivals: tuple[int, ...]) -> None:
+    """Two of five bars agree: then three are wrong. Chi-square must differ by 2 ln 1000 - ln 5 = 12.2."""
+    one = bars(0.0, 20.0, 20.0 + apart, 0.0, 0.0)
+    found = given_values._wrong_values(one, 0.001, np.log(5))
+    assert found is not None and found.values == (1, 2)
+    assert found.rivals == rivals
 
 
 def test_suspects_are_those_without_which_the_others_fit() -> None:
@@ -522,3 +526,15 @@ def test_a_bias_is_tested_by_all_its_parameters_and_by_each(shared: bool) -> Non
     single = n * stats.chi2.sf(4.5 if shared else 18.0, 1)
     assert (together < single) == shared
     assert found.probability == pytest.approx(2 * min(together, single), rel=1e-3)
+
+
+def test_few_values_do_not_confirm_one_another() -> None:
+    """A value must be checked in all its rows: three points leave two degrees of freedom, bars one of two."""
+    five, four = exact(5, "five confirm"), exact(4, "four do not")
+    placing = FRAME.inverse()
+    assert five.model(placing, estimated=False).confirms_rest((1,))
+    assert not four.model(placing, estimated=False).confirms_rest((1,))
+    assert bars(0.0, 1.0, 2.0).confirms_rest((1,)) and not bars(0.0, 1.0).confirms_rest((1,))
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 1]])
+    near = replace(five, given=line, free=FRAME.apply(line)).model(placing, estimated=False)
+    assert near.confirms_rest((4,)) and not near.kept((0,)).dof < 3 and not near.confirms_rest((0,))

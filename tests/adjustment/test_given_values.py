@@ -123,6 +123,66 @@ def test_of_three_points_none_is_identified() -> None:
     assert found is not None and found.judgement.doubtful == (0, 1, 2)
 
 
+def test_of_four_points_none_is_left_out() -> None:
+    """Two degrees of freedom of three that remain are too few to confirm them."""
+    for k in range(5):
+        found = judge_points(moved(points(4, f"one of four {k}"), 1, 50 * SIGMA * np.eye(3)[k % 3]), LEVEL)
+        assert found is not None and found.judgement.wrong == () and 1 in found.judgement.doubtful
+        assert not found.judgement.one_wrong
+
+
+def test_one_of_two_is_wrong_that_the_others_confirm() -> None:
+    """Two points side by side, far from four that are right, and a distance that is wrong."""
+    one = pair_far_from_others("far pair")
+    found = judge_points(one, LEVEL)
+    assert found is not None and found.judgement.doubtful == (4, 5) and found.judgement.one_wrong
+    few = judge_points(one.select(np.array([0, 1, 4, 5])), LEVEL)
+    assert few is not None and few.judgement.doubtful and not few.judgement.one_wrong
+
+
+def pair_far_from_others(name: str) -> GivenPoints:
+    X = np.concatenate([0.02 * PYRAMID[[0, 1, 2, 4]], [[1.0, 0, 0], [1.02, 0, 0]]])
+    return moved(figure(X, list(range(6)), name), 5, 9 * SIGMA * np.eye(3)[0])
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01, 1.5])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_stretched_points_are_named(factor: float, axis: int) -> None:
+    for n in (6, 12):
+        one = points(n, f"stretched {n}")
+        by = np.where(np.arange(3) == axis, factor, 1.0)
+        found = judge_points(replace(one, given=by * one.given), LEVEL)
+        assert found is not None and found.judgement.doubtful == tuple(range(n)) and not found.judgement.wrong
+        if n == 12:
+            assert found.strain is not None and found.strain.axis == "XYZ"[axis]
+            assert found.strain.elongation == pytest.approx(factor - 1, abs=4 * SIGMA)
+
+
+def test_an_affinity_is_a_strain_of_no_axis() -> None:
+    one = points(12, "affinity")
+    F = np.array([[1.02, 0.01, 0], [0.01, 0.99, 0], [0, 0, 1]])
+    found = judge_points(replace(one, given=one.given @ F.T), LEVEL)
+    assert found is not None and found.strain is not None and found.strain.axis is None
+    d = np.linalg.svd(F, compute_uv=False)
+    assert found.strain.elongation == pytest.approx(d[0] / d[2] - 1, abs=4 * SIGMA)
+    assert found.strain.chi2 < 60 < found.judgement.statistic  # 24 degrees of freedom
+
+
+def test_five_stretched_points_are_not_one_wrong() -> None:
+    for k in range(10):
+        one = points(5, f"five stretched {k}")
+        found = judge_points(replace(one, given=one.given * (1.05, 1, 1)), LEVEL)
+        assert found is not None and found.judgement.wrong == ()
+        assert found.judgement.doubtful == (0, 1, 2, 3, 4) and found.judgement.factor == 1.0
+
+
+def test_a_wrong_point_is_no_strain() -> None:
+    for k in range(10):
+        one = points(5, f"no strain {k}")
+        found = judge_points(moved(one, 2, 30 * SIGMA * np.eye(3)[k % 3]), LEVEL)
+        assert found is not None and found.judgement.wrong == (2,) and found.strain is None
+
+
 def test_exchanged_names_are_identified() -> None:
     one = points(5, "exchanged")
     given = one.given[[0, 3, 2, 1, 4]]

@@ -14,6 +14,7 @@ from sfm.remarks.remark import Remark, kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.survey.mistyped import SIGMA, scene
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
@@ -149,3 +150,27 @@ def test_image_points_are_no_better_than_a_thousandth_of_a_pixel() -> None:
     result = run_survey(survey_of(network, truth, scale_bars=(ScaleBar("9", "20", length, 1e-4),)))
     used = np.sqrt(result.adjustment.image_covariance[0, 0, 0])
     assert used == pytest.approx(1e-3, rel=0.4)  # px
+
+
+def test_contradicting_control_is_an_error_but_for_one_of_some_that_the_others_confirm() -> None:
+    """Of two points side by side and far from four others; without two of these nothing is confirmed."""
+    near = [[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0], [0, 0, 0.03]]
+    figure = np.array([*near, [1.0, 0, 0], [1.02, 0, 0]])
+    network, truth = scene("far pair", figure)
+    xyz = figure + 0.2 * SIGMA * seed_of("far pair").standard_normal(figure.shape)
+    xyz[5, 0] += 9 * SIGMA
+    for names, kinds in (([0, 1, 2, 3, 4, 5], "warning"), ([0, 1, 4, 5], "error")):
+        control = KnownPoints.from_arrays([str(k + 1) for k in names], xyz[names], SIGMA)
+        result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+        said = remarks_on_given(result)[0]
+        assert said.kind == "given_contradicted" and said.severity == kinds
+        assert (said.number("shift") < 5) == (kinds == "warning")
+
+
+def test_stretched_control_is_an_error() -> None:
+    network, truth = make_network(seed_of("stretched control"), images=8, points=30)
+    xyz = truth.points[:8] * (1, 0.99, 1)
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz, 2e-4)
+    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+    assert said[0].kind == "given_strained" and said[0].severity == "error"
+    assert said[0].names("axis") == ("Y",) and said[0].number("elongation") == pytest.approx(-1, rel=0.1)

@@ -1,7 +1,7 @@
 """Given points and lengths as differences from the free network.
 
 Points place the free network by a similarity, which most of them agree upon; lengths and placed points each
-give its scale. Where points do not fit, they may be left-handed or have one another's names as well.
+give its scale. Where points do not fit, they may also be stretched, left-handed or have one another's names.
 
 Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984), J. Am. Stat. Assoc. 79(388).
 """
@@ -11,12 +11,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import comb
+from math import comb, log
 
 import numpy as np
 
 from sfm.adjustment.quality.given_names import assignments, cost_of_choice, moved_by
-from sfm.adjustment.quality.given_values import MARGIN, RANK, GivenModel, Judgement, judge_values, misfit_of
+from sfm.adjustment.quality.given_values import (
+    MARGIN,
+    RANK,
+    GivenModel,
+    Judgement,
+    cost_of_scatter,
+    judge_values,
+    misfit_of,
+)
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, fit_similarity, similarity_motions
@@ -27,7 +35,30 @@ MAX_TRIPLES = (
 MAX_STEPS = 20  # of a similarity to the best one; those to one that fits are fewer than ten
 MAX_DECIMALS = 8  # of coordinates; more are those of computed ones
 SAME_DECIMAL = 1e-6  # by which a number in its last place may differ from a whole one, by its binary rounding
+STRAINS = (  # derivatives of coordinates by their parameters, along an axis or of an affinity, (u, 3, 3)
+    *(np.diag(e)[None] for e in np.eye(3)),
+    np.array(
+        [np.diag([1.0, -1, 0]), np.diag([0, 1.0, -1])]
+        + [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
+    ),
+)
 ROUNDING = 16 * np.finfo(float).eps  # of coordinates after a similarity, over the largest of them
+
+
+@dataclass(frozen=True, eq=False)
+class Strain:
+    """Stretched coordinates, but for their scale where it stretches all axes."""
+
+    derivatives: FloatArray  # by its parameters, (u, 3, 3)
+    F: FloatArray  # stretched coordinates from those that are not, about their centre, (3, 3)
+    axis: str | None = None  # the only one that is stretched, where no other explains as much
+    chi2: float = 0.0  # of points that are not stretched
+
+    @property
+    def elongation(self) -> float:
+        """Relative elongation along the axis; of all axes that of the longest over the shortest."""
+        d = np.linalg.svd(self.F, compute_uv=False)
+        return float(np.trace(self.F) - 3 if len(self.derivatives) == 1 else d[0] / d[-1] - 1)
 
 
 @dataclass(frozen=True)
@@ -39,6 +70,7 @@ class GivenPoints:
     free: FloatArray  # in the frame of the free network, (n, 3)
     joint: FloatArray  # covariance of the free ones, (3 n, 3 n)
     redundancy: int  # of the free network
+    strain: Strain | None = None  # of the given coordinates
 
     @property
     def known(self) -> FloatArray:
@@ -91,11 +123,15 @@ class GivenPoints:
         rows = np.flatnonzero(self.known.ravel())
         X = placing.apply(self.free)
         centre, size = _centre_and_size(X)
-        A = similarity_motions(X, centre=centre, size=size).reshape(-1, 7)[rows]
-        n = len(X)
-        turned = np.einsum(
-            "ab,ibjc,dc->iajd", placing.rotation, self.joint.reshape(n, 3, n, 3), placing.rotation
-        )
+        A = similarity_motions(X, centre=centre, size=size).reshape(-1, 3, 7)
+        n, R = len(X), placing.rotation
+        if self.strain is not None:
+            E, F = self.strain.derivatives, self.strain.F
+            own = np.einsum("uab,nb->nau", E, (X - centre) / size)
+            X, R = centre + (X - centre) @ F.T, F @ R
+            A = np.concatenate([np.einsum("ab,nbu->nau", F, A), own], axis=2)
+        A = A.reshape(3 * n, -1)[rows]
+        turned = np.einsum("ab,ibjc,dc->iajd", R, self.joint.reshape(n, 3, n, 3), R)
         network = placing.scale**2 * turned.reshape(3 * n, 3 * n)[np.ix_(rows, rows)]
         network[np.diag_indices(len(rows))] += (ROUNDING * np.abs(X).max()) ** 2
         stated = np.zeros((3 * n, 3 * n))
@@ -166,6 +202,8 @@ class PlacedPoints:
     unmirrored: float | None = None  # chi-square as given, where only the mirrored network fits
     order: tuple[int, ...] = ()  # whose coordinates each has, where they fit with other names
     exchangeable: tuple[int, ...] = ()  # those whose names, if exchanged, explain the differences as well
+    strain: Strain | None = None  # that explains the differences
+    cost_of_strain: float = 0.0
 
     @property
     def mirrored(self) -> bool:
@@ -179,8 +217,8 @@ class PlacedPoints:
 
     @property
     def cost(self) -> float:
-        """Their misfit, and that of the choice of other names."""
-        return self.misfit + cost_of_choice(self.order)
+        """Their misfit, and what a strain and the choice of other names cost."""
+        return self.misfit + self.cost_of_strain + cost_of_choice(self.order)
 
     @property
     def agreeing(self) -> Similarity | None:
@@ -198,9 +236,9 @@ def judge_points(
 ) -> PlacedPoints | None:
     """Return what is wrong of given points, and how the others place the free network.
 
-    The most likely explanation counts: errors of single points, that all are mirrored, or have one another's
-    names. Where it is not more likely than others by the margin, they contradict one another, but for what
-    may be mirrored: that is no figure to be placed.
+    The most likely explanation counts: errors of single points, that all are mirrored, stretched, or have one
+    another's names. Where it is not more likely than others by the margin, they contradict one another, but
+    for what may be mirrored: that is no figure to be placed.
 
     Args:
         points: given, and of the free network.
@@ -218,7 +256,12 @@ def judge_points(
     mirrored = _placed(points.mirrored(), level, None, estimated)
     if mirrored is not None and mirrored.judgement.explained:
         others.append(replace(mirrored, unmirrored=found.judgement.statistic))
+    strained = _strained(points, level, found, estimated)
+    if strained is not None:
+        others.append(strained)
     if not others or min(one.cost for one in others) >= found.misfit:
+        if strained is not None and strained.cost < found.misfit + MARGIN:
+            return _contradiction(found, [strained])
         return found
     best = min(others, key=lambda one: one.cost)
     like = [one for one in others if one.cost < best.cost + MARGIN]
@@ -229,7 +272,9 @@ def judge_points(
         # as a whole left and right may be exchanged, which is no choice among all orders
         like = [one for one in others if one.order and one.misfit < either.misfit + MARGIN]
         return replace(either, exchangeable=_points_of(like))
-    return best if len(like) == 1 else _contradiction(found, like)
+    if len(like) > 1:
+        return _contradiction(found, like)
+    return replace(_contradiction(found, like), strain=best.strain) if best.strain else best
 
 
 def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
@@ -274,10 +319,40 @@ def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:
 def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
     """Return points as given, of which nothing shows which of several explanations is right."""
     some = {k for one in like for k in (*moved_by(one.order), *one.judgement.wrong, *one.judgement.doubtful)}
-    if not some or any(one.mirrored for one in like):
+    if not some or any(one.mirrored or one.strain for one in like):
         some = set(range(found.model.items))
-    judgement = replace(found.judgement, wrong=(), factor=1.0, score=0.0, doubtful=tuple(sorted(some)))
-    return replace(found, judgement=judgement, exchangeable=_points_of(like))
+    return replace(
+        found, judgement=found.judgement.contradicted(tuple(sorted(some))), exchangeable=_points_of(like)
+    )
+
+
+def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated: bool) -> PlacedPoints | None:
+    """Return points that fit as stretched ones, along an axis or more, by the most likely strain.
+
+    Nothing shows which axes are right, and whether the scale is.
+    """
+    fitting: list[tuple[PlacedPoints, Strain]] = []
+    for derivatives in STRAINS:
+        strain, placing = Strain(derivatives, np.eye(3)), found.placing
+        for _ in range(MAX_STEPS):
+            placing, model = _converged(replace(points, strain=strain), placing, (), estimated)
+            size = _centre_and_size(placing.apply(points.free))[1]
+            step = parameters_of(model, np.ones(len(model.v), dtype=bool))[7:] @ model.v / size
+            F = strain.F + np.einsum("u,uab->ab", step, derivatives)
+            if not np.linalg.det(F) > 0 or np.abs(step).max() <= RANK:
+                break
+            strain = replace(strain, F=F)
+        judgement = judge_values(model, level)
+        if judgement.fits and model.confirms_rest(()):
+            q, fall = found.judgement.dof - judgement.dof, found.judgement.statistic - judgement.statistic
+            cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
+            fitting.append((PlacedPoints(judgement, placing, model, cost_of_strain=cost), strain))
+    if not fitting:
+        return None
+    best, strain = min(fitting, key=lambda one: one[0].cost)
+    like = [other for one, other in fitting if one.cost < best.cost + MARGIN and len(other.derivatives) == 1]
+    axis = "XYZ"[int(strain.derivatives[0].diagonal().argmax())] if like == [strain] else None
+    return replace(best, strain=replace(strain, axis=axis, chi2=best.judgement.statistic))
 
 
 def _placed(

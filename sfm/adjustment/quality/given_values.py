@@ -228,6 +228,13 @@ class GivenModel:
         fits = self.kept(without).probability() >= level
         return fits and (not self.estimated or self.at_worst.kept(without).probability() >= level)
 
+    def confirms_rest(self, out: tuple[int, ...]) -> bool:
+        """Return whether the values without some confirm one another.
+
+        They check each of themselves, and one in all its rows; fewer fit whatever they are.
+        """
+        return self.kept(out).dof >= self.blocks[1].shape[1] and not np.isinf(self.external(out)).any()
+
     def part(self, kept: BoolArray) -> GivenModel:
         """Return the model of some of the differences."""
         return replace(
@@ -301,6 +308,7 @@ class Judgement:
     wrong: tuple[int, ...] = ()  # given values without which the others fit
     factor: float = 1.0  # on all standard deviations, with which all fit; of fixed values their sigma
     doubtful: tuple[int, ...] = ()  # given values of which nothing shows which are wrong
+    one_wrong: bool = False  # whether one of the doubtful values is, and those that are not doubted are right
     score: float = 0.0  # of what is wrong: change of -2 ln likelihood, and its cost
 
     @property
@@ -312,6 +320,10 @@ class Judgement:
     def explained(self) -> bool:
         """Whether errors of some values or of all standard deviations explain the differences."""
         return not self.doubtful or self.score < 0
+
+    def contradicted(self, some: tuple[int, ...]) -> Judgement:
+        """Return it where nothing shows which of some values are wrong."""
+        return replace(self, wrong=(), factor=1.0, score=0.0, doubtful=some, one_wrong=False)
 
     @property
     def misfit(self) -> float:
@@ -340,14 +352,17 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
     found = Judgement(every.chi2, every.dof, every.probability())
     if every.dof < 1 or model.fits(level):
         return found
-    cost = float(np.log(max(len(model.v), 2)))
+    cost = cost_of_parameter(len(model.v))
     removed = _wrong_values(model, level, cost)
     factor, gain = (1.0, 0.0) if model.estimated else model.factor()
     if gain <= 0 or not model.at_worst.fits(level):
         gain = -np.inf
-    of_wrong, of_factor = np.inf if removed is None else removed.score, cost - gain
+    of_wrong, of_factor = np.inf, cost - gain
+    if removed is not None:  # of values without standard deviations, errors are scatter in any case
+        of_wrong = _score(model, removed.values, scatter=not model.stated.any())
     if min(of_wrong, of_factor) >= 0:
-        return replace(found, doubtful=_suspects(model, level))
+        some = _suspects(model, level)
+        return replace(found, doubtful=some, one_wrong=_one_is_wrong(model, some))
     if removed is None or of_factor < of_wrong:
         sets = _sets(model, cost)
         # one wrong value of so few would look like standard deviations that are too small, but for values of
@@ -356,9 +371,11 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         if sets and (unseen or of_factor + APART < min(one.score for one in sets)):
             return replace(found, factor=factor, score=of_factor)
         return replace(found, doubtful=tuple(range(model.items)), score=of_factor)
-    found = replace(found, score=_score_as_scatter(model, removed.values, cost))
-    if removed.rivals:
-        return replace(found, doubtful=tuple(sorted({*removed.values, *removed.rivals})))
+    found = replace(found, score=removed.score)
+    if removed.rivals or not model.confirms_rest(removed.values):
+        some = tuple(sorted({*removed.values, *removed.rivals}))
+        one_wrong = len(removed.values) == 1 and _one_is_wrong(model, some)
+        return replace(found, doubtful=some, one_wrong=one_wrong)
     return replace(found, wrong=removed.values)
 
 
@@ -370,8 +387,8 @@ def misfit_of(model: GivenModel, found: Judgement) -> float:
     if not found.wrong:
         return model.at_worst.kept().chi2 if model.estimated else found.misfit
     model = model.at_worst if model.estimated else model
-    others = model.part(~np.isin(model.item, found.wrong))
-    return others.kept().chi2 + _cost_as_scatter(model, found.wrong, float(np.log(max(len(model.v), 2))))
+    others = model.part(~np.isin(model.item, found.wrong)).kept().chi2
+    return others + _cost_of(model, found.wrong)
 
 
 @dataclass(frozen=True)
@@ -402,30 +419,44 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
             kept = model.kept(out)
         if kept.dof < 1:
             break
-        found.append(WrongValues(out, _score_as_scatter(model, out, cost)))
+        found.append(WrongValues(out, _score(model, out)))
     return tuple(found)
 
 
-def _score_as_scatter(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
-    """Return the change of -2 ln likelihood where values scatter more than stated, and its cost."""
-    return _cost_as_scatter(model, out, cost) - (model.kept().chi2 - model.kept(out).chi2)
-
-
-def _cost_as_scatter(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
-    """Return the cost of values that scatter more than stated, and of their choice.
-
-    Chi-square F of q differences costs q (1 + ln F / q): how large errors are must be known too.
-    """
-    every, kept = model.kept(), model.kept(out)
-    q, F = every.dof - kept.dof, every.chi2 - kept.chi2
-    return cost + q * (1 + log(max(F / max(q, 1), 1.0))) + 2 * log(comb(model.items, len(out)))
-
-
-def _score(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
+def _score(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
     """Return the change of -2 ln likelihood without values, and the cost of their errors and choice."""
-    every, kept = model.kept(), model.kept(out)
-    of_errors = cost * (every.dof - kept.dof)
-    return float(kept.chi2 - every.chi2 + of_errors + 2 * log(comb(model.items, len(out))))
+    return _cost_of(model, out, scatter=scatter) - (model.kept().chi2 - model.kept(out).chi2)
+
+
+def _cost_of(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
+    """Return the cost of the errors of values, and of their choice.
+
+    Args:
+        model: of all values.
+        out: those that are wrong.
+        scatter: whether their errors are of one distribution, as those of all are by a factor; else each is
+            a parameter by itself.
+    """
+    every, kept, m = model.kept(), model.kept(out), len(model.v)
+    q = every.dof - kept.dof
+    of_errors = cost_of_scatter(q, every.chi2 - kept.chi2, m) if scatter else q * cost_of_parameter(m)
+    return of_errors + 2 * log(comb(model.items, len(out)))
+
+
+def cost_of_parameter(m: int) -> float:
+    """Return the cost of a parameter of m differences, in -2 ln likelihood.
+
+    Source: Schwarz (1978), Ann. Stat. 6(2).
+    """
+    return log(max(m, 2))
+
+
+def cost_of_scatter(q: int, chi2: float, m: int) -> float:
+    """Return the cost of q of m differences that scatter more than stated, by this chi-square.
+
+    Their standard deviation costs a parameter, and its size 1 + ln chi2 / q for each.
+    """
+    return cost_of_parameter(m) + q * (1 + log(max(chi2 / max(q, 1), 1.0)))
 
 
 def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues | None:
@@ -449,19 +480,11 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     misfit = dict(_misfits_like(model, out))
     out = min(misfit, key=lambda some: misfit[some])
     like = {one for some, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for one in some}
-    found = WrongValues(out, _score(model, out, cost))
-    if _score_of_others(model, out, cost) < found.score + MARGIN:
+    # the others may be the wrong ones, and these right; errors of one cause do not scatter
+    rest, others = model.kept(out), model.part(np.isin(model.item, out)).kept()
+    if others.dof > 0 and others.chi2 - rest.chi2 < cost * (others.dof - rest.dof) + MARGIN:
         like = set(range(model.items))
-    return replace(found, rivals=tuple(sorted(like - set(out))))
-
-
-def _score_of_others(model: GivenModel, some: tuple[int, ...], cost: float) -> float:
-    """Return the score of all but some values as wrong ones, infinite where those some check nothing."""
-    every, part = model.kept(), model.part(np.isin(model.item, some)).kept()
-    if part.dof < 1:
-        return np.inf
-    choice = 2 * log(comb(model.items, len(some)))
-    return part.chi2 - every.chi2 + cost * (every.dof - part.dof) + choice
+    return WrongValues(out, _score(model, out), tuple(sorted(like - set(out))))
 
 
 def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], float]]:
@@ -484,3 +507,8 @@ def _suspects(model: GivenModel, level: float) -> tuple[int, ...]:
     each = [(one, model.kept((one,))) for one in range(model.items)]
     alone = [one for one, kept in each if kept.dof > 0 and model.fits(level, (one,))]
     return tuple(alone) if len(alone) > 1 else tuple(range(model.items))
+
+
+def _one_is_wrong(model: GivenModel, some: tuple[int, ...]) -> bool:
+    """Return whether, of values any of which may be wrong, one is: the others are right, and confirm that."""
+    return len(some) < model.items and all(model.confirms_rest((one,)) for one in some)

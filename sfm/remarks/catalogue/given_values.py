@@ -57,10 +57,18 @@ ROWS = (
         "given_contradicted",
         DETECTED,
         "Some of {of:@} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
-        "wrong[[, and shift coordinates by up to {shift} standard deviations]].[[ The names of "
-        "{exchanged} may be exchanged, in more than one way.]]",
+        "wrong[[, one of them, which shifts coordinates by up to {shift} standard deviations]].[[ The names "
+        "of {exchanged} may be exchanged, in more than one way.]]",
         CHECK_THE_LIST,
         "Check these coordinates; more given points show which one is wrong.",
+    ),
+    Kind(
+        "given_strained",
+        "error",
+        "The coordinates of {of:@} are stretched by {elongation:+}[[ along {axis}]] (chi-square {chi2} as "
+        "given, {fitting} if not stretched): scale and shape of the result are not dependable.",
+        "coordinates of a print or a scan, or axes of different scale or unit",
+        "Correct the scale of the axes, or give coordinates that were measured.",
     ),
     Kind(
         "given_renamed",

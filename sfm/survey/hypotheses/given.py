@@ -264,11 +264,22 @@ def _left_out(group: Group, unit: str) -> Remark:
 
 
 def _doubtful(task: Task, group: Group) -> Remark:
-    found, model = group.found, group.placed.model
-    shift = float(_shifts(model)[list(found.doubtful)].max())
-    # they take part with the standard deviations that their differences show, if these are believed
-    if task.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
-        shift /= model.factor()[0]
+    found, model, strain = group.found, group.placed.model, group.placed.strain
+    if strain is not None:
+        return remark(
+            "given_strained",
+            of=group.of,
+            axis=strain.axis,
+            elongation=(100 * strain.elongation, "%"),
+            chi2=found.statistic,
+            fitting=strain.chi2,
+        )
+    shift = np.inf
+    if found.one_wrong:
+        shift = float(_shifts(model)[list(found.doubtful)].max())
+        # they take part with the standard deviations that their differences show, if these are believed
+        if task.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
+            shift /= model.factor()[0]
     return remark(
         "given_contradicted",
         of=group.of,
