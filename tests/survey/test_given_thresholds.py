@@ -174,3 +174,21 @@ def test_stretched_control_is_an_error() -> None:
     said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
     assert said[0].kind == "given_strained" and said[0].severity == "error"
     assert said[0].names("axis") == ("Y",) and said[0].number("elongation") == pytest.approx(-1, rel=0.1)
+
+
+def test_errors_of_fixed_control_shift_the_datum() -> None:
+    """Errors s in a network of sigma: s / sigma sqrt(h / (1 + h)), where h is the leverage."""
+    rng = seed_of("fixed shift")
+    X, A = rng.normal(size=(2, 24, 7))
+    h = np.diagonal(A @ np.linalg.pinv(A)).max()
+    model = GivenModel(X[:, 0], 4.0 * np.eye(24), np.zeros((24, 24)), A, np.repeat(np.arange(8), 3), 200)
+    assert given.shift_of_fixed(model, 10.0) == pytest.approx(5 * np.sqrt(h / (1 + h)))
+
+
+@pytest.mark.parametrize(("error", "severity"), [(4e-4, "warning"), (4e-3, "error")])
+def test_fixed_control_that_shifts_the_result_is_an_error(error: float, severity: str) -> None:
+    network, truth = make_network(seed_of("not exact"), images=8, points=30)
+    xyz = truth.points[:12] + error * seed_of("errors of fixed control").standard_normal((12, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(12)], xyz)
+    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+    assert said[0].kind == "given_not_exact" and said[0].severity == severity

@@ -96,9 +96,9 @@ ROWS = (
     ),
     Kind(
         "given_not_exact",
-        "warning",
-        "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points; the "
-        "standard deviations of the result do not contain this.",
+        DETECTED,
+        "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points. This "
+        "shifts the result by up to {shift} of its standard deviations, which do not contain it.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
     ),

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import GivenPoints, judge_points
+from sfm.adjustment.quality.given_points import GivenPoints, judge_points, parameters_of
 from sfm.adjustment.quality.given_values import NONCENTRALITY, GivenModel, GivenTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
@@ -243,7 +243,8 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     covariance = (task.network.control if of == "control" else task.network.exterior).covariance
     of_points = covariance[group.rows, :3, :3]
     if not of_points[np.isfinite(of_points)].any():
-        yield remark("given_not_exact", of=of, sigma=(found.factor, task.unit))
+        shift = shift_of_fixed(group.placed.model, found.factor)
+        yield remark("given_not_exact", of=of, sigma=(found.factor, task.unit), shift=shift)
     else:
         used_factor = found.factor if task.rescale else None
         yield remark("given_sigmas", of=of, factor=found.factor, used=used_factor)
@@ -296,3 +297,19 @@ def _shifts(model: GivenModel) -> FloatArray:
     reach = model.external()
     found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / NONCENTRALITY
     return np.where(np.isfinite(reach), found, np.inf)
+
+
+def shift_of_fixed(model: GivenModel, sigma: float) -> float:
+    """Return the shift of coordinates by errors of points that are held fixed, in standard deviations.
+
+    It is the standard deviation of the shift by the datum over that of the coordinate, the largest of points
+    at the places of the given ones.
+
+    Args:
+        model: differences of the fixed points.
+        sigma: standard deviation of their errors.
+    """
+    fixed = replace(model, stated=np.zeros_like(model.stated), estimated=False)
+    datum = model.A @ parameters_of(fixed, np.ones(len(model.v), dtype=bool))
+    variance = np.diagonal(datum @ model.network @ datum.T) + np.diagonal(model.network)
+    return float(sigma * np.sqrt(((datum**2).sum(axis=1) / variance).max()))
