@@ -287,6 +287,13 @@ def test_standard_deviations_may_be_too_small_by_an_order_of_magnitude(factor: f
     assert (found.judgement.factor == pytest.approx(factor, rel=0.3)) is believed
 
 
+def test_the_factor_that_fits_best_may_exceed_what_must_explain_the_differences() -> None:
+    """Of few points: 10 times the stated standard deviations do not contradict a scatter of 13 times."""
+    found = [judge_points(points(8, f"thirteen {k}", noise=13 * SIGMA), LEVEL) for k in range(6)]
+    factors = [one.judgement.factor for one in found if one is not None]
+    assert max(factors) > 10 and sum(one > 1 for one in factors) >= 4
+
+
 @pytest.mark.parametrize(
     ("noise", "estimated", "believed"),
     [(0.03, False, True), (0.075, False, False), (0.03, True, True), (0.2, True, False)],

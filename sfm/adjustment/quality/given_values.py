@@ -4,8 +4,8 @@ An adjustment shares a contradiction among all observations, and weak photograph
 The free network has the shape that the image points give by themselves, with its covariance. Given values
 differ from it by v with covariance network + stated, but for the parameters A that only they determine: a
 scale (bars), a similarity (points). In what A leaves of v every error of a given value is tested, and the
-errors compared: some values are wrong, or the standard deviations are too small, by an order of magnitude at
-most. Names and handedness of points are compared with these in `given_points`.
+errors compared: some values are wrong, or the standard deviations are too small, which an order of magnitude
+must explain. Names and handedness of points are compared with these in `given_points`.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests, external
 reliability); Schwarz (1978), Ann. Stat. 6(2) (the cost of a parameter); Patterson and Thompson (1971),
@@ -30,8 +30,8 @@ LEVEL = 0.001  # probability with which a test of a survey rejects right given v
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
 APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood ratio of two alternatives
-# An order of magnitude, mm stated for cm or the precision of an instrument alone; more are no statements of
-# precision, but errors of the values.
+# An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does not
+# explain are no lack of precision, but errors of the values; the factor that fits best may be larger by chance.
 MAX_FACTOR = 10.0
 UNSTATED = SWELLING  # relative, of coordinates without standard deviations
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
