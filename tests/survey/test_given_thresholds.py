@@ -192,3 +192,13 @@ def test_fixed_control_that_shifts_the_result_is_an_error(error: float, severity
     control = KnownPoints.from_arrays([str(k + 1) for k in range(12)], xyz)
     said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
     assert said[0].kind == "given_not_exact" and said[0].severity == severity
+
+
+def test_mirrored_control_names_what_does_not_fit_either() -> None:
+    network, truth = make_network(seed_of("mirrored and wrong"), images=8, points=30)
+    xyz = truth.points[:8] * (1, 1, -1)
+    xyz[3] += (0.0, 0.02, 0.0)
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz, 2e-4)
+    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+    assert said[0].kind == "given_mirrored" and said[0].names("given") == ("4",)
+    assert said[0].number("mirrored") < 40 < said[0].number("chi2")  # 14 degrees of freedom

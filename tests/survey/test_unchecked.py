@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.given_points import GivenPoints
+from sfm.adjustment.quality.given_values import GivenModel
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
+from sfm.similarity import Similarity
+from sfm.survey.hypotheses.given_groups import remarks_on_unchecked
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
@@ -112,11 +116,29 @@ def test_an_object_nearer_than_the_image_is_implausible(scale: float, implausibl
     assert bool(said) == implausible == (verdict.level == "bad")
 
 
-def test_three_control_points_are_unchecked() -> None:
+def test_three_control_points_are_partly_checked() -> None:
+    """Two of their distances, beside the scale; of two points nothing is."""
     network, truth = _scene("three points")
     control = KnownPoints.from_arrays(["1", "2", "3"], truth.points[:3], 1e-4)
     level, kinds = _kinds(network, truth, control=control, datum={"kind": "control"})
-    assert level == "good" and kinds == ("given_unchecked", "scale_unchecked")
+    assert level == "good" and kinds == ("given_partly_checked", "scale_unchecked")
+    three, two = (
+        GivenPoints(X, np.tile(1e-8 * np.eye(3), (len(X), 1, 1)), X, 1e-10 * np.eye(3 * len(X)), 500)
+        for X in (truth.points[:3], truth.points[:2])
+    )
+    for one, kind in ((three, "given_partly_checked"), (two, "given_unchecked")):
+        model = one.model(Similarity(1.0, np.eye(3), np.zeros(3)), estimated=False)
+        (said,) = remarks_on_unchecked("control", ["1", "2", "3"], model)
+        assert said.kind == kind and len(said.names("given")) == len(one.given)
+
+
+def test_what_is_weakly_checked_is_one_remark() -> None:
+    """Of two pairs the better values have redundancy numbers of 1 / 3 and 1 / 10."""
+    A = np.array([[1.0, 0], [1, 0], [0, 1], [0, 1]])
+    model = GivenModel(np.zeros(4), np.zeros((4, 4)), np.diag([1.0, 2, 1, 9]), A, np.arange(4), 500)
+    (said,) = remarks_on_unchecked("lengths", ["a", "b", "c", "control"], model)
+    assert said.kind == "given_weakly_checked" and said.names("given") == ("a", "c")
+    assert said.number("sigmas") == pytest.approx(4.13 * 3, rel=0.01)
 
 
 def test_fixed_control_is_held_against_the_free_network() -> None:

@@ -63,7 +63,10 @@ def assignments(
 
 
 def cost_of_choice(order: tuple[int, ...]) -> float:
-    """Return -2 ln of the share of an assignment among those that move as many names."""
+    """Return 2 ln of n! / (n - m)!, the number of ordered choices of m coordinates, where m names are moved.
+
+    About one in e of them moves all m.
+    """
     n, moved = len(order), len(moved_by(order))
     return 2 * (lgamma(n + 1) - lgamma(n - moved + 1))
 

@@ -30,8 +30,8 @@ LEVEL = 0.001  # probability with which a test of a survey rejects right given v
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
 APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood ratio of two alternatives
-# An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does not
-# explain are no lack of precision, but errors of the values; the factor that fits best may be larger by chance.
+# An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does
+# not explain are errors of the values; the factor that fits best may be larger by chance.
 MAX_FACTOR = 10.0
 UNSTATED = SWELLING  # relative, of coordinates without standard deviations
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist

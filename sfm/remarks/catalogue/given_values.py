@@ -73,7 +73,8 @@ ROWS = (
     Kind(
         "given_renamed",
         "warning",
-        "Of {of:@}, {given} have one another's coordinates: these were reassigned.",
+        "Of {of:@}, {given} {given:has|have} the coordinates of {given:another point|other points}: these "
+        "were reassigned.",
         "names exchanged or a list shifted by a row, in the given coordinates or in the photographs",
         "Correct these names.",
     ),
@@ -81,7 +82,8 @@ ROWS = (
         "given_mirrored",
         "error",
         "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored)[[, or "
-        "the names of {exchanged} are exchanged]]: they were not used.",
+        "the names of {exchanged} are exchanged]]: they were not used.[[ Even mirrored, {given} "
+        "{given:does|do} not fit: the second chi-square is without {given:it|them}.]]",
         "left-handed coordinates, two axes exchanged, the sign of one axis changed, mirrored photographs, or "
         "the names of left and right exchanged",
         "Give X, Y and Z of a right-handed system; check the names of the points.",
@@ -105,8 +107,8 @@ ROWS = (
     Kind(
         "given_rounded",
         "note",
-        "The rounding of {of:@} to {step} exceeds what the network allows: they took part with its standard "
-        "deviation, {sigma}.",
+        "The rounding of {of:@} to {step} exceeds what the network allows: they took part with the standard "
+        "deviation of this rounding, {sigma}.",
         "coordinates printed with few decimals",
         "Give more decimals, or the standard deviations of these coordinates.",
     ),
@@ -156,10 +158,17 @@ ROWS = (
         "Add control or scale bars.",
     ),
     Kind(
+        "given_partly_checked",
+        "note",
+        "Of {of:@}, an error of {given:@} is found in some directions only.",
+        "hardly more given values than the datum needs",
+        "Add control or scale bars.",
+    ),
+    Kind(
         "given_weakly_checked",
         "note",
-        "Of {of:@}, {given:@} {given:is|are} weakly checked: an error may stay unnoticed and shift the "
-        "result by up to {sigmas} of its standard deviations.",
+        "Of {of:@}, an error of {given:@} may stay unnoticed and shift the result by up to {sigmas} of its "
+        "standard deviations.",
         "few control points or bars, all on one side, or one far more precise than the others",
         "Add control or scale bars.",
     ),

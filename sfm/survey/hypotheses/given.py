@@ -223,8 +223,14 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     found, of = group.found, group.of
     exchanged = [group.names[k] for k in group.placed.exchangeable] or None
     if group.placed.mirrored:
-        chi2, mirrored = group.placed.unmirrored, found.statistic
-        yield remark("given_mirrored", of=of, chi2=chi2, mirrored=mirrored, exchanged=exchanged)
+        yield remark(
+            "given_mirrored",
+            of=of,
+            chi2=group.placed.unmirrored,
+            mirrored=group.placed.model.kept(found.wrong).chi2,
+            given=[group.names[k] for k in found.wrong] or None,
+            exchanged=exchanged,
+        )
         return
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])

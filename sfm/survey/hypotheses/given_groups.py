@@ -165,9 +165,14 @@ def remarks_on_unchecked(
     of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
 ) -> Iterator[Remark]:
     """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
-    reach = model.external(without)
-    nothing = [names[k] for k in np.flatnonzero(np.isinf(reach)).tolist()]
-    if nothing:
-        yield remark("given_unchecked", given=nothing, of=of)
-    for k in np.flatnonzero((reach > WRONG_SIGMAS) & np.isfinite(reach)).tolist():
-        yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
+    reach, rank = model.external(without), model.kept(without).decreases()[1]
+    for kind, some in (
+        ("given_unchecked", np.isinf(reach) & (rank == 0)),
+        ("given_partly_checked", np.isinf(reach) & (rank > 0)),
+    ):
+        if some.any():
+            yield remark(kind, given=[names[k] for k in np.flatnonzero(some).tolist()], of=of)
+    weak = np.flatnonzero((reach > WRONG_SIGMAS) & np.isfinite(reach)).tolist()
+    if weak:
+        largest = float(reach[weak].max())
+        yield remark("given_weakly_checked", given=[names[k] for k in weak], of=of, sigmas=largest)
