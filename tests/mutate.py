@@ -65,7 +65,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             "tests/adjustment/test_given_model.py",
             "tests/adjustment/test_given_values.py",
         )
-        for module in ("given_values", "given_points")
+        for module in ("given_values", "given_points", "given_names")
     },
     "sfm/adjustment/quality/consistency.py": ("tests/report/test_consistency.py",),
     "sfm/adjustment/quality/other_solutions.py": (

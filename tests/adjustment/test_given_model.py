@@ -23,8 +23,8 @@ def test_thresholds_are_those_stated() -> None:
     """Limits of effort and of rounding; the others decide tests in this folder."""
     assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
     assert given_points.MAX_STEPS == 20
-    assert given_names.MIN_POINTS == 4 and given_names.MAX_POINTS == 40 and given_names.TRIANGLES == 20
-    assert given_names.ALIKE == 60 and given_names.MAX_ASSIGNMENTS == 8
+    assert given_names.TRIANGLES == 20 and given_names.MAX_SIMILAR == 60
+    assert given_names.MAX_ASSIGNMENTS == 8
     assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
     assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
 
@@ -125,7 +125,7 @@ def test_the_probability_shares_the_level_among_three_tests() -> None:
 def test_values_none_of_which_is_checked_alone_contradict_nothing(
     estimated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(given_values, "CHECKED", 1.1)  # beyond every redundancy number
+    monkeypatch.setattr(given_values, "MIN_REDUNDANCY", 1.1)  # beyond every redundancy number
     one = replace(bars(0.0, 0.1, -0.1), estimated=estimated)
     assert one.kept().dof == 2 and one.kept().probability() == 1.0
 
@@ -254,10 +254,10 @@ def test_a_factor_must_beat_wrong_values_by_the_margin(monkeypatch: pytest.Monke
     one = bars(*(5 * seed_of("factor or wrong").normal(size=30)))
     factor, gain = one.factor()
     ahead = min(some.score for some in given_values._sets(one, np.log(30))) - (np.log(30) - gain)
-    assert ahead > 2 * np.log(100) == pytest.approx(given_values.APART)
-    monkeypatch.setattr(given_values, "APART", 0.99 * ahead)
+    assert ahead > 2 * np.log(100) == pytest.approx(2 * given_values.MIN_LEAD)
+    monkeypatch.setattr(given_values, "MIN_LEAD", 0.99 * ahead / 2)
     assert judge_values(one, 0.001).factor == factor
-    monkeypatch.setattr(given_values, "APART", 1.01 * ahead)
+    monkeypatch.setattr(given_values, "MIN_LEAD", 1.01 * ahead / 2)
     assert judge_values(one, 0.001).doubtful == tuple(range(30))
 
 
@@ -538,3 +538,16 @@ def test_few_values_do_not_confirm_one_another() -> None:
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 1]])
     near = replace(five, given=line, free=FRAME.apply(line)).model(placing, estimated=False)
     assert near.confirms_rest((4,)) and not near.kept((0,)).dof < 3 and not near.confirms_rest((0,))
+
+
+@pytest.mark.parametrize(
+    ("n", "agreed", "assigned"), [(3, 0, 0), (4, 0, 1), (40, 0, 1), (41, 0, 0), (41, 21, 1)]
+)
+def test_names_of_four_to_forty_points_are_assigned(n: int, agreed: int, assigned: int) -> None:
+    """Three have similar triangles by chance; of more than 40 those that disagree with the others."""
+    one = exact(n, f"assigned {n}")
+    given = np.concatenate([one.given[:agreed], np.roll(one.given[agreed:], 1, axis=0)])
+    placing = FRAME.inverse() if agreed else None
+    found = list(given_names.assignments(one.free, given, one.variances, placing))[:1]
+    right = (*range(agreed), *np.roll(range(agreed, n), -1).tolist())
+    assert found == [right] * assigned

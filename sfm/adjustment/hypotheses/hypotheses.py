@@ -27,6 +27,7 @@ from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
 from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
 from sfm.adjustment.hypotheses.score import log_likelihood_gain, reduce_adjustment
 from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
+from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -40,7 +41,6 @@ MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
-MIN_LEAD = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be separated
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
 

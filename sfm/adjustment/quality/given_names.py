@@ -19,7 +19,7 @@ from sfm.similarity import Similarity, fit_similarity
 MIN_POINTS = 4  # three have a similar triangle by chance too easily: two degrees of freedom
 MAX_POINTS = 40  # 59,280 triangles with their orders; of more points those that disagree are assigned only
 TRIANGLES = 20  # of the network: with half of the points right, 14 of 15 lists have a right one among them
-ALIKE = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
+MAX_SIMILAR = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
 MAX_ASSIGNMENTS = 8  # that are judged: the likeliest, and rivals of it
 
 
@@ -85,7 +85,7 @@ def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
     for _ in range(TRIANGLES):
         some = rng.choice(n, 3, replace=False)
         apart = np.abs(shape - _shape(X[some])).sum(axis=1)
-        for k in np.argpartition(apart, min(ALIKE, len(apart)) - 1)[:ALIKE]:
+        for k in np.argpartition(apart, min(MAX_SIMILAR, len(apart)) - 1)[:MAX_SIMILAR]:
             try:
                 found.append(fit_similarity(X[some], Y[of_y[k]]))
             except GeometryError:

@@ -29,13 +29,13 @@ from sfm.units import SWELLING
 LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
-APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood ratio of two alternatives
+MIN_LEAD = log(100)  # of ln likelihood, below which two alternatives cannot be separated
 # An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does
 # not explain are errors of the values; the factor that fits best may be larger by chance.
 MAX_FACTOR = 10.0
-UNSTATED = SWELLING  # relative, of coordinates without standard deviations
+UNSTATED_FRACTION = SWELLING  # relative, of coordinates without standard deviations
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
-CHECKED = RANK**0.5  # redundancy number below which nothing checks a direction
+MIN_REDUNDANCY = RANK**0.5  # redundancy number below which nothing checks a direction
 MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value
 FACTORS = np.geomspace(1.0, 1e6, 241)  # on standard deviations
 
@@ -68,7 +68,7 @@ class Kept:
         rows = np.flatnonzero(self.model.item == one)
         s = self.model.size[rows]
         d, U = np.linalg.eigh(self.precision[np.ix_(rows, rows)] * s[:, None] * s)
-        on = d > CHECKED
+        on = d > MIN_REDUNDANCY
         half = s[:, None] * U[:, on] / np.sqrt(d[on])
         G, w = self.precision[:, rows] @ half, half.T @ self.u[rows]
         M, u = self.precision - G @ G.T, self.u - G @ w
@@ -80,7 +80,7 @@ class Kept:
         at, there = self.model.blocks
         s = np.where(there, self.model.size[at], 0.0)
         d, U = np.linalg.eigh(self.precision[at[:, :, None], at[:, None, :]] * s[:, :, None] * s[:, None, :])
-        on = d > CHECKED
+        on = d > MIN_REDUNDANCY
         w2 = np.einsum("kab,ka->kb", U, self.u[at] * s) ** 2
         return np.where(on, w2 / np.where(on, d, 1.0), 0.0).sum(axis=1), on.sum(axis=1)
 
@@ -126,7 +126,7 @@ class Kept:
         if self.model.estimated:
             return min(1.0, single)
         of_one, u = np.diagonal(self.precision) * self.model.size**2, self.u * self.model.size
-        on = of_one > CHECKED
+        on = of_one > MIN_REDUNDANCY
         largest = float((u[on] ** 2 / of_one[on]).max(initial=0.0))
         together = self._sf(self.chi2, self.dof)
         coordinate = int(on.sum()) * self._sf(largest, 1) if on.any() else np.inf
@@ -220,7 +220,7 @@ class GivenModel:
         """The model with the largest standard deviations that are believed."""
         stated = self.stated
         if self.estimated or not stated.any():
-            stated = (UNSTATED * self.extent) ** 2 * np.eye(len(self.v))
+            stated = (UNSTATED_FRACTION * self.extent) ** 2 * np.eye(len(self.v))
         return replace(self, stated=MAX_FACTOR**2 * stated, estimated=False)
 
     def fits(self, level: float, without: tuple[int, ...] = ()) -> bool:
@@ -267,7 +267,7 @@ class GivenModel:
             L = np.linalg.cholesky(W + RANK * np.trace(W) * np.eye(len(rows)))
             checked = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, own).T)).min()
             r = float(np.clip(checked, 0.0, 1.0))
-            out[one] = NONCENTRALITY * np.sqrt((1 - r) / r) if r > RANK**0.5 else np.inf
+            out[one] = NONCENTRALITY * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
         return out
 
     def factor(self) -> tuple[float, float]:
@@ -368,7 +368,7 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         # one wrong value of so few would look like standard deviations that are too small, but for values of
         # which each by itself is within what its test finds
         unseen = float(np.sqrt(every.decreases()[0].max())) < NONCENTRALITY
-        if sets and (unseen or of_factor + APART < min(one.score for one in sets)):
+        if sets and (unseen or of_factor + 2 * MIN_LEAD < min(one.score for one in sets)):
             return replace(found, factor=factor, score=of_factor)
         return replace(found, doubtful=tuple(range(model.items)), score=of_factor)
     found = replace(found, score=removed.score)

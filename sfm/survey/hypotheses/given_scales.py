@@ -16,7 +16,7 @@ from sfm.adjustment.quality.given_points import (
 )
 from sfm.adjustment.quality.given_values import (
     LEVEL,
-    UNSTATED,
+    UNSTATED_FRACTION,
     GivenModel,
     GivenTest,
     Judgement,
@@ -101,7 +101,7 @@ def _scale_of(task: Task, group: Group) -> GivenScale | None:
     else:
         found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
     if task.datum.kind != "control" and not points.stated.any():
-        return replace(found, sigma=float(np.hypot(found.sigma, UNSTATED * found.scale)))
+        return replace(found, sigma=float(np.hypot(found.sigma, UNSTATED_FRACTION * found.scale)))
     return found
 
 
