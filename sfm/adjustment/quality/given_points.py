@@ -342,8 +342,8 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
             if not np.linalg.det(F) > 0 or np.abs(step).max() <= RANK:
                 break
             strain = replace(strain, F=F)
-        judgement = judge_values(model, level)
-        if judgement.fits and model.confirms_rest(()):
+        if model.fits(level) and model.confirms_rest(()):
+            judgement = judge_values(model, level)
             q, fall = found.judgement.dof - judgement.dof, found.judgement.statistic - judgement.statistic
             cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
             fitting.append((PlacedPoints(judgement, placing, model, cost_of_strain=cost), strain))
