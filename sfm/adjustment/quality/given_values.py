@@ -103,7 +103,7 @@ class Kept:
         scale = 1 / np.linalg.norm(columns / self.model.size[:, None], axis=0)
         g, H = scale * (columns.T @ self.u), scale[:, None] * (columns.T @ self.precision @ columns) * scale
         d, U = np.linalg.eigh((H + H.T) / 2)
-        on, alone = d > CHECKED, np.diagonal(H) > CHECKED
+        on, alone = d > MIN_REDUNDANCY, np.diagonal(H) > MIN_REDUNDANCY
         if not on.any():
             return Bias(np.zeros(len(g)), 0.0, 0, 1.0)
         w = U[:, on].T @ g
