@@ -221,7 +221,8 @@ def _own_camera(
             continue
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             continue  # no picture of these points, as where their names are wrong
-        gain = _log_likelihood(found, camera, n, sigma_px) - _log_likelihood(shared, camera, n, sigma_px)
+        sigma = max(sigma_px, found.sigma0_px)
+        gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
         q = int(own.sum())
         evidence = gain - q / 2 * np.log(2 * n) - search
         if evidence > most:
