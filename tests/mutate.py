@@ -145,7 +145,9 @@ def _changes(node: ast.AST, numbers: dict[str, object]) -> Iterator[tuple[str, C
         )
     elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-        if isinstance(target, ast.Name) and target.id in numbers:
+        parts = node.value.elts if isinstance(node.value, ast.Tuple) else []
+        spelled = not any(isinstance(one, ast.Starred) for one in parts)
+        if isinstance(target, ast.Name) and target.id in numbers and spelled:
             yield from _scalings(target.id, numbers[target.id])
     elif isinstance(node, ast.Call):
         for k, one in enumerate(node.keywords):
