@@ -23,7 +23,7 @@ from sfm.adjustment.hypotheses.hypotheses import (
     remark_of,
 )
 from sfm.adjustment.hypotheses.refit import Refit, log_likelihood, shifts_of
-from sfm.adjustment.hypotheses.score import Gain
+from sfm.adjustment.hypotheses.score import Gain, log_likelihood_gain
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
@@ -248,6 +248,7 @@ def choice(
     *,
     gain: float = 50.0,
     gains: dict[int, float] | None = None,
+    before: tuple[Cause, ...] = (),
 ) -> Cause | None:
     """Return the best of these alternatives, an adjustment with which gains so much."""
 
@@ -259,7 +260,7 @@ def choice(
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
     monkeypatch.setattr(hypotheses, "refit", adjusted)
     nothing: Any = None
-    return hypotheses._best(nothing, ())
+    return hypotheses._best(nothing, before)
 
 
 def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(
@@ -302,6 +303,24 @@ def test_the_alternative_that_adjusts_best_holds_not_that_of_most_evidence(
         found = choice(monkeypatch, every, gains=gains)
         assert found is not None and found.alternative is right
     assert choice(monkeypatch, [strong], gains=gains) is None
+
+
+def test_beside_a_first_cause_what_photographs_differ_by_anyhow_explains_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not of the first one, a large error of which makes them differ, nor of a parameter of all of them."""
+    plain = replace(alternative("strain"), gain=Gain(80.0, 1, np.ones(1)))
+    plain = replace(plain, evidence=log_likelihood_gain(plain.gain.value, 200) - plain.price)
+    differing = replace(plain, family=alternative("c").family, evidence=plain.evidence - 12.0)
+    held = replace(differing, family=alternative("held", "all").family, parameters=((0, 1),))
+    for second, holds in ((differing, False), (held, True)):
+        gains = {id(plain): 40.0, id(second): 45.0}
+        first: Any = SimpleNamespace(
+            alternative=second, refit=SimpleNamespace(adjustment=None, beta=np.ones(1))
+        )
+        for before, best in (((), second), ((first,), second if holds else plain)):
+            found = choice(monkeypatch, [plain, second], gains=gains, before=before)
+            assert found is not None and found.alternative is best
 
 
 def test_causes() -> None:

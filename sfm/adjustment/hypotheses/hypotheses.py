@@ -25,7 +25,7 @@ from sfm.adjustment.hypotheses.alternatives import (
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
 from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
-from sfm.adjustment.hypotheses.score import log_likelihood_gain, reduce_adjustment
+from sfm.adjustment.hypotheses.score import Reduced, log_likelihood_gain, reduce_adjustment
 from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
@@ -145,7 +145,11 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
         of_kind[cause[0]] += 1
         if of_kind[cause[0]] <= MAX_TRIED:
             tried.append((one, refit(plain, one, current, before)))
-    holding = [(found.gain - one.price, one, found) for one, found in tried if found is not None]
+    holding = [
+        (found.gain - one.price - (_shared_by_chance(one, reduced) if causes else 0.0), one, found)
+        for one, found in tried
+        if found is not None
+    ]
     most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
     if best is None or adjusted is None or not most > np.log(1 / ALPHA):
         return None
@@ -161,6 +165,16 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
         )
     )
     return Cause(best, adjusted, near)
+
+
+def _shared_by_chance(one: Alternative, reduced: Reduced) -> float:
+    """Return how much of the evidence of an alternative is no more than photographs differ anyhow.
+
+    Of the first cause it is not known: the same large error makes photographs differ.
+    """
+    if isinstance(one.family, InteriorFamily):
+        return 0.0
+    return log_likelihood_gain(one.gain.value, reduced.redundancy) - one.price - one.evidence
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
