@@ -321,7 +321,7 @@ def _stretches(
     i, j = np.triu_indices(len(axes))
     tensors = np.zeros((len(i), 3, 3))
     for k, (u, v) in enumerate(zip(axes[i], axes[j], strict=True)):
-        tensors[k] = (np.outer(u, v) + np.outer(v, u)) / 2
+        tensors[k] = np.outer(u, v) + np.outer(v, u)
     S = np.einsum("kxy,ny->nxk", tensors, along[stable] @ axes).reshape(-1, len(i))
     N = S.T @ among.P @ S
     if pairs.scale is None:  # nothing but the trace is undetermined

@@ -36,6 +36,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import ImagePoints, InteriorObservations
+from tests.survey.faults import planted
 from tests.synthetic import make_network, observed_anew, seed_of
 
 NO_POINTS = np.zeros(0, dtype=np.int64)
@@ -508,6 +509,36 @@ def test_variance_that_is_left_in_a_photograph() -> None:
     assert alternatives._variance_of(
         reduced, np.array([False, True]), Gain(30.0, 4, np.zeros(4))
     ) == pytest.approx(132.0)
+
+
+def test_points_of_three_photographs_have_no_place_to_move_at() -> None:
+    few: Any = SimpleNamespace(photographs=3)
+    assert list(alternatives._moved_points(few)) == []
+
+
+def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the other freedoms of the photographs take once it is in: the gain of all less its own."""
+    one = planted("stabiliser", 18)
+    a = adjust(one.network, one.start, datum=Datum("free"), reject="none")
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    m = reduced.photographs
+    H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), np.arange(m))
+    made: dict[str, Spread] = {}
+    monkeypatch.setattr(
+        alternatives, "_made", lambda *given, parts: made.update({given[1].name: given[6]}) or given[1]
+    )
+    list(alternatives._each(reduced, H, g, squares, np.arange(m)))
+    size = g.size
+    every = gain_of(H.reshape(size, size), g.ravel(), squares.ravel())
+    for family in families.OF_EACH:
+        if family.name not in made:
+            continue
+        some, spread = np.array(family.places), made[family.name]
+        q = m * len(some)
+        own = gain_of(H[:, some][:, :, :, some].reshape(q, q), g[:, some].ravel(), squares[:, some].ravel())
+        assert spread.factor * spread.redundancy == pytest.approx(every.value - own.value, rel=0.05)
+    assert "point" in made
 
 
 def test_patterns_have_two_photographs_on_each_side() -> None:

@@ -158,6 +158,18 @@ def test_stretched_points_are_named(factor: float, axis: int) -> None:
             assert found.strain.elongation == pytest.approx(factor - 1, abs=4 * SIGMA)
 
 
+def test_a_strain_costs_its_parameters_and_their_choice() -> None:
+    one = points(12, "stretched 12")
+    stretched = replace(one, given=(1.01, 1, 1) * one.given)
+    plain = given_points._placed(stretched, LEVEL, None, False)
+    assert plain is not None
+    found = given_points._strained(stretched, LEVEL, plain, False)
+    assert found is not None and found.judgement.dof == plain.judgement.dof - 1
+    fall = plain.judgement.statistic - found.judgement.statistic
+    # of 36 differences: ln of their number, 1 + ln of the chi-square, and twice ln of 4 kinds of strain
+    assert found.cost_of_strain == pytest.approx(np.log(36) + 1 + np.log(fall) + 2 * np.log(4))
+
+
 def test_an_affinity_is_a_strain_of_no_axis() -> None:
     one = points(12, "affinity")
     F = np.array([[1.02, 0.01, 0], [0.01, 0.99, 0], [0, 0, 1]])

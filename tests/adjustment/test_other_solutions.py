@@ -68,6 +68,15 @@ def test_solutions_are_others_from_one_standard_deviation_on(
     assert bool(searched.other_solutions(a)) == other
 
 
+def test_uncertain_points_place_a_solution_as_little_as_they_count() -> None:
+    rng = seed_of("apart by weights")
+    points, sigma = rng.normal(size=(12, 3)), np.full(12, 1e-3)
+    sigma[0] = 10.0
+    other = points.copy()
+    other[0] += 5.0
+    assert searched._apart(points, other, sigma) == pytest.approx(0.5 * np.sqrt(3 / 36), rel=0.01)
+
+
 def camera_at(model: str, x: float, y: float, *, free: bool = True) -> Any:
     """Return the estimate of a camera of 2000 x 1500 pixels with its principal point there, px."""
     names = CAMERA_MODELS[model].names

@@ -72,6 +72,15 @@ def _false_alarms(runs: int) -> Counter[str]:
     return count
 
 
+def test_points_of_residuals_too_large_together_are_named() -> None:
+    rng = seed_of("one rough point")
+    network, truth = make_network(rng, images=12, points=50, free=("c",))
+    seen = network.image_points
+    rough = (seen.point == 7)[:, None] * 0.25 * rng.standard_normal((len(seen), 2))
+    a = _solved(replace(network, image_points=replace(seen, xy=seen.xy + rough)), truth, "none")
+    assert consistency_of(a).large == (network.points[7],)
+
+
 def test_clean_networks_raise_no_alarm() -> None:
     assert max(_false_alarms(12).values()) <= 1  # each test speaks once in 100
 

@@ -10,10 +10,11 @@ import pytest
 from sfm.adjustment.quality.given_values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark, kinds_of
+from sfm.remarks.remark import Remark, kinds_of, of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.survey import mistyped
 from tests.survey.mistyped import SIGMA, scene
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -52,6 +53,34 @@ def test_standard_deviations_that_are_too_small_are_named_once() -> None:
     result = run_survey(survey_of(network, truth, **parts))
     (said,) = (one for one in findings_of(result).verdict.remarks if one.kind == "given_sigmas")
     assert said.names("of") == ("control",) and said.number("factor") == pytest.approx(6, rel=0.3)
+
+
+@pytest.mark.parametrize("weights", ["stated", "components"])
+def test_bars_of_too_small_standard_deviations_take_part_as_the_weights_say(
+    weights: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = Judgement(90.0, 2, 1e-6, factor=6.0, score=-20.0)
+    monkeypatch.setattr(given_scales, "judge_values", lambda *_: judged)
+    network, truth = make_network(seed_of("small bars"), images=8, points=30)
+    bars = tuple(
+        ScaleBar(str(k + 1), str(k + 16), float(np.linalg.norm(truth.points[k] - truth.points[k + 15])), 1e-3)
+        for k in range(3)
+    )
+    result = run_survey(survey_of(network, truth, scale_bars=bars, adjust={"weights": weights}))
+    (said,) = of_kind(remarks_on_given(result), "given_sigmas")
+    assert said.number("factor") == 6.0
+    used = 1.0 if weights == "stated" else 6.0
+    np.testing.assert_allclose(result.network.scale_bars.sigma, used * 1e-3, rtol=1e-6)
+
+
+def test_names_that_may_be_exchanged_are_in_the_remark(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    run = mistyped.run_survey
+    monkeypatch.setattr(mistyped, "run_survey", lambda survey: found.append(run(survey)) or found[-1])
+    mistyped.mistyped("two names of a box", 101)
+    (said,) = of_kind(remarks_on_given(found[0]), "given_contradicted")
+    assert len(said.names("exchanged")) >= 2
+    assert set(said.names("exchanged")) <= set(said.names("given"))
 
 
 def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:

@@ -125,6 +125,7 @@ def test_a_plate_without_marks_must_be_whole() -> None:
     none = np.zeros(len(xy), dtype=bool)
     code = name_dots(xy, radius, none, NO_MARKS)
     assert (code == truth).all() or (code == truth[::-1]).all()  # it looks alike turned by 180 degrees
+    assert (xy[:, 0] - xy[:, 0].mean()) @ (code % NO_MARKS.columns) > 0  # columns run to the right
     part = truth >= NO_MARKS.columns
     assert (name_dots(xy[part], radius[part], none[part], NO_MARKS) == -1).all()
 

@@ -179,7 +179,7 @@ def _step(camera: Camera, s: int, uv: FloatArray) -> float:
         most = float(np.nanmax(away, initial=0.0))
         if most > SMALL_MOVE_PX / 10:
             return step * SMALL_MOVE_PX / most
-        step *= 10 if most < SMALL_MOVE_PX / 1000 else SMALL_MOVE_PX / most
+        step *= 10
     return step
 
 
