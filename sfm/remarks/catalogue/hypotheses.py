@@ -24,7 +24,7 @@ ROWS = (
         "camera_varies",
         SHIFT,
         "The camera differs from photograph to photograph"
-        f"[[ (c by up to {{change}})]][[, the principal point by up to {{away}}]]. {SHIFTED}{INSTEAD}",
+        f"[[, c by up to {{change}}]][[, the principal point by up to {{away}}]]. {SHIFTED}{INSTEAD}",
         "autofocus, a stabiliser, a rolling shutter or a loose lens",
         "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
         short="a camera that differs from photograph to photograph",
