@@ -516,6 +516,14 @@ def test_points_of_three_photographs_have_no_place_to_move_at() -> None:
     assert list(alternatives._moved_points(few)) == []
 
 
+def test_as_many_places_are_tried_as_can_be_afforded(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[float] = []
+    monkeypatch.setattr(alternatives, "_moved_at", lambda _, factor, __: tried.append(factor.sum()) or ())
+    monkeypatch.setattr(alternatives, "MAX_PRODUCTS", 3.5 * 6 * 100 * 126**2)
+    large: Any = SimpleNamespace(photographs=20, L=np.zeros((100, 3, 3)), t=np.zeros(126))
+    assert list(alternatives._moved_points(large)) == [] and len(tried) == 3
+
+
 def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the other freedoms of the photographs take once it is in: the gain of all less its own."""
     one = planted("stabiliser", 18)

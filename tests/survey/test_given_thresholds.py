@@ -83,6 +83,14 @@ def test_names_that_may_be_exchanged_are_in_the_remark(monkeypatch: pytest.Monke
     assert set(said.names("exchanged")) <= set(said.names("given"))
 
 
+def test_the_shift_by_a_value_is_in_standard_deviations_of_what_all_give() -> None:
+    """The last of four lengths is 2 sigma off the mean of the others, and shifts theirs by half a sigma."""
+    model = GivenModel(
+        np.array([0.0, 0, 0, 2]), np.zeros((4, 4)), np.eye(4), np.ones((4, 1)), np.arange(4), 500
+    )
+    assert given._shifts(model)[3] == pytest.approx(0.5 / np.sqrt(1 / 4))
+
+
 def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     v, variance = np.log([1.0, 1.1, 1.02]), np.array([1e-4, 3e-4, 2e-4])
     model = GivenModel(v, np.zeros((3, 3)), np.diag(variance), np.ones((3, 1)), np.arange(3), 100)

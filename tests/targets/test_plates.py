@@ -16,6 +16,7 @@ from sfm.errors import SurveyFileError
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
+from sfm.targets.codes import dot_plates
 from sfm.targets.codes.dot_plates import name_dots, placements
 from sfm.targets.codes.lattice import Lattice
 from sfm.targets.codes.plates import PlateFamily
@@ -99,6 +100,13 @@ def test_three_marks_are_enough_wherever_they_are(layout: str) -> None:
         assert (whole == np.arange(plate.count)).all()
         larger = name_dots(xy, radius, none, plate)
         assert (larger[on_plate] == np.arange(plate.count)).all() and (larger[~on_plate] == -1).all()
+
+
+@pytest.mark.parametrize("strange", [0.01, 0.3])
+def test_sizes_have_a_density(strange: float) -> None:
+    z = np.linspace(-dot_plates.RANGE / 2, dot_plates.RANGE / 2, 20001)
+    density = np.exp(dot_plates._log_likelihood(z, strange))
+    assert np.trapezoid(density, z) == pytest.approx(1, abs=2e-3)
 
 
 def test_smaller_dots_are_no_marks() -> None:

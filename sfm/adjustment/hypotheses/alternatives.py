@@ -448,8 +448,8 @@ def _shifted(
             members = again
         if 2 * members.sum() > total:
             members = ~members  # that the others moved the other way says the same
-        count = int(members.sum())
-        if not MIN_GROUP <= count <= total - MIN_GROUP:
+        count = int(members.sum())  # not more than half
+        if count < MIN_GROUP:
             continue
         points = movable[members]
         on = (factor[reduced.image] > 0) & np.isin(reduced.point, points)
