@@ -12,16 +12,11 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.codes.ring_reading import UNCODED
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
-from sfm.targets.fits.undamaged import STROKES, UNEVEN_EDGE
+from sfm.targets.fits.undamaged import unlike_targets
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
 from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 
-# Largest RMS of the residuals over the contrast.
-POOR_FIT = 0.12
-# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
-# only half of it where the background is a thin stroke.
-LOBES, LOBES_SIGMAS = 0.02, 5.0
 # Centres nearer than this share of the smaller radius belong to concentric targets.
 CONCENTRIC = 0.5
 # Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.
@@ -61,7 +56,6 @@ def judge_fits(
     if defined.any():
         a[defined], b[defined] = axes_from_shape(fit.shape[defined])[0].T
     contrast = np.abs(fit.contrast)
-    lobes = LOBES + LOBES_SIGMAS * fit.lobes_sigma
     border = (fit.flag & Flag.CUT_BY_BORDER) != 0
     with np.errstate(divide="ignore", invalid="ignore"):
         tests = [
@@ -73,16 +67,17 @@ def judge_fits(
             (Flag.TOO_OBLIQUE, b / a < MIN_AXIS_RATIO),
             (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, MIN_STEP * scale)),
             (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
-            (
-                Flag.UNEVEN_EDGE,
-                ((fit.flag & Flag.UNEVEN_EDGE) != 0) | (fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+            *unlike_targets(
+                unevenness=fit.unevenness,
+                lobes=fit.lobes,
+                lobes_sigma=fit.lobes_sigma,
+                strokes=fit.strokes,
+                noise_of_fit=fit.noise,
+                contrast=contrast,
+                noise=noise,
             ),
-            (Flag.LOBED, fit.lobes > lobes),
-            (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
-            (
-                Flag.POOR_FIT,
-                ((fit.flag & Flag.POOR_FIT) != 0) | (fit.noise / contrast > POOR_FIT + noise / contrast),
-            ),
+            (Flag.UNEVEN_EDGE, (fit.flag & Flag.UNEVEN_EDGE) != 0),
+            (Flag.POOR_FIT, (fit.flag & Flag.POOR_FIT) != 0),
         ]
     reason = np.zeros(len(fit.xy), dtype=np.int64)
     for flag, against in tests:

@@ -27,11 +27,14 @@ def trace_rays(
     sign: int,
     noise: float,
     margin: float,
+    skirt: float,
     edge: FloatArray,
     limit: FloatArray,
     window: int = 0,
 ) -> float:
     """Find the steepest edge on rays from the centre and how far out the background reaches.
+
+    It ends the skirt before the rise to a neighbour, at the margin at the latest.
 
     The edge is the vertex of a parabola through the slopes at the steepest point or, where the caller takes
     the surroundings for clean, the mean position of the slope over a window of samples to both sides.
@@ -51,7 +54,7 @@ def trace_rays(
         ex, ey = ex / R, ey / R
         reach = max(2.5, 0.3 * R)
         first = max(0.0, R - reach - 1.0)
-        n = min(4096, int((R + reach + margin + 1.0 - first) / step) + 1)
+        n = min(4096, int((R + reach + margin + skirt + 1.0 - first) / step) + 1)
         m = 0
         for i in range(n):
             x, y = x0 + (first + i * step) * ex, y0 + (first + i * step) * ey
@@ -90,11 +93,11 @@ def trace_rays(
             inside = max(inside, profile[i])
         limit[k] = margin
         for i in range(at + 2, m):
-            if (i - at) * step > margin:
+            if (i - at) * step > margin + skirt:
                 break
             level = min(level, profile[i])
             if profile[i] - level > max(_DISTURBANCE * (inside - level), _DISTURBANCE_SIGMAS * noise):
-                limit[k] = max(0.0, (i - at) * step - 1.0)
+                limit[k] = min(margin, max(0.0, (i - at) * step - skirt))
                 break
         if (m - at) * step < 3.0:  # the photograph ends here
             limit[k] = -1.0

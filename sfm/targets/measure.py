@@ -11,6 +11,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.sampling import as_grey
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
+from sfm.targets.fits.outline_noise import outline_shape
 from sfm.targets.fits.undamaged import fit_undamaged
 from sfm.targets.flags import Flag
 
@@ -109,6 +110,7 @@ def fit_ellipse_model(
         least_variance,
     )
     theta, cofactor, statistics, flag = fits[:4]
+    harmonics = outline_shape(fits.shape)
     found = statistics.T
     covariance = np.full((k, GAIN_X, GAIN_X), np.nan)
     failed = Flag.NO_CONVERGENCE | Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC
@@ -135,8 +137,8 @@ def fit_ellipse_model(
         gain=gain,
         noise=np.sqrt(variance),
         unevenness=found[goodness.UNEVENNESS],
-        lobes=outlines.lobes,
-        lobes_sigma=noise * np.sqrt(outlines.lobes_cofactor),
+        lobes=harmonics.lobes,
+        lobes_sigma=noise * np.sqrt(harmonics.lobes_cofactor),
         strokes=found[goodness.STROKES],
         pixels=found[goodness.PIXELS].astype(np.int64),
         iterations=found[goodness.STEPS].astype(np.int64),

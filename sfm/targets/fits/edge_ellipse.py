@@ -84,14 +84,14 @@ def _fit_edges(
         window = min(WINDOW, int(minor_px / STEP_PX))
         agree = 0.0
         for _ in range(TRACES):
-            trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, edge, limit, window)
+            trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, 0.0, edge, limit, window)
             agree, _change = improve_outline(theta[t], edge)
             if agree < MIN_AGREEMENT:
                 break
         if agree < MIN_AGREEMENT:
             theta[t] = math.nan
             continue
-        trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, edge, limit, window)
+        trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, 0.0, edge, limit, window)
         for k in range(RAYS):
             if abs(edge[k] - 1) < TOLERANCE:
                 residual[t, k] = edge[k] - 1

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
 from sfm.kernels.options import compiled
-from sfm.targets.edge_rays import RAYS, improve_outline, trace_rays
+from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 from sfm.targets.fits import blurred_ellipse as model
 from sfm.targets.fits import goodness
 from sfm.targets.flags import Flag
@@ -27,8 +27,8 @@ MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
 LARGE_PX, BAND_PX = 25.0, 15.0
 # Blur of the edge at the start and its limits.
 BLUR_START, MIN_BLUR = 0.9, 0.25
-# A ray ends so far before the rise to a neighbour; with soft edges so many sigma, where 1 % of it are left.
-SKIRT_PX, SKIRT_SIGMAS = 1.0, 1.7
+# A rise to a neighbour shows at three tenths of its step, half a blur before its edge.
+RISE_BLURS = 0.5
 # The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
 MAX_TRACES, SMALL_CHANGE, MIN_AGREEMENT = 2, 0.08, 0.7
 _NONE = int(Flag.NONE)
@@ -128,7 +128,7 @@ def _fit_one(
     for _ in range(MAX_TRACES):
         mean = 1 / math.sqrt(max(theta[model.P] * theta[model.R] - theta[model.Q] ** 2, 1e-12))
         margin = min(MARGIN_MAX_PX, MARGIN_PX + MARGIN_SHARE * mean)
-        step = trace_rays(image, theta, sign, noise, margin, edge, limit)
+        step = trace_rays(image, theta, sign, noise, margin, _skirt(MIN_BLUR), edge, limit)
         agree, change = improve_outline(theta, edge)
         if agree < MIN_AGREEMENT or step <= 0:
             return _NOT_ELLIPTIC
@@ -154,15 +154,14 @@ def _fit_one(
     prior = (noise / GAIN_SIGMA) ** 2
     N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
     steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
-    skirt = SKIRT_SIGMAS * theta[model.BLUR] - SKIRT_PX
-    if steps > 0 and skirt > SKIRT_PX and theta[model.CONTRAST] * sign > 0:
+    if steps > 0 and theta[model.CONTRAST] * sign > 0:
         # the edges of neighbours are as soft: their skirts begin farther away from them than the rays say
         wide = np.empty(RAYS)
-        trace_rays(image, theta, sign, noise, margin + skirt, edge, wide)
+        trace_rays(image, theta, sign, noise, margin, _skirt(theta[model.BLUR]), edge, wide)
         nearer = False
         for k in range(RAYS):
-            if 0 <= wide[k] < limit[k] + skirt and wide[k] < margin + skirt:
-                limit[k], nearer = max(0.0, wide[k] - skirt), True
+            if 0 <= wide[k] < limit[k]:
+                limit[k], nearer = wide[k], True
         if nearer:
             flag |= _CLOSE_NEIGHBOUR
             n = _collect(image, theta, limit, margin, half_x, half_y, depth, keep, pixels)
@@ -190,6 +189,15 @@ def _fit_one(
         pixels, n, theta, length, saturation, noise, J, sectors
     )
     return flag
+
+
+@compiled
+def _skirt(blur: float) -> float:
+    """Return how far before the rise to a neighbour the background is undisturbed, px.
+
+    As beside the own edge, few thousandths of the step are left there. Rays find a rise up to a step late.
+    """
+    return (goodness.EDGE_ENDS_BLURS - RISE_BLURS) * blur + STEP_PX
 
 
 @compiled

@@ -26,6 +26,21 @@ EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
 _ALIKE = 1e4
 
 
+class OutlineShape(NamedTuple):
+    """Harmonics 3 to 6 of the outlines of k targets, which no ellipse follows."""
+
+    harmonics: FloatArray
+    """cosine and sine of each, radii, shape (k, SHAPES)"""
+    normal: FloatArray
+    """their normal equations, shape (k, SHAPES, SHAPES)"""
+    effect: FloatArray
+    """change of the centre by each, px per radius, shape (k, 2, SHAPES)"""
+    lobes: FloatArray
+    """amplitude of harmonics 3 and 4 together, radii, shape (k,)"""
+    lobes_cofactor: FloatArray
+    """largest cofactor of their four components, for unit variance of the intensities, shape (k,)"""
+
+
 class OutlineNoise(NamedTuple):
     """Noise of the outlines of k targets."""
 
@@ -33,27 +48,35 @@ class OutlineNoise(NamedTuple):
     """ratio of the variances to those by the noise of the intensities, shape (k,)"""
     gap_covariance: FloatArray
     """what gaps in the edges add to the covariance of the centres, px^2, shape (k, 2, 2)"""
-    lobes: FloatArray
-    """amplitude of harmonics 3 and 4 together, radii, shape (k,)"""
-    lobes_cofactor: FloatArray
-    """largest cofactor of their four components, for unit variance of the intensities, shape (k,)"""
 
 
-def judge_outlines(
-    equations: FloatArray, variance: FloatArray, sound: BoolArray, rise: float
-) -> OutlineNoise:
-    """Return the noise of outlines.
-
-    Args:
-        equations: of the harmonics of the outlines, see `goodness.shape_equations`, (k, SHAPES + 3, SHAPES).
-        variance: of the intensities, shape (k,).
-        sound: targets that show what is usual, shape (k,).
-        rise: power of the first harmonic over that of harmonics 3 to 6, see `rise_to_first`.
-    """
+def outline_shape(equations: FloatArray) -> OutlineShape:
+    """Return the harmonics of outlines from their `goodness.shape_equations`, (k, SHAPES + 3, SHAPES)."""
     N, g, effect = np.split(equations, [SHAPES, SHAPES + 1], axis=1)
     N = N + 1e-9 * (1 + np.trace(N, axis1=1, axis2=2))[:, None, None] * np.eye(SHAPES)
     cofactor = np.linalg.inv(N)
     shape = np.einsum("kab,kb->ka", cofactor, g[:, 0])
+    return OutlineShape(
+        shape,
+        N,
+        effect,
+        np.sqrt((shape[:, :4] ** 2).sum(axis=1)),
+        np.maximum(np.diagonal(cofactor, axis1=1, axis2=2)[:, :4].max(axis=1), 0.0),
+    )
+
+
+def judge_outlines(
+    outlines: OutlineShape, variance: FloatArray, sound: BoolArray, rise: float
+) -> OutlineNoise:
+    """Return the noise of outlines.
+
+    Args:
+        outlines: their harmonics.
+        variance: of the intensities, shape (k,).
+        sound: targets that show what is usual, shape (k,).
+        rise: power of the first harmonic over that of harmonics 3 to 6, see `rise_to_first`.
+    """
+    shape, N, effect = outlines[:3]
     rest = shape - np.median(shape[sound], axis=0) if sound.sum() >= MIN_POPULATION else shape
     ratio = np.maximum(np.einsum("ka,kab,kb->k", rest, N, rest), 0.0) / (SHAPES * np.maximum(variance, 1e-12))
     factor = moderate(ratio, sound, SHAPES)
@@ -62,8 +85,6 @@ def judge_outlines(
     return OutlineNoise(
         factor + (rise - 1) * excess,
         in_radii[:, None, None] * effect @ np.swapaxes(effect, 1, 2),
-        np.sqrt((shape[:, :4] ** 2).sum(axis=1)),
-        np.maximum(np.diagonal(cofactor, axis1=1, axis2=2)[:, :4].max(axis=1), 0.0),
     )
 
 

@@ -16,14 +16,17 @@ from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
 from sfm.targets.fits.damage import MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
 from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
-from sfm.targets.fits.outline_noise import OutlineNoise, judge_outlines, rise_to_first
+from sfm.targets.fits.outline_noise import OutlineNoise, judge_outlines, outline_shape, rise_to_first
 from sfm.targets.flags import Flag
 
 # Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
 # share of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.
 UNEVEN_EDGE, MIN_CONTRAST = 0.18, 0.2
-# Nor is their background a thin stroke, as in letters, on more than this share of the circumference.
-STROKES = 0.5
+# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
+# only half of it where the background is a thin stroke, as in letters, on this share of the circumference.
+LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
+# Largest RMS of the residuals over the contrast.
+POOR_FIT = 0.12
 # Damage is sought so often; each fit shows more of it.
 ROUNDS = 3
 # So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
@@ -78,6 +81,39 @@ def fit_undamaged(
         np.concatenate([one[1] for one in found])[back],
         OutlineNoise(*together(one[2] for one in found)),
     )
+
+
+def unlike_targets(
+    *,
+    unevenness: FloatArray,
+    lobes: FloatArray,
+    lobes_sigma: FloatArray,
+    strokes: FloatArray,
+    noise_of_fit: FloatArray,
+    contrast: FloatArray,
+    noise: float,
+) -> list[tuple[Flag, BoolArray]]:
+    """Return what shows candidates to be no targets, whatever else is in the photograph.
+
+    Args:
+        unevenness: largest mean residual on an eighth of the edge over the contrast, shape (k,).
+        lobes: amplitude of harmonics 3 and 4 of the outline, radii, shape (k,).
+        lobes_sigma: standard deviation of one of their components by the noise, radii, shape (k,).
+        strokes: share of the circumference where the background is only a thin stroke, shape (k,).
+        noise_of_fit: standard deviation of the intensities about the fit, shape (k,).
+        contrast: step of intensity, positive, shape (k,).
+        noise: standard deviation of the intensities of the photograph.
+
+    Returns:
+        Each reason and which candidates it is against, shape (k,).
+    """
+    limit = LOBES + LOBES_SIGMAS * lobes_sigma
+    return [
+        (Flag.UNEVEN_EDGE, unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+        (Flag.LOBED, lobes > limit),
+        (Flag.THIN_BACKGROUND, (strokes > STROKES) & (lobes > limit / 2)),
+        (Flag.POOR_FIT, noise_of_fit / contrast > POOR_FIT + noise / contrast),
+    ]
 
 
 def _some_of(fits: EllipseFits, some: IntArray) -> EllipseFits:
@@ -164,7 +200,7 @@ def _repaired(
     fits.theta[cut, :2] -= px.T[cut]
     softness = float(np.median((fits.theta[:, BLUR] / _radii(fits.theta))[sound])) if sound.any() else 0.0
     rise = rise_to_first(h[sound], weight[sound], softness)
-    return fits, variance, judge_outlines(fits.shape, variance, sound, rise)
+    return fits, variance, judge_outlines(outline_shape(fits.shape), variance, sound, rise)
 
 
 def _variances(fits: EllipseFits, least: float) -> FloatArray:
@@ -182,8 +218,18 @@ def _deviations(
     """
     fitted, contrast = np.isfinite(fits.cofactor[:, 0, 0]), np.abs(fits.theta[:, CONTRAST])
     variance = _variances(fits, least_variance)
-    sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < UNEVEN_EDGE)
-    sound &= fits.statistics[:, goodness.STROKES] <= STROKES
+    outlines, noise = outline_shape(fits.shape), math.sqrt(variance_of_noise)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        against = unlike_targets(
+            unevenness=fits.statistics[:, goodness.UNEVENNESS],
+            lobes=outlines.lobes,
+            lobes_sigma=noise * np.sqrt(outlines.lobes_cofactor),
+            strokes=fits.statistics[:, goodness.STROKES],
+            noise_of_fit=np.sqrt(variance),
+            contrast=contrast,
+            noise=noise,
+        )
+    sound = fitted & keep.all(axis=1) & ~np.any([unlike for _, unlike in against], axis=0)
     if fitted.any():
         sound &= contrast > MIN_CONTRAST * np.percentile(contrast[fitted], 90)
     if sound.sum() >= MIN_POPULATION:
