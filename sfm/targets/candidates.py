@@ -89,8 +89,8 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
     """Return which of the good candidates are no targets because of what is about or inside of them.
 
     Of concentric ellipses the smallest is kept: a retro-reflective dot with a dark rim in glare is seen as
-    bright dot and, larger, as the dark rim. What is in another candidate but not concentric, of the polarity
-    that fewer targets of the photograph have, is a stain.
+    bright dot and, larger, as the dark rim. What is in another candidate and not shown to be concentric, of
+    the polarity that fewer targets of the photograph have, is a stain.
     """
     duplicate = np.zeros(len(fit.xy), dtype=bool)
     p, q, r = fit.shape.T
@@ -111,7 +111,8 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
         distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
         larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
         smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])
-        apart = distance > ECCENTRIC * radius[i] + ECCENTRIC_SIGMAS * (sigma[i] + typical)
+        tolerance = ECCENTRIC_SIGMAS * (sigma[i] + typical)
+        apart = (distance > ECCENTRIC * radius[i] + tolerance) | (tolerance > CONCENTRIC * radius[i])
         stained = larger & (distance < radius[near]) & apart & (sign[near] == usual)
         if sign[i] != usual:
             duplicate[i] = stained.any()

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
+from datasets.bridge import render
 from sfm.conventions import AnyArray, FloatArray
+from sfm.rendering.render import render_photographs
+from sfm.targets.candidates import find_duplicates
 from sfm.targets.detect import find_targets
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import damage, undamaged
@@ -16,6 +21,7 @@ from sfm.targets.fits.damage import MIN_POPULATION, common_shape, find_damage, g
 from sfm.targets.fits.outline_noise import moderate, rise_to_first
 from sfm.targets.fits.undamaged import _stands_out
 from sfm.targets.flags import Flag
+from sfm.targets.measure import EllipseFit
 from tests.synthetic import seed_of
 from tests.targets.shapes import measure_class, over_stated
 
@@ -156,6 +162,30 @@ def test_shape_is_not_damage_and_sigma_is_true(name: str, size: tuple[float, int
     assert 0.8 < over_stated(measured, ~damaged) < 1.3
 
 
+def test_cells_of_codes_are_no_population_of_dots() -> None:
+    """Before: sigmas of 0.024 px where 0.008 is true, and cells of the codes in the edges of the dots."""
+    staging = render.staging("second")
+    photographs, truths = render_photographs(
+        staging.scene,
+        staging.camera,
+        staging.positions[:2],
+        staging.rotations[:2],
+        optics=staging.optics,
+        seed=seed_of("bridge").integers(1 << 31),
+    )
+    normalised, error = [], []
+    for photograph, truth in zip(photographs, truths, strict=True):
+        found = find_targets(photograph)
+        for xy in truth.outline_centre[truth.visible]:
+            at = int(np.hypot(*(found.xy - xy).T).argmin())
+            assert not found.flag[at] & Flag.DAMAGED
+            error.append(found.xy[at] - xy)
+            normalised.append(np.linalg.solve(np.linalg.cholesky(found.covariance[at]), error[-1]))
+    assert len(error) > 80
+    assert np.sqrt(np.mean(np.square(error))) < 0.009
+    assert 0.8 < np.sqrt(np.mean(np.square(normalised))) < 1.2
+
+
 def test_nicks_are_left_out_and_widen_the_sigma() -> None:
     """Before: 1.71 of the stated sigma."""
     measured, damaged, _ = measure_class("nick", ((25.0, 5),))
@@ -196,6 +226,19 @@ def test_rings_are_measured_at_their_holes_and_stains_are_not() -> None:
         stained = find_targets(picture_of([*GRID, (x + shift, y, 8.0, 200.0)]))
         assert (stained.polarity == -1).all() and len(stained) >= 24
         assert np.hypot(*(stained.xy[:, None] - np.array(GRID)[:, :2]).T).min(axis=0).max() < 0.1
+
+
+@pytest.mark.parametrize(("sigma", "duplicate"), [(0.01, False), (0.5, False), (0.95, True)])
+def test_a_hole_must_be_shown_to_be_concentric(sigma: float, duplicate: bool) -> None:
+    """Five of its sigmas are less than half its radius."""
+    radius, sigmas = np.array([14.0, 8.0, 14.0]), np.array([0.02, sigma, 0.02])
+    fit = SimpleNamespace(
+        xy=np.array([(0.0, 0.0), (0.1, 0.1), (60.0, 0.0)]),
+        shape=np.column_stack([1 / radius, 0 * radius, 1 / radius]),
+        covariance=sigmas[:, None, None] ** 2 * np.eye(2),
+    )
+    found = find_duplicates(cast(EllipseFit, fit), np.array([-1, 1, -1]), np.zeros(3, np.int64))
+    assert found.tolist() == [not duplicate, duplicate, False]
 
 
 @pytest.mark.parametrize(("radius", "rejected"), [(3.2, True), (7.0, False)])
