@@ -15,16 +15,16 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import alternatives, columns, families, hypotheses, refit, score
 from sfm.adjustment.hypotheses.alternatives import (
-    NONE,
-    Spread,
     alternatives_of,
     is_significant,
 )
 from sfm.adjustment.hypotheses.columns import Columns, columns_of, interior_columns
 from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.score import (
+    NONE,
     Gain,
     Reduced,
+    Spread,
     gain_of,
     least_share,
     log_f_sf,

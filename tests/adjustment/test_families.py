@@ -23,7 +23,7 @@ from sfm.adjustment.hypotheses.hypotheses import (
     remark_of,
 )
 from sfm.adjustment.hypotheses.refit import Refit, log_likelihood, shifts_of
-from sfm.adjustment.hypotheses.score import Gain, log_likelihood_gain
+from sfm.adjustment.hypotheses.score import NONE, Gain, Spread, log_likelihood_gain
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
@@ -66,6 +66,7 @@ def alternative(
             pattern,
             np.array(factor, dtype=float),
             Gain(9.0, 1, np.ones(1)),
+            NONE,
             log_p,
             5.0,
             search,
@@ -311,7 +312,8 @@ def test_beside_a_first_cause_what_photographs_differ_by_anyhow_explains_nothing
     """Not of the first one, a large error of which makes them differ, nor of a parameter of all of them."""
     plain = replace(alternative("strain"), gain=Gain(80.0, 1, np.ones(1)))
     plain = replace(plain, evidence=log_likelihood_gain(plain.gain.value, 200) - plain.price)
-    differing = replace(plain, family=alternative("c").family, evidence=plain.evidence - 12.0)
+    spread = Spread(1.3, 200, among=False)  # a gain of 45 is one of 32
+    differing = replace(plain, family=alternative("c").family, spread=spread)
     held = replace(differing, family=alternative("held", "all").family, parameters=((0, 1),))
     for second, holds in ((differing, False), (held, True)):
         gains = {id(plain): 40.0, id(second): 45.0}

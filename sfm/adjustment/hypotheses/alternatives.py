@@ -30,14 +30,15 @@ from sfm.adjustment.hypotheses.families import (
     format_columns,
 )
 from sfm.adjustment.hypotheses.score import (
+    NONE,
     Gain,
     Reduced,
+    Spread,
     determined_inverse,
     gain_of,
     gains_of,
     least_share,
     log_f_sf,
-    log_likelihood_gain,
     log_probability,
     points_by_cameras,
 )
@@ -94,23 +95,6 @@ def price_of(rank: int, touched: int, search: float) -> float:
     return float(rank / 2 * np.log(2 * max(touched, 2)) + search)
 
 
-@dataclass(frozen=True)
-class Spread:
-    """How much parts that an alternative does not concern differ among themselves, over what chance makes.
-
-    Image points of one photograph have errors in common that no weight states: the lens, its shutter, light
-    from one side. Photographs then differ, each in its way, and what differs in some of them must be larger
-    than that. So must points, of which each has errors of its target.
-    """
-
-    factor: float = 1.0  # of the variance
-    redundancy: int = 10**9  # by which it is known
-    among: bool = True  # whether an alternative that concerns some of the parts was chosen from them
-
-
-NONE = Spread()
-
-
 def _made(
     reduced: Reduced,
     family: Family,
@@ -130,20 +114,14 @@ def _made(
     if len(some):
         on &= np.isin(reduced.point, some)
     touched = int(on.sum()) // parts
-    over = max(spread.factor, 1.0)
-    evidence = log_likelihood_gain(gain.value, r)
     log_p = log_probability(gain.value, gain.rank, r)
-    if over > 1:
-        left = max(r - gain.value, 1.0) / r  # of the variance factor
-        f = gain.value / max(gain.rank, 1) / over / left
+    if spread.factor > 1:
+        f = spread.ratio(gain.value, gain.rank, r)
         log_p = max(log_p, log_f_sf(f, gain.rank, spread.redundancy)) if gain.rank else 0.0
-        if spread.among:
-            evidence = min(evidence, spread.redundancy / 2 * np.log1p(f * gain.rank / spread.redundancy))
-        else:
-            evidence = log_likelihood_gain(gain.value / over, r)
     price = price_of(gain.rank, touched, search)
+    evidence = spread.evidence(gain.value, gain.rank, r) - price
     return Alternative(
-        *(family, pattern, factor, gain, log_p, price, search, evidence - price), some, parameters
+        *(family, pattern, factor, gain, spread, log_p, price, search, evidence), some, parameters
     )
 
 

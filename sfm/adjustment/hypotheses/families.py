@@ -22,7 +22,7 @@ from sfm.adjustment.hypotheses.columns import (
     object_fields,
     shared_columns,
 )
-from sfm.adjustment.hypotheses.score import Gain
+from sfm.adjustment.hypotheses.score import Gain, Spread
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.remarks.remark import Quantity
@@ -41,6 +41,7 @@ class Alternative:
     pattern: str  # single | split | linear | alternating | group | each | all
     factor: FloatArray  # of each photograph, (m,)
     gain: Gain
+    spread: Spread  # of the parts that it does not concern
     log_p: float  # ln of the probability by chance
     price: float  # q / 2 ln n and ln of the number of patterns and sets from which it was taken
     search: float  # the latter

@@ -146,7 +146,7 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
         if of_kind[cause[0]] <= MAX_TRIED:
             tried.append((one, refit(plain, one, current, before)))
     holding = [
-        (found.gain - one.price - (_shared_by_chance(one, reduced) if causes else 0.0), one, found)
+        ((_beyond_spread(one, found.gain, reduced) if causes else found.gain) - one.price, one, found)
         for one, found in tried
         if found is not None
     ]
@@ -167,14 +167,15 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
     return Cause(best, adjusted, near)
 
 
-def _shared_by_chance(one: Alternative, reduced: Reduced) -> float:
-    """Return how much of the evidence of an alternative is no more than photographs differ anyhow.
+def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
+    """Return the gain of ln likelihood by another cause beyond what photographs differ by anyhow.
 
     Of the first cause it is not known: the same large error makes photographs differ.
     """
     if isinstance(one.family, InteriorFamily):
-        return 0.0
-    return log_likelihood_gain(one.gain.value, reduced.redundancy) - one.price - one.evidence
+        return gain
+    squares = reduced.redundancy * -np.expm1(-2 * gain / reduced.redundancy)  # as in `log_likelihood_gain`
+    return one.spread.evidence(float(squares), one.gain.rank, reduced.redundancy)
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:

@@ -382,3 +382,35 @@ def log_likelihood_gain(gain: float, redundancy: int) -> float:
     """
     left = max(redundancy - gain, np.finfo(float).tiny)
     return float(redundancy / 2 * (np.log(redundancy) - np.log(left)))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How much parts that an alternative does not concern differ among themselves, over what chance makes.
+
+    Image points of one photograph have errors in common that no weight states: the lens, its shutter, light
+    from one side. Photographs then differ, each in its way, and what differs in some of them must be larger
+    than that. So must points, of which each has errors of its target.
+    """
+
+    factor: float = 1.0  # of the variance
+    redundancy: int = 10**9  # by which it is known
+    among: bool = True  # whether an alternative that concerns some of the parts was chosen from them
+
+    def ratio(self, gain: float, q: int, redundancy: int) -> float:
+        """Return how much larger a gain of v'Pv by q parameters is than the parts differ, for each."""
+        left = max(redundancy - gain, 1.0) / redundancy  # of the variance factor
+        return gain / max(q, 1) / max(self.factor, 1.0) / left
+
+    def evidence(self, gain: float, q: int, redundancy: int) -> float:
+        """Return by how much ln of the likelihood grows, q parameters not yet paid for."""
+        grows = log_likelihood_gain(gain, redundancy)
+        if self.factor <= 1:
+            return grows
+        if not self.among:
+            return log_likelihood_gain(gain / self.factor, redundancy)
+        f = self.ratio(gain, q, redundancy)
+        return min(grows, float(self.redundancy / 2 * np.log1p(f * q / self.redundancy)))
+
+
+NONE = Spread()

@@ -25,7 +25,7 @@ from sfm.adjustment.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
-from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, directions_of, reduce_adjustment
+from sfm.adjustment.hypotheses.score import DETERMINED, NONE, Gain, Reduced, directions_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
@@ -76,7 +76,8 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     for owner in interior_parameters(a, HELD):
         for some in owner:
             yield Alternative(
-                *(HELD, "all", np.ones(reduced.photographs), nothing, 0.0, 0.0, 0.0, 0.0), parameters=some
+                *(HELD, "all", np.ones(reduced.photographs), nothing, NONE, 0.0, 0.0, 0.0, 0.0),
+                parameters=some,
             )
     m = reduced.photographs
     if m < 2 * MIN_GROUP:
@@ -84,7 +85,7 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     half = (np.arange(m) >= m // 2).astype(float)
     search = float(np.log(m - 2 * MIN_GROUP + 1))
     for family in (*CAMERA_FAMILIES, STRAIN):
-        yield Alternative(family, "split", half, nothing, 0.0, 0.0, search, 0.0)
+        yield Alternative(family, "split", half, nothing, NONE, 0.0, 0.0, search, 0.0)
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns) -> float:
