@@ -12,6 +12,7 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.codes.ring_reading import UNCODED
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
+from sfm.targets.fits.blurred_ellipse import BLUR
 from sfm.targets.fits.undamaged import unlike_targets
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
@@ -23,9 +24,8 @@ CONCENTRIC = 0.5
 ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
 # Parts of an unreadable code are smaller than this share of its dot.
 PART_OF_DOT = 0.75
-# Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
-SOFTEST_EDGE = 0.35
-SOFTEST_EDGE_PX = 1.3
+# Softest edge: this share of the minor semi-axis, or this blur in px where that is more, and so many sigmas.
+SOFTEST_EDGE, SOFTEST_EDGE_PX, BLUR_SIGMAS = 0.35, 1.3, 3.0
 # Share of the rays on which a stroke ends, and on which something else begins behind it. No ring of up to 20
 # cells is set on so much of the circumference: even parity leaves at least two of them clear.
 CLOSED, CROWDED = 0.95, 0.08
@@ -66,7 +66,11 @@ def judge_fits(
             (Flag.TOO_LARGE, ~(2 * a <= max_diameter_px)),
             (Flag.TOO_OBLIQUE, b / a < MIN_AXIS_RATIO),
             (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, MIN_STEP * scale)),
-            (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
+            (
+                Flag.BLURRED,
+                fit.blur - BLUR_SIGMAS * np.sqrt(fit.full_covariance[:, BLUR, BLUR])
+                > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX),
+            ),
             *unlike_targets(
                 unevenness=fit.unevenness,
                 lobes=fit.lobes,
@@ -111,8 +115,10 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
         distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
         larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
         smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])
-        tolerance = ECCENTRIC_SIGMAS * (sigma[i] + typical)
-        apart = (distance > ECCENTRIC * radius[i] + tolerance) | (tolerance > CONCENTRIC * radius[i])
+        inner = np.where(larger, i, near)
+        tolerance = ECCENTRIC_SIGMAS * (sigma[inner] + typical)
+        apart = distance > ECCENTRIC * radius[inner] + tolerance
+        apart |= tolerance > CONCENTRIC * radius[inner]
         stained = larger & (distance < radius[near]) & apart & (sign[near] == usual)
         if sign[i] != usual:
             duplicate[i] = stained.any()
