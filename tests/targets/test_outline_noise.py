@@ -138,7 +138,7 @@ def test_an_exponent_is_used_from_two_sigmas_on() -> None:
 
 def test_what_is_unlike_the_others() -> None:
     sound = np.arange(41) > 0
-    for scatter, limit in ((0.0, 1.0), (0.4, 2.0)):  # 5 sigmas of 0.2 at least
+    for scatter, limit in ((0.0, 0.5), (0.4, 2.0)):  # 5 sigmas of 0.1 at least
         others = np.exp(scatter * np.where(np.arange(40) % 2, 1, -1) / damage.MAD)
         for z, unlike in ((0.75 * limit, False), (1.3 * limit, True)):
             assert _stands_out(np.append(math.exp(z), others), sound)[0] == unlike

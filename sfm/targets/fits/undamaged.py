@@ -34,8 +34,8 @@ SKIRT_BLURS = 1.5
 # Largest residual inside of whole targets, in robust sigmas of those there.
 MAX_INSIDE = 8.0
 # What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike
-# the others. Their scatter is this at least: noise and paper differ by a tenth, variances by a fifth.
-POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.2
+# the others. Their scatter is that of the variance of 200 pixels at least.
+POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
 MIN_CURVATURE_BLURS = 2.0
 # Smaller targets have too few pixels to tell damage from another shape.
