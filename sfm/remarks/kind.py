@@ -68,6 +68,7 @@ class Kind:
     cause: str  # why it happens
     remedy: str  # what to do
     short: str = ""  # what it is called in the sentences of others, whose subjects have its name
+    explains: tuple[str, ...] = ()  # kinds that follow from it, whose remedies would mislead beside it
 
     @property
     def fields(self) -> frozenset[str]:

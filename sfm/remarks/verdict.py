@@ -45,13 +45,15 @@ class Verdict:
 
 
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
-    """Return the verdict on a result.
+    """Return the verdict on a result; what others of its remarks explain is left out.
 
     Args:
         remarks: all that was found, in the order in which it is to be read within a severity.
         headlines: what each level means for this kind of result.
     """
     every = tuple(remarks)
+    explained = {kind for one in every for kind in one.row.explains}
+    every = tuple(one for one in every if one.kind not in explained)
     order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order)

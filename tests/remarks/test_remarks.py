@@ -75,6 +75,19 @@ def test_the_most_serious_remark_decides_and_comes_first() -> None:
     assert verdict.remarks == (serious, warning, mild)
 
 
+def test_what_another_remark_explains_is_left_out() -> None:
+    held = remark("interior_held_of_pair", camera="A", parameters=("c",))
+    high = remark("sigma0_high", ratio=9.0, stated=(0.1, "px"))
+    other = remark("two_photographs")
+    assert judge([high, other, held], HEADLINES).remarks == (held, other)
+    assert judge([high, other], HEADLINES).remarks == (high, other)
+
+
+def test_every_kind_that_is_explained_is_known() -> None:
+    for row in KINDS.values():
+        assert set(row.explains) <= set(KINDS)
+
+
 def test_every_row_has_a_cause_and_a_remedy_and_is_a_sentence() -> None:
     for name, row in KINDS.items():
         assert row.name == name

@@ -21,7 +21,7 @@ from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import measure_targets
-from tests.surveys import code_centres, write_observed_survey, write_photograph_survey
+from tests.surveys import C_MM, code_centres, write_observed_survey, write_photograph_survey
 
 FREE = '["c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"]'
 
@@ -56,7 +56,22 @@ def test_two_photographs_are_a_survey_that_says_what_it_cannot_tell(survey: Surv
     assert error_mm(a.network.points, a.estimate.points) < 0.1
     (held,) = of_kind(result.remarks, "interior_held_of_pair")
     assert held.names("parameters") == ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
-    assert of_kind(findings_of(result).verdict.remarks, "two_photographs")
+    verdict = findings_of(result).verdict
+    assert verdict.level == "bad" and of_kind(verdict.remarks, "two_photographs")
+
+
+def test_a_calibrated_pair_is_good_and_says_what_it_rests_on(survey: Survey) -> None:
+    cameras = tuple(one.model_copy(update={"c_mm": C_MM, "free": ()}) for one in survey.cameras)
+    result = run_survey(replace(survey, cameras=cameras))
+    a = result.adjustment
+    assert len(a.network.images) == 2
+    verdict = findings_of(result).verdict
+    assert verdict.level == "good"
+    assert len(of_kind(verdict.remarks, "held_weakly_tested", "two_photographs")) == 2
+    truth = np.array([code_centres()[int(name)] for name in a.network.points])
+    error = fit_similarity(truth, a.estimate.points).apply(truth) - a.estimate.points
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
 
 
 def test_points_of_a_plane_and_the_circles_in_it(survey: Survey, measured: Measurements) -> None:

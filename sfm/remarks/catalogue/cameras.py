@@ -23,12 +23,13 @@ ROWS = (
     ),
     Kind(
         "interior_held_of_pair",
-        "warning",
-        "{parameters} of camera {camera} {parameters:was|were} held fixed at the start values, which two "
-        "photographs do not determine.",
+        "error",
+        "Camera {camera} is not calibrated, and two photographs do not calibrate it: {parameters} "
+        "{parameters:was|were} held fixed at the start values.",
         "an error of c scales the depth, one of the distortion bends the object; standard deviations do not "
         "contain it",
         "Give a calibrated camera, or add photographs.",
+        explains=("c_held_contradicted", "held_parameter", "scale_contradicted", "sigma0_high"),
     ),
     Kind(
         "pair_contradicted",

@@ -44,7 +44,7 @@ ROWS = (
         "The image points contradict the held values of {parameters} of camera {camera}"
         f"[[: held at {{value}}, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
         "a calibration that does not describe these photographs",
-        "Add the parameters to free, or calibrate the camera anew.",
+        "Calibrate the camera anew, or free the parameters if there are three photographs or more.",
         short="wrong held parameters",
     ),
     Kind(
