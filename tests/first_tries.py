@@ -157,7 +157,7 @@ TRIES = (
     Try(
         "no overlap", "4 of 10 photographs share two points with the others",
         lambda folder: _image_points(folder, _halves(10, 4)), 0,
-        ("are not connected with the 6 oriented photographs", "with only 21, 22 in common"),
+        ("are not connected with the 6 oriented photographs", "with only points 21, 22 in common"),
     ),
     Try(
         "most photographs lost", "7 of 12 photographs see nothing that another sees",
