@@ -125,8 +125,16 @@ def resect(
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option("--tolerance", metavar="MM", help="Largest residual of a good point for robust, mm."),
+        typer.Option(
+            "--tolerance",
+            metavar="MM",
+            help="Largest residual of a good point for robust, mm; from the data if not given.",
+        ),
     ] = None,
+    opposite_signs: Annotated[
+        bool,
+        typer.Option("--opposite-signs", help="Distortion is subtracted from what was measured, not added."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
 ) -> None:
     """Orient one photograph on known points.
@@ -140,7 +148,14 @@ def resect(
         from sfm.survey.inputs.resection_points import read_task
 
     with working_on(str(points)):
-        task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+        task = read_task(
+            points,
+            c_mm=c,
+            camera_file=camera,
+            start=start,
+            tolerance_mm=tolerance,
+            opposite_signs=opposite_signs,
+        )
     if method == "all":
         found = resect_by_all(task)
         text = comparison_table(found, task.c)

@@ -24,6 +24,7 @@ from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
 from sfm.orientation.resection.ransac import resect_robust
+from sfm.orientation.resection.unknown_noise import resect_unknown_noise
 from sfm.orientation.resection.zeng_wang import resect_zeng_wang
 
 START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
@@ -42,7 +43,7 @@ class Task:
     points: FloatArray  # object points, object unit, (n, 3)
     c: float  # principal distance, mm
     start: FloatArray | None  # X0, Y0, Z0 [, omega, phi, kappa in rad], (3,) or (6,)
-    tolerance_mm: float  # of `robust`, mm
+    tolerance_mm: float | None = None  # of `robust`, mm; from the data if not given
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,11 @@ def _dlt(task: Task) -> Resected:
 
 def _robust(task: Task) -> Resected:
     uv, xyz = checked_points("robust", task.tangents, task.points, needed=4)
-    result = resect_robust(uv, xyz, tolerance=task.tolerance_mm / task.c)
+    result = (
+        resect_unknown_noise(uv, xyz)
+        if task.tolerance_mm is None
+        else resect_robust(uv, xyz, tolerance=task.tolerance_mm / task.c)
+    )
     if not result.found:
         raise GeometryError(f"robust: {result.reason}")
     return Resected(

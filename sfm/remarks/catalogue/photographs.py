@@ -16,8 +16,8 @@ ROWS = (
         "not_connected",
         "warning",
         "{photographs} {photographs:is|are} not connected with the {oriented} oriented "
-        "photographs[[, with only {shared:point|points} {shared} in common]].[[ A photograph that shows {needed} of points "
-        "{points} and {needed} of {others} connects them.]]",
+        "photographs[[, with only {shared:point|points} {shared} in common]].[[ A photograph that "
+        "shows {needed} of points {points} and {needed} of {others} connects them.]]",
         "groups of photographs with too few common points",
         "Add a photograph that shows points of both groups.",
     ),

@@ -12,8 +12,8 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.orientation.resection.by_method import Task
 
-TOLERANCE = 1e-3  # of c: the tolerance of `robust` if none is given, some px of a usual camera
-_CAMERA = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
+_DISTORTION = ("K1", "K2", "K3", "P1", "P2", "b1", "b2")
+_CAMERA = ("c", "x0", "y0", *_DISTORTION)
 _UNIT_PIXEL = np.array([1.0, 1.0])
 
 
@@ -24,6 +24,7 @@ def read_task(
     camera_file: Path | None = None,
     start: str | None = None,
     tolerance_mm: float | None = None,
+    opposite_signs: bool = False,
 ) -> Task:
     """Return the points of a photograph from files.
 
@@ -33,7 +34,8 @@ def read_task(
         camera_file: CSV with parameter,value[,...] for c, x0, y0, K1-K3, P1, P2, b1, b2 of `brown`
             (corrections of the measured point, mm).
         start: "X,Y,Z" or "X,Y,Z,omega,phi,kappa" with angles in deg.
-        tolerance_mm: largest residual that `robust` takes for right, mm; c/1000 if not given.
+        tolerance_mm: largest residual that `robust` takes for right, mm; from the data if not given.
+        opposite_signs: whether distortion is subtracted from measured coordinates, as some programs do.
 
     Raises:
         SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or there
@@ -41,6 +43,8 @@ def read_task(
     """
     names, points, xy = _read_points(points_file)
     values = _read_camera(camera_file) if camera_file is not None else {}
+    if opposite_signs:
+        values |= {name: -values[name] for name in _DISTORTION if name in values}
     if c_mm is not None:
         values["c"] = c_mm
     if "c" not in values:
@@ -53,7 +57,7 @@ def read_task(
     )
     tangents = tangents_from_pixel(camera, pixel_from_image(xy, (1, 1), _UNIT_PIXEL))
     c = values["c"]
-    return Task(names, xy, tangents, points, c, _parse_start(start), tolerance_mm or TOLERANCE * c)
+    return Task(names, xy, tangents, points, c, _parse_start(start), tolerance_mm)
 
 
 def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:

@@ -1,0 +1,130 @@
+"""Space resection from many points of which some are wrong, whatever their noise.
+
+Right points have one standard deviation, wrong ones lie anywhere in the photograph. Which are right is what
+makes the measurements most likely; these are adjusted by least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import gammaln
+
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.orientation.resection.least_squares import UNKNOWNS, Resection, pose_normals, resect_least_squares
+from sfm.orientation.resection.ransac import SAMPLE, RobustResection, resect_robust
+
+# Tolerances that are tried, tangents: from a tenth of the principal distance down to what no camera reaches.
+TOLERANCES = 0.1 * 0.5 ** np.arange(17)
+# Smallest residual that counts, tangents: coordinates are given with so many digits.
+LEAST_RESIDUAL = 1e-9
+ROUNDS = 20  # of least squares and new choice of the right points
+
+
+def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int = 0) -> RobustResection:
+    """Return the exterior orientation that makes the measured points most likely, their noise unknown.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
+        points: object points, shape (n, 3), object unit.
+        seed: of the choice of triples; the same seed gives the same result.
+
+    Returns:
+        The orientation by least squares over the right points, or the reason why there is none.
+
+    Source: Torr and Zisserman (2000), MLESAC, CVIU 78, for the mixture; the standard deviation is integrated
+    out, Box and Tiao (1973), Bayesian Inference in Statistical Analysis, sec. 2.7.
+    """
+    uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
+    xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
+    field = max(float(np.prod(np.ptp(uv, axis=0))), LEAST_RESIDUAL) if len(uv) else 1.0
+    best, most = None, -(len(uv) - SAMPLE) * np.log(field)  # three points fit whatever they are
+    failure = None
+    for tolerance in TOLERANCES:
+        if best is not None and tolerance < best.sigma0:  # all that is tighter loses right points
+            break
+        start = resect_robust(uv, xyz, tolerance=float(tolerance), seed=seed)
+        failure = failure or start
+        if not start.found:
+            continue
+        one, likelihood = _settled(uv, xyz, start, field)
+        if likelihood > most:
+            best, most = one, likelihood
+    assert failure is not None
+    if best is not None:
+        return best
+    return replace(failure, reason=failure.reason or "its points fit no better than random ones")
+
+
+def _settled(
+    uv: FloatArray, xyz: FloatArray, start: RobustResection, field: float
+) -> tuple[RobustResection, float]:
+    """Return the orientation by least squares over the right points, and ln of its likelihood."""
+    residuals = start.residuals
+    used, likelihood = _right_points(residuals, field)
+    X0, R, found = start.position, start.rotation, None
+    for _ in range(ROUNDS):
+        try:
+            trial = resect_least_squares(uv[used], xyz[used], X0, R)
+        except GeometryError:
+            break
+        others, normal_matrix = _normals(uv, xyz, used, trial)
+        again, better = _right_points(others, field)
+        if found is not None and better <= likelihood:
+            break
+        found, residuals, likelihood, X0, R = trial, others, better, trial.position, trial.rotation
+        N = normal_matrix
+        taken, used = used, again
+        if (taken == again).all():
+            break
+    if found is None:
+        return start, -np.inf
+    return (
+        replace(
+            start,
+            position=found.position,
+            rotation=found.rotation,
+            inliers=taken,
+            residuals=residuals,
+            rms=found.rms,
+            sigma0=found.sigma0,
+            sigma=found.sigma0,
+            normal_matrix=N,
+        ),
+        likelihood,
+    )
+
+
+def _right_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float]:
+    """Return which points are right, (n,), and ln of the likelihood.
+
+    Args:
+        residuals: of all points, tangents, NaN behind the camera, shape (n, 2).
+        field: area over which wrong points are spread, squared tangents.
+    """
+    n = len(residuals)
+    squares = np.sum(residuals**2, axis=1)
+    squares = np.maximum(np.where(np.isfinite(squares), squares, np.inf), LEAST_RESIDUAL**2)
+    order = np.argsort(squares, kind="stable")
+    k = np.arange(SAMPLE + 1, n + 1)
+    half = k - UNKNOWNS / 2  # of the redundancy
+    right = gammaln(half) - half * np.log(np.pi * np.cumsum(squares[order])[k - 1])
+    choice = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
+    likelihood = right - (n - k) * np.log(field) - choice
+    at = int(np.argmax(likelihood))
+    used = np.zeros(n, dtype=bool)
+    used[order[: k[at]]] = True
+    return used, float(likelihood[at])
+
+
+def _normals(
+    uv: FloatArray, xyz: FloatArray, used: BoolArray, found: Resection
+) -> tuple[FloatArray, FloatArray]:
+    """Return computed - measured of all points, tangents, NaN behind the camera, (n, 2), and N of some."""
+    n = len(uv)
+    N, residuals = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((n, 2))
+    weights = np.ascontiguousarray(np.broadcast_to(np.eye(2), (n, 2, 2)))
+    pose_normals(uv, xyz, weights, used, found.position, found.rotation, N, np.empty(UNKNOWNS), residuals)
+    return residuals, N
