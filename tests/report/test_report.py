@@ -109,7 +109,12 @@ def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> 
     write_tables(findings_of(result), tmp_path)
     a = result.adjustment
     points = rows_of(tmp_path / "points.csv")
-    assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"]
+    seen = ["rays", "code", "angle_deg", "rms_px"]
+    limiting = ["limiting_sX", "limiting_sY", "limiting_sZ"]
+    assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", *seen, *limiting]
+    limits = np.array([[float(row[name]) for name in limiting] for row in points])
+    held = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
+    np.testing.assert_allclose(limits, held, rtol=1e-14)
     assert [row["id"] for row in points] == list(a.network.points)
     np.testing.assert_array_equal([[float(row[c]) for c in "XYZ"] for row in points], a.estimate.points)
     variances = np.array([[float(row[f"s{c}"]) for c in "XYZ"] for row in points]) ** 2

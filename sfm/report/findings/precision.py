@@ -15,6 +15,7 @@ class Precision:
     """Standard deviations of points and photographs; of X, Y, Z or omega, phi, kappa, and of all together."""
 
     points: FloatArray  # of each coordinate, 0 where fixed, object unit, (n, 3)
+    limiting_points: FloatArray  # the same with the cameras free of error
     exterior: FloatArray  # of each photograph, object unit and rad, (m, 6)
     rms: FloatArray  # of the points, object unit, (4,)
     largest: FloatArray  # of the points, object unit, (4,)
@@ -36,6 +37,7 @@ def precision_of(adjustment: Adjustment) -> Precision:
     rms, largest_of_all, limiting = point_precision(adjustment)
     return Precision(
         _sqrt_diagonal(covariance.points),
+        _sqrt_diagonal(covariance.points_limiting),
         _sqrt_diagonal(covariance.exterior),
         rms,
         largest_of_all,

@@ -26,6 +26,7 @@ class PointRow:
     code: int | None  # code number, None if uncoded
     angle_deg: float  # largest angle between two rays; NaN with fewer than two
     rms_px: float  # root mean square residual per coordinate
+    limiting: FloatArray  # standard deviations with the cameras free of error, object unit, (3,)
 
     @property
     def sigma_length(self) -> float:
@@ -58,6 +59,7 @@ def points_of(result: SurveyResult, precision: Precision, geometry: Geometry) ->
             None if result.code[j] == UNCODED else int(result.code[j]),
             float(geometry.angle_deg[j]),
             float(geometry.point_rms_px[j]),
+            precision.limiting_points[j],
         )
         for j, name in enumerate(network.points)
     )

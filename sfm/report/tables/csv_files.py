@@ -31,7 +31,10 @@ def write_tables(findings: Findings, folder: Path) -> None:
     """Write all tables of a result into an existing folder; `summary.write_summary` adds the figures."""
     adjustment, statistics = findings.result.adjustment, findings.statistics
     for name, header, rows in (
-        ("points", "id,X,Y,Z,sX,sY,sZ,rays,code,angle_deg,rms_px", point_rows(findings)),
+        (
+            *("points", "id,X,Y,Z,sX,sY,sZ,rays,code,angle_deg,rms_px,limiting_sX,limiting_sY,limiting_sZ"),
+            point_rows(findings),
+        ),
         (
             "images",
             "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,"
@@ -66,9 +69,10 @@ def write_tables(findings: Findings, folder: Path) -> None:
 
 
 def point_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return coordinates, sigmas, accepted rays, code, intersection angle and RMS of every point."""
+    """Return coordinates, sigmas, rays, code, intersection angle, RMS and limiting sigmas of every point."""
     for one in findings.points:
-        yield (one.name, *one.xyz, *one.sigma, one.rays, one.code, one.angle_deg, one.rms_px)
+        seen = (one.rays, one.code, one.angle_deg, one.rms_px)
+        yield (one.name, *one.xyz, *one.sigma, *seen, *one.limiting)
 
 
 def photograph_rows(findings: Findings) -> Iterable[Sequence[object]]:

@@ -24,6 +24,7 @@ CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regul
 CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that only checks
 COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
+SEEN_OF_POINTS = ("rays", "code", "angle_deg", "rms_px", "limiting_sX", "limiting_sY", "limiting_sZ")
 SIGMAS_OF_AXES, SIGMAS_OF_ANGLES = ("sX", "sY", "sZ"), ("somega_deg", "sphi_deg", "skappa_deg")
 
 
@@ -290,7 +291,7 @@ def read_points(path: Path) -> KnownPoints:
         ("point",),
         ("X", "Y", "Z"),
         aliases=(("id", "point"),),
-        ignored=("sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"),
+        ignored=(*SIGMAS_OF_AXES, *SEEN_OF_POINTS),
     )
     return KnownPoints(table.keys("point"), table.values, np.zeros_like(table.values))
 
