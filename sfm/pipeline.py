@@ -20,6 +20,7 @@ from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.solution import Correspondences, Solution, solve_survey
 from sfm.survey.assembly import assemble_result
+from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.correspondences import find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
@@ -74,7 +75,7 @@ def _solve(
 ) -> tuple[Orientation, Correspondences, Solution]:
     """Return what orientation, matching and adjustment make of the image points."""
     with clock.stage("orientation"):
-        start = orient_survey(survey, measured)
+        measured, start = agree_on_turns(survey, measured, orient_survey(survey, measured))
     with clock.stage("matching"):
         matched = find_correspondences(survey, measured, start, jobs=jobs)
     with clock.stage("adjustment"):

@@ -138,6 +138,28 @@ def test_a_plate_without_marks_must_be_whole() -> None:
     assert (name_dots(xy[part], radius[part], none[part], NO_MARKS) == -1).all()
 
 
+@pytest.mark.parametrize("side", [6, 7])
+def test_a_square_board_is_named_upright_with_its_first_square_dark(side: int) -> None:
+    """Of an odd number of crossings, squares tell two of four turns; of an even number, none."""
+    squares = np.add.outer(np.arange(side + 1), np.arange(side + 1)) % 2
+    drawn = (
+        np.pad(np.where(squares, 220, 30).astype(np.uint8), 1, constant_values=220)
+        .repeat(40, 0)
+        .repeat(40, 1)
+    )
+    board = PlateFamily("checkerboard", side, side)
+    for turn in range(4):
+        picture = cv2.GaussianBlur(np.rot90(drawn, turn).copy(), (0, 0), 1.0)
+        found = find_targets(picture, codes=board)
+        assert len(found) == board.count
+        xy = found.xy[np.argsort(found.code)].reshape(side, side, 2)
+        across, down = xy[0, 1] - xy[0, 0], xy[1, 0] - xy[0, 0]
+        x, y = np.rint(xy[0, 0] + (across + down) / 2).astype(int)
+        assert picture[y, x] < 100
+        if side == 6 or turn % 2 == 0:
+            assert across[0] > 30
+
+
 @lru_cache
 def photographed(plate: PlateFamily, rings: bool) -> tuple[Targets, FloatArray]:
     """Return the targets of a rendered plate upside down, and where its points are, px."""

@@ -69,9 +69,12 @@ ROWS = (
     Kind(
         "plate_looks_alike_turned",
         "warning",
-        "The plate looks alike turned by 180 degrees: {cameras} may count its points from opposite corners.",
-        "a board with an even number of rows and columns together, or dots without marks, and two cameras",
-        "Do not compare stations of one camera with those of the other; take a plate with marks.",
+        "The plate looks alike turned: {cameras} may count its points from different corners in "
+        "{photographs:photograph} ({photographs}).",
+        "cameras that were not mounted together, photographs that are not of the same moments, or a plate "
+        "that was hardly moved",
+        "Number photographs of one moment alike; otherwise do not compare stations of one camera with those "
+        "of the other, or take a plate with marks.",
     ),
     Kind(
         "board_not_found",

@@ -1,4 +1,4 @@
-"""Photographs in which the calibration plate of a survey was not found or may be turned, and what to do."""
+"""Photographs in which the calibration plate of a survey was not found, and what to do."""
 
 from __future__ import annotations
 
@@ -33,11 +33,3 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         many = round(statistics.median(dots[name] for name in strange))
         remarks.append(remark("plate_not_recognised", photographs=strange, dots=many, size=size))
     return tuple(remarks)
-
-
-def turned_plates(family: TargetFamily | None, photographs: MeasuredPhotographs) -> tuple[Remark, ...]:
-    """Return a remark where two cameras photograph a plate that looks alike turned by 180 degrees."""
-    cameras = sorted({photographs.cameras[k].name for k in photographs.camera})
-    if not isinstance(family, PlateFamily) or not family.is_ambiguous or len(cameras) < 2:
-        return ()
-    return (remark("plate_looks_alike_turned", cameras=cameras),)

@@ -1,11 +1,13 @@
 """Boards as targets: the crossings of checkerboards and ChArUco boards, and which of the board they are.
 
 A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
-follows from its colours (an odd number of rows and columns together) or is taken as it stands in the
-photograph, since the board looks alike turned by 180 degrees.
+follows from its colours, the first square being the dark one. Of the turns that look alike (see
+`PlateFamily.turns`) the one that is upright in the photograph is taken.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -64,19 +66,17 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     across, down = xy[0, -1] - xy[0, 0], xy[-1, 0] - xy[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from behind
         xy = xy[:, ::-1]
-    turned = xy[::-1, ::-1]
-    if (plate.rows + plate.columns) % 2:
-        swap = _first_square(grey, xy) > _first_square(grey, turned)  # the first square is the dark one
-    else:
-        swap = (xy[0, -1] - xy[0, 0])[0] < 0
-    xy = turned if swap else xy
+    ways = [np.rot90(xy, k) for k in ((0, 2) if plate.rows != plate.columns else range(4))]
+    step = len(ways) // (1 + len(plate.turns))  # between those in which the first square has one colour
+    alike = min((ways[k::step] for k in range(step)), key=lambda some: _first_squares(grey, some))
+    xy = max(alike, key=lambda way: float((way[:, -1] - way[:, 0]).mean(axis=0)[0]))
     return xy.reshape(-1, 2), np.arange(plate.count)
 
 
-def _first_square(grey: AnyArray, xy: FloatArray) -> float:
-    """Return the intensity in the middle of the first square inside the crossings."""
-    x, y = xy[:2, :2].reshape(-1, 2).mean(axis=0)
-    return float(cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean())
+def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:
+    """Return the mean intensity in the middle of the first square inside the crossings, in some turns."""
+    middles = [way[:2, :2].reshape(-1, 2).mean(axis=0) for way in ways]
+    return float(np.mean([cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean() for x, y in middles]))
 
 
 def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -67,14 +68,38 @@ class PlateFamily:
         """Whether every second row is shifted by half the pitch."""
         return self.name in GRIDS and GRIDS[self.name].shift > 0
 
+    @cached_property
+    def turns(self) -> tuple[IntArray, ...]:
+        """The turns after which the plate looks alike, none for most: the number each point then has, (n,).
+
+        The colours of its squares tell a checkerboard with an odd number of rows and columns together from
+        one turned by 180 degrees, and one with an odd number of each, as many rows as columns, from one
+        turned by 90 degrees. Marks and tags tell every turn.
+        """
+        if self.marks or self.name == "charuco":
+            return ()
+        fold = GRIDS[self.name].turns if self.name in GRIDS else 4
+        points = self.plane(1.0)[:, :2] @ [1, 1j]
+        points -= points.mean()
+        found = []
+        for turn in range(1, fold):
+            away = np.abs(points[:, None] * np.exp(2j * np.pi * turn / fold) - points)
+            number = away.argmin(axis=1)
+            if away.min(axis=1).max() < ALIKE and self._has_colours_of(number):
+                found.append(number)
+        return tuple(found)
+
+    def _has_colours_of(self, number: IntArray) -> bool:
+        """Return whether the first square inside the crossings has its colour where its corners are put."""
+        if self.name != "checkerboard":
+            return True
+        row, column = np.divmod(number[[0, self.columns + 1]], self.columns)
+        return int(row.min() + column.min()) % 2 == 0
+
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the plate looks alike when it is turned by 180 degrees, so that points have no identity."""
-        if self.marks or self.name == "charuco":
-            return False
-        if self.name in GRIDS:
-            return not self.is_shifted or self.rows % 2 == 0
-        return (self.rows + self.columns) % 2 == 0  # the colours of its squares
+        """Whether the plate looks alike when it is turned, so that points have no identity."""
+        return len(self.turns) > 0
 
     @property
     def places(self) -> IntArray:

@@ -1,0 +1,225 @@
+"""Two cameras before a plate that looks alike turned: the same turn for what both photograph at once.
+
+For one camera any turn of a photograph is as good as another, since the points of the turned plate coincide
+with those of the plate. Between cameras it is not: their relative orientation is that of the rig in one turn
+only. Cameras mounted together have one relative orientation at all places of the plate, which a wrong turn
+has not, unless the plate was not moved. Photographs are of one moment by the last number in their names, or
+by their order.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm.camera import Camera, project
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import f_isf
+from sfm.network import Estimate, rows_of
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.remarks.remark import remark
+from sfm.similarity import fit_similarity
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.orientation import orient_survey
+from sfm.survey.target_network import build_network, name_coded
+from sfm.targets.codes.plates import PlateFamily
+
+RIGS_TRIED = 12  # pairs of photographs, spread over all, whose relative orientation is tried on the others
+OF_A_RIG = 6  # parameters of a relative orientation with its scale
+ALPHA = 0.001  # probability with which turns are taken for certain though others are as true
+
+
+class Pair(NamedTuple):
+    """Two photographs of one moment."""
+
+    left: int  # of the first camera
+    right: int
+
+
+@dataclass(frozen=True)
+class _Rig:
+    """A relative orientation of two cameras, and how pairs of photographs agree with it."""
+
+    turn: IntArray  # of the plate in the right photograph, 0 where it is named alike, (p,)
+    misfit: FloatArray  # RMS distance of its points from where the left photograph places them, px, (p,)
+    agrees: BoolArray  # whether each is nearest to where the point of its number is placed, (p,)
+
+    @classmethod
+    def none(cls, count: int) -> _Rig:
+        """Return one that no pair agrees with."""
+        return cls(np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count, dtype=bool))
+
+    def squares(self, rows: BoolArray) -> float:
+        """Return the sum of the squared misfits of some pairs, px^2."""
+        return float((self.misfit[rows] ** 2).sum())
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """What is less for one that more pairs agree with, and more closely."""
+        return -int(self.agrees.sum()), self.squares(self.agrees)
+
+
+def agree_on_turns(
+    survey: Survey, measured: Measurements, start: Orientation
+) -> tuple[Measurements, Orientation]:
+    """Name the points of a plate that looks alike turned in the same turn for cameras mounted together.
+
+    Args:
+        survey: with the plate.
+        measured: its points in each photograph, in any turn.
+        start: orientation from them.
+
+    Returns:
+        The image points, renamed where the turn was another than that of the first camera, and the
+        orientation from them, with a remark on the photographs of pairs whose turn remains uncertain.
+    """
+    plate, photographs = survey.family, measured.photographs
+    cameras = np.unique(measured.network.camera)
+    if (
+        not isinstance(plate, PlateFamily)
+        or not plate.is_ambiguous
+        or photographs is None
+        or len(cameras) < 2
+    ):
+        return measured, start
+    codes = [found.code for found in photographs.targets]
+    uncertain: set[int] = set()
+    for camera in cameras[1:].tolist():
+        tried = [
+            (pairs, _common_rig(plate, measured, start.estimate, pairs))
+            for pairs in _pairings(measured, int(cameras[0]), camera)
+        ]
+        pairs, rig = max(tried, key=lambda one: 0 if one[1] is None else int(one[1].agrees.sum()))
+        if rig is None:
+            either = np.isin(measured.network.camera, [cameras[0], camera])
+            uncertain |= set(np.flatnonzero(either).tolist())
+            continue
+        uncertain |= {i for k in np.flatnonzero(~rig.agrees) for i in pairs[k]}
+        for k in np.flatnonzero(rig.agrees & (rig.turn > 0)).tolist():
+            right, number = pairs[k].right, plate.turns[int(rig.turn[k]) - 1]
+            codes[right] = np.where(codes[right] >= 0, number[codes[right]], codes[right])
+    if any((found.code != code).any() for found, code in zip(photographs.targets, codes, strict=True)):
+        targets = [replace(found, code=code) for found, code in zip(photographs.targets, codes, strict=True)]
+        photographs = replace(photographs, targets=tuple(targets))
+        naming = name_coded(photographs)
+        network = build_network(survey, photographs, naming)
+        measured = replace(measured, network=network, photographs=photographs, naming=naming)
+        start = orient_survey(survey, measured)
+    uncertain &= set(np.flatnonzero(start.estimate.oriented).tolist())
+    if not uncertain:
+        return measured, start
+    names = [photographs.names[i] for i in sorted(uncertain)]
+    involved = sorted({measured.cameras[measured.network.camera[i]].name for i in uncertain})
+    told = remark("plate_looks_alike_turned", cameras=involved, photographs=names)
+    return measured, replace(start, remarks=(*start.remarks, told))
+
+
+def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair]]:
+    """Return the photographs of two cameras that may be of one moment, by number and by order."""
+    assert measured.files is not None
+    files, row = measured.files, {name: i for i, name in enumerate(measured.network.images)}
+    names = [
+        [name for name, k in zip(files.names, files.camera.tolist(), strict=True) if k == camera]
+        for camera in (first, second)
+    ]
+    numbers = [_numbered(some) for some in names]
+    ways = [[(numbers[0][k], numbers[1][k]) for k in sorted(numbers[0].keys() & numbers[1].keys())]]
+    if len(names[0]) == len(names[1]):
+        ways.append(list(zip(*names, strict=True)))
+    return [_pairs_in(row, some) for some in ways]
+
+
+def _pairs_in(row: dict[str, int], names: Iterable[tuple[str, str]]) -> list[Pair]:
+    """Return pairs of names as rows, those of which both are measured."""
+    return [Pair(row[left], row[right]) for left, right in names if left in row and right in row]
+
+
+def _numbered(names: Sequence[str]) -> dict[int, str]:
+    """Return names by the last number in them; none that two have in common."""
+    found: dict[int, list[str]] = {}
+    for name in names:
+        digits = re.findall(r"\d+", PurePosixPath(name).stem)
+        if digits:
+            found.setdefault(int(digits[-1]), []).append(name)
+    return {number: same[0] for number, same in found.items() if len(same) == 1}
+
+
+def _common_rig(
+    plate: PlateFamily, measured: Measurements, estimate: Estimate, pairs: Sequence[Pair]
+) -> _Rig | None:
+    """Return the relative orientation of two cameras that most pairs agree on; None where two may be true.
+
+    That of other turns may fit as well, if the plate was moved too little. Both have as many unknowns, so
+    that the ratio of their squared misfits decides.
+    """
+    seen = np.flatnonzero([estimate.oriented[list(pair)].all() for pair in pairs])
+    if len(seen) < 2:
+        return None
+    views = _Views(plate, measured, estimate)
+    rigs: dict[bytes, _Rig] = {}
+    for k in seen[np.unique(np.linspace(0, len(seen) - 1, RIGS_TRIED).round().astype(int))]:
+        for turn in range(len(views.turns)):
+            rig = views.compare(pairs, seen, *views.relative_orientation(pairs[k], turn))
+            turns = rig.turn.tobytes()
+            if turns not in rigs or rig.rank < rigs[turns].rank:
+                rigs[turns] = rig
+    best, *others = sorted(rigs.values(), key=lambda one: one.rank)
+    return best if _is_certain(best, others, len(seen)) else None
+
+
+def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int) -> bool:
+    """Return whether most pairs agree with a relative orientation, and with no other as well (F test)."""
+    agreeing = int(best.agrees.sum())
+    if agreeing < 2 or 2 * agreeing <= pairs:
+        return False
+    redundancy = OF_A_RIG * (agreeing - 1)
+    limit = float(f_isf(ALPHA, redundancy, redundancy))
+    rivals = [other for other in others if (other.turn != best.turn)[best.agrees].any()]
+    return all(other.squares(best.agrees) > limit * best.squares(best.agrees) for other in rivals)
+
+
+class _Views:
+    """The photographs of a plate as they are oriented to it."""
+
+    def __init__(self, plate: PlateFamily, measured: Measurements, estimate: Estimate) -> None:
+        network, naming = measured.network, measured.naming
+        assert naming is not None
+        self.turns = (np.arange(plate.count), *plate.turns)
+        self.estimate = estimate
+        self.cameras: list[Camera] = [estimate.cameras[k] for k in network.camera]
+        rows = rows_of(network.image_points.image, len(network.images))
+        self.number = [naming.code[network.image_points.point[some]] for some in rows]
+        self.xy = [network.image_points.xy[some] for some in rows]
+        # approximate points are no plate that looks exactly alike turned
+        plane, known = plate.plane(1.0), estimate.determined
+        self.points = fit_similarity(plane[naming.code[known]], estimate.points[known]).apply(plane)
+
+    def relative_orientation(self, pair: Pair, turn: int) -> tuple[FloatArray, FloatArray]:
+        """Return rotation and base of the right camera in the frame of the left one, its plate turned."""
+        left, right = pair
+        motion = fit_similarity(self.points, self.points[self.turns[turn]], scale=1.0)
+        R, X0 = self.estimate.rotation, self.estimate.position
+        base = motion.apply(X0[right][None])[0] - X0[left]
+        return R[left].T @ motion.rotation @ R[right], R[left].T @ base
+
+    def compare(self, pairs: Sequence[Pair], rows: IntArray, rotation: FloatArray, base: FloatArray) -> _Rig:
+        """Return how some of the pairs, each in its best turn, agree with a relative orientation."""
+        found = _Rig.none(len(pairs))
+        R, X0 = self.estimate.rotation, self.estimate.position
+        for k in rows.tolist():
+            left, right = pairs[k]
+            placed = project(self.cameras[right], X0[left] + R[left] @ base, R[left] @ rotation, self.points)
+            placed[~np.isfinite(placed)] = np.inf  # behind the camera
+            away = np.linalg.norm(self.xy[right][:, None] - placed, axis=2)
+            own = [(np.arange(len(away)), number[self.number[right]]) for number in self.turns]
+            misfit = [float(np.sqrt((away[one] ** 2).mean())) for one in own]
+            turn = int(np.argmin(misfit))
+            found.turn[k], found.misfit[k] = turn, misfit[turn]
+            found.agrees[k] = bool((away.argmin(axis=1) == own[turn][1]).all())
+        return found
