@@ -41,6 +41,7 @@ from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_rin
 from sfm.runtime.cores import cores
 from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
+from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family
 from sfm.targets.codes.tags import tag_family, tag_modules
 from sfm.targets.detect import find_targets
@@ -57,13 +58,15 @@ FREE = ("c", "x0", "y0", "K1", "P1", "P2")
 
 
 def compile_targets() -> None:
-    """Find dark and bright targets in a drawn photograph, with rings of cells, with arcs and with tags."""
+    """Find targets in drawn photographs: dark and bright, rings of cells, arcs, tags, and crossings."""
     for bright in (False, True):
         for codes in ("ring14", "arcs", "apriltag36h11"):
             find_targets(drawn_photograph(bright), polarity="auto", codes=codes)
     black = np.pad(tag_modules(tag_family("apriltag36h11"), 3), 2)
     tag = np.where(np.kron(black, np.ones((12, 12))), 40, 200).astype(np.uint8)
     find_targets(tag, polarity="auto", codes="apriltag36h11")
+    squares = np.where(np.add.outer(np.arange(7), np.arange(8)) % 2, 40, 200).astype(np.uint8)
+    find_targets(squares.repeat(30, 0).repeat(30, 1), codes=PlateFamily("checkerboard", 6, 7))
 
 
 def compile_orientation() -> None:

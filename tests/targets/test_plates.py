@@ -21,6 +21,7 @@ from sfm.targets.codes.dot_plates import name_dots, placements
 from sfm.targets.codes.lattice import Lattice
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets
+from sfm.targets.fits.saddle import measure_saddles
 from tests.plates import BOARD, GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
 from tests.synthetic import seed_of
 
@@ -177,6 +178,43 @@ def test_rendered_dots_are_all_found(rings: bool) -> None:
     found, xy = photographed(GRID, rings)
     assert sorted(found.code.tolist()) == list(range(GRID.count))
     assert np.abs(found.xy - xy[found.code]).max() < 0.25  # eccentricity, which the survey corrects
+
+
+@pytest.mark.parametrize("square_px", [14, 60, 130])
+def test_boards_are_found_in_large_photographs(square_px: int) -> None:
+    """Sought reduced, measured in full."""
+    squares = np.add.outer(np.arange(7), np.arange(10)) % 2
+    drawn = np.pad(np.where(squares, 220, 30).astype(np.uint8), 1, constant_values=220)
+    photograph = np.full((1300, 1900), 220, dtype=np.uint8)
+    board = drawn.repeat(square_px, 0).repeat(square_px, 1)
+    photograph[40 : 40 + len(board), 90 : 90 + board.shape[1]] = board
+    found = find_targets(cv2.GaussianBlur(photograph, (0, 0), 1.0), codes=PlateFamily("checkerboard", 6, 9))
+    row, column = np.divmod(np.arange(54), 9)
+    true = np.stack([90 + square_px * (column + 2), 40 + square_px * (row + 2)], axis=1) - 0.5
+    assert np.abs(found.xy[np.argsort(found.code)] - true).max() < 0.02
+
+
+def measured_crossing(drawn: FloatArray) -> FloatArray:
+    """Return the crossing in the middle of a drawn photograph, (2,)."""
+    picture = np.rint(cv2.GaussianBlur(drawn, (0, 0), 1.5)).astype(np.uint8)
+    return measure_saddles(picture, np.array([[41.0, 39.6]]), np.array([40.0]), noise=1.0).xy[0]
+
+
+@pytest.mark.parametrize(("weak", "is_crossing"), [(0.0, False), (0.1, False), (0.2, True)])
+def test_an_edge_is_no_crossing(weak: float, is_crossing: bool) -> None:
+    """Finders of boards take a point on an edge for a crossing now and then; a weak second edge is chance."""
+    y, x = np.mgrid[-40:41, -40:41] - 0.5
+    found = measured_crossing(120 + 60 * np.sign(x) + 60 * weak * np.sign(y))
+    assert np.isfinite(found).all() == is_crossing
+
+
+@pytest.mark.parametrize("sine", [0.5, 0.55, 0.6, 0.65, 0.8, 0.99])
+def test_oblique_edges_are_a_crossing(sine: float) -> None:
+    y, x = np.mgrid[-40:41, -40:41] - np.array([0.27, 0.31])[:, None, None]
+    half = np.arcsin(sine) / 2
+    first, second = (np.sign(x * np.sin(a) + y * np.cos(a)) for a in (half, -half))
+    # drawn in whole pixels
+    assert measured_crossing(120 + 80 * first * second) == pytest.approx([40.31, 40.27], abs=0.35)
 
 
 def test_crossings_are_as_precise_as_they_say() -> None:

@@ -20,6 +20,7 @@ from sfm.targets.fits.saddle import Saddles, measure_saddles
 from sfm.targets.outlines import as_bytes
 
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+REDUCED_PX = 800  # larger side of the photograph in which a checkerboard is sought first
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
@@ -53,16 +54,24 @@ def find_crossings(
 def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
     """Return the crossings of a checkerboard and their points, upright or by the colours of its squares.
 
-    OpenCV's older finder takes boards without a white rim. What neither finds whole may be cut by the border
-    of the photograph.
+    Sought in the reduced photograph first, then as one that the border may cut; in the photograph as it is
+    where squares are too small for that. OpenCV's older finder takes boards without a white rim.
     """
     size = plate.columns, plate.rows
-    found, corners = cv2.findChessboardCornersSB(grey, size, flags=FLAGS)
+    small, scale = reduced(grey, REDUCED_PX)
+    found, corners = cv2.findChessboardCornersSB(small, size, flags=FLAGS)
+    if not found:
+        xy, code = name_cut_board(grey, plate.rows, plate.columns)
+        if len(code):
+            return xy, code
+        scale = 1.0
+        if small is not grey:
+            found, corners = cv2.findChessboardCornersSB(grey, size, flags=FLAGS)
     if not found:
         found, corners = cv2.findChessboardCorners(grey, size, flags=OLDER_FLAGS)
     if not found:
-        return name_cut_board(grey, plate.rows, plate.columns)
-    xy = np.asarray(corners, dtype=float).reshape(plate.rows, plate.columns, 2)
+        return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+    xy = ((np.asarray(corners, dtype=float) + 0.5) / scale - 0.5).reshape(plate.rows, plate.columns, 2)
     across, down = xy[0, -1] - xy[0, 0], xy[-1, 0] - xy[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from behind
         xy = xy[:, ::-1]
@@ -71,6 +80,15 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     alike = min((ways[k::step] for k in range(step)), key=lambda some: _first_squares(grey, some))
     xy = max(alike, key=lambda way: float((way[:, -1] - way[:, 0]).mean(axis=0)[0]))
     return xy.reshape(-1, 2), np.arange(plate.count)
+
+
+def reduced(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]:
+    """Return a photograph of at most this size, and its size in parts of that of the photograph."""
+    scale = min(1.0, largest_px / max(grey.shape))
+    if scale == 1.0:
+        return grey, scale
+    height, width = (max(1, round(scale * side)) for side in grey.shape)
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)), scale
 
 
 def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:

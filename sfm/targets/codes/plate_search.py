@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.boards import find_crossings, reduced
 from sfm.targets.codes.cut_boards import board_ends
 from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
 from sfm.targets.codes.lattice import find_lattice
@@ -41,9 +41,7 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     """
     sizes = Counter[tuple[int, int]]()
     for grey in photographs:
-        scale = min(1.0, SEARCHED_PX / max(grey.shape))
-        height, width = (max(1, round(scale * side)) for side in grey.shape)
-        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        small, _ = reduced(grey, SEARCHED_PX)
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
         if not found or meta is None or min(meta.shape[:2]) < LEAST_SIDE:
             continue

@@ -4,22 +4,26 @@ Every pixel of an edge says that the crossing lies on the line through it across
 intersection, weighted by the squared gradient, is the crossing; blur, which is the same on both sides of an
 edge, does not move it. The covariance is that of the noise of the intensities, carried through the filters.
 
-Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken (precise location of corners).
+Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken (precise location of corners,
+and their roundness, the squared sine of the angle between the edges).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 
 WINDOW = 0.35  # half side of the window, in the distance of the nearest crossing
 MIN_HALF_PX, MAX_HALF_PX = 3, 15
 ROUNDS, LAST_STEP_PX = 20, 1e-3
 FARTHEST = 1.0  # of the half window, by which a crossing may be off where it was expected
+MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; one edge has 0
 SMOOTHING_PX = 0.7  # of the gradients
 REACH_PX = 4  # of the filters
 
@@ -50,62 +54,166 @@ def measure_saddles(image: AnyArray, start: FloatArray, spacing_px: FloatArray, 
     out = Saddles(np.full((k, 2), np.nan), np.full((k, 2, 2), np.nan), np.full(k, np.nan))
     if not k:
         return out
-    smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), SMOOTHING_PX), dtype=float)
-    gradient = np.stack([_derivative(smooth, 1, 0), _derivative(smooth, 0, 1)], axis=2)
-    for i in range(k):
-        half = int(np.clip(round(WINDOW * spacing_px[i]), MIN_HALF_PX, MAX_HALF_PX))
-        found = _measure(gradient, start[i].astype(float), half, noise)
-        if found is None:
-            continue
-        out.xy[i], out.covariance[i] = found
-        column, row = (round(float(v)) for v in found[0])
-        part = smooth[row - half : row + half + 1, column - half : column + half + 1]
-        out.contrast[i] = float(np.quantile(part, 0.9) - np.quantile(part, 0.1))
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
+    half = np.clip(np.rint(WINDOW * spacing_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
+    _measure_all(
+        np.asarray(smooth),
+        np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)),
+        np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)),
+        start.astype(float),
+        half,
+        noise,
+        out.xy,
+        out.covariance,
+        out.contrast,
+    )
     return out
 
 
-def _measure(
-    gradient: FloatArray, start: FloatArray, half: int, noise: float
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return a crossing and its covariance; None where there is none, or the border cuts it off."""
-    h, w, _ = gradient.shape
-    at = start
-    margin = half + REACH_PX + 1
+def _taps() -> tuple[FloatArray, FloatArray]:
+    """Return the weights by which a derivative is smoothed along it, and across it, 2 REACH_PX + 1 each."""
+    smoothing = cv2.getGaussianKernel(2 * REACH_PX - 1, SMOOTHING_PX)[:, 0]
+    return np.convolve(smoothing, [-0.5, 0.0, 0.5]), np.convolve(smoothing, [0.25, 0.5, 0.25])
+
+
+ALONG, ACROSS = _taps()
+
+
+@compiled
+def _measure_all(
+    smooth: AnyArray,
+    gx: AnyArray,
+    gy: AnyArray,
+    start: FloatArray,
+    half_px: IntArray,
+    noise: float,
+    xy: FloatArray,
+    covariance: FloatArray,
+    contrast: FloatArray,
+) -> None:
+    """Fill places, covariances and contrasts of crossings, those of failed ones left as they are.
+
+    Args:
+        smooth: smoothed intensities, (H, W).
+        gx: their derivative along x, per px, (H, W).
+        gy: the same along y.
+        start: approximate places, px, (k, 2).
+        half_px: half sides of the windows, px, (k,).
+        noise: standard deviation of an intensity.
+        xy: receives the places, (k, 2).
+        covariance: receives their covariance, (k, 2, 2).
+        contrast: receives their contrast, (k,).
+    """
+    N = np.empty((2, 2))
+    for i in range(len(start)):
+        half = half_px[i]
+        x, y = _crossing(gx, gy, start[i, 0], start[i, 1], half, N)
+        if math.isnan(x):
+            continue
+        xy[i, 0], xy[i, 1] = x, y
+        _propagate(gx, gy, x, y, half, noise, N, covariance[i])
+        column, row = round(x), round(y)
+        part = np.sort(smooth[row - half : row + half + 1, column - half : column + half + 1].copy().ravel())
+        last = len(part) - 1
+        contrast[i] = part[round(0.9 * last)] - part[round(0.1 * last)]
+
+
+@compiled
+def _weight(dx: float, dy: float, half: int) -> float:
+    """Return the weight of a pixel: a round window about the point itself, cut off gradually.
+
+    No step of the point, however small, may change the weights by more than a little: it would not settle.
+    """
+    inside_x, inside_y = half + 0.5 - abs(dx), half + 0.5 - abs(dy)
+    if inside_x <= 0 or inside_y <= 0:
+        return 0.0
+    return min(inside_x, 1.0) * min(inside_y, 1.0) * math.exp(-2.0 * (dx * dx + dy * dy) / (half * half))
+
+
+@compiled
+def _crossing(
+    gx: AnyArray, gy: AnyArray, x0: float, y0: float, half: int, N: FloatArray
+) -> tuple[float, float]:
+    """Return a crossing and fill its normal matrix; NaN where there is none, or the border cuts it off."""
+    height, width = gx.shape
+    margin, x, y = half + REACH_PX + 1, x0, y0
     for _ in range(ROUNDS):
-        column, row = round(float(at[0])), round(float(at[1]))
-        if not (margin <= column < w - margin and margin <= row < h - margin):
-            return None
-        reach = half + REACH_PX
-        y, x = np.mgrid[row - reach : row + reach + 1, column - reach : column + reach + 1].astype(float)
-        g = gradient[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        # a round window about the point itself, so that a step of a pixel changes nothing
-        away = np.stack([x - at[0], y - at[1]], axis=2)
-        weight = np.exp(-0.5 * (away**2).sum(axis=2) / (half / 2) ** 2)
-        weight[(np.abs(away) > half).any(axis=2)] = 0.0
-        N = np.einsum("ij,ija,ijb->ab", weight, g, g)
-        if np.linalg.det(N) <= 1e-6 * np.trace(N) ** 2:
-            return None
-        step = np.linalg.solve(N, np.einsum("ij,ija,ijb,ijb->a", weight, g, g, away))
-        at = at + step
-        if np.hypot(*(at - start)) > FARTHEST * half:
-            return None
-        if np.hypot(*step) < LAST_STEP_PX:
+        column, row = round(x), round(y)
+        if not (margin <= column < width - margin and margin <= row < height - margin):
             break
-    else:
-        return None
-    # by how much each intensity moves the crossing: the filters of the gradient, the other way round
-    away = np.stack([x - at[0], y - at[1]], axis=2)
-    lines = (g * away).sum(axis=2)
-    moved = []
+        xx = xy = yy = nx = ny = 0.0
+        for r in range(row - half - 1, row + half + 2):
+            for c in range(column - half - 1, column + half + 2):
+                dx, dy = c - x, r - y
+                w = _weight(dx, dy, half)
+                a, b = float(gx[r, c]), float(gy[r, c])
+                line = w * (a * dx + b * dy)
+                xx += w * a * a
+                xy += w * a * b
+                yy += w * b * b
+                nx += a * line
+                ny += b * line
+        det = xx * yy - xy * xy
+        if 4 * det <= (MIN_SINE * (xx + yy)) ** 2:
+            break
+        step_x, step_y = (yy * nx - xy * ny) / det, (xx * ny - xy * nx) / det
+        x, y = x + step_x, y + step_y
+        if math.hypot(x - x0, y - y0) > FARTHEST * half:
+            break
+        if math.hypot(step_x, step_y) < LAST_STEP_PX:
+            N[0, 0], N[0, 1], N[1, 0], N[1, 1] = xx, xy, xy, yy
+            return x, y
+    return math.nan, math.nan
+
+
+@compiled
+def _propagate(
+    gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: float, N: FloatArray, out: FloatArray
+) -> None:
+    """Fill the covariance of a crossing, px^2, (2, 2).
+
+    By how much each intensity moves it are the filters of the gradient, the other way round.
+    """
+    column, row = round(x), round(y)
+    side, reach = 2 * (half + REACH_PX) + 1, half + REACH_PX
+    by_gx, by_gy = np.zeros((2, side, side)), np.zeros((2, side, side))
+    for r in range(REACH_PX - 1, side - REACH_PX + 1):
+        for c in range(REACH_PX - 1, side - REACH_PX + 1):
+            dx, dy = column - reach + c - x, row - reach + r - y
+            w = _weight(dx, dy, half)
+            a, b = (
+                float(gx[row - reach + r, column - reach + c]),
+                float(gy[row - reach + r, column - reach + c]),
+            )
+            line = w * (a * dx + b * dy)
+            by_gx[0, r, c], by_gy[0, r, c] = w * a * dx + line, w * a * dy
+            by_gx[1, r, c], by_gy[1, r, c] = w * b * dx, w * b * dy + line
+    moved = np.zeros((2, side, side))
+    rows = np.empty((side, side))
     for axis in range(2):
-        by_gradient = weight[:, :, None] * g[:, :, axis, None] * away
-        by_gradient[:, :, axis] += weight * lines
-        there = _derivative(by_gradient[:, :, 0], 1, 0) + _derivative(by_gradient[:, :, 1], 0, 1)
-        moved.append(cv2.GaussianBlur(there, (0, 0), SMOOTHING_PX).ravel())
-    J = np.linalg.solve(N, np.array(moved))
-    return at, noise**2 * J @ J.T
+        _add_filtered(by_gx[axis], ALONG, ACROSS, rows, moved[axis])
+        _add_filtered(by_gy[axis], ACROSS, ALONG, rows, moved[axis])
+    xx, xy, yy = (moved[0] ** 2).sum(), (moved[0] * moved[1]).sum(), (moved[1] ** 2).sum()
+    det = N[0, 0] * N[1, 1] - N[0, 1] * N[1, 0]
+    a, b, c = N[1, 1] / det, -N[0, 1] / det, N[0, 0] / det  # its inverse
+    out[0, 0] = noise**2 * (a * a * xx + 2 * a * b * xy + b * b * yy)
+    out[1, 1] = noise**2 * (b * b * xx + 2 * b * c * xy + c * c * yy)
+    out[0, 1] = out[1, 0] = noise**2 * (a * b * xx + (a * c + b * b) * xy + b * c * yy)
 
 
-def _derivative(image: FloatArray, dx: int, dy: int) -> FloatArray:
-    """Return the derivative of intensities along x or y, per px."""
-    return np.asarray(cv2.Sobel(image, cv2.CV_64F, dx, dy, ksize=3, scale=1 / 8))
+@compiled
+def _add_filtered(
+    image: FloatArray, along_x: FloatArray, along_y: FloatArray, rows: FloatArray, out: FloatArray
+) -> None:
+    """Add an image (n, n) filtered by two rows of weights; it is zero near its border."""
+    n = len(image)
+    rows[:] = 0.0
+    for k in range(2 * REACH_PX + 1):
+        low, high = max(0, REACH_PX - k), min(n, n + REACH_PX - k)
+        for r in range(n):
+            for c in range(low, high):
+                rows[r, c] += along_x[k] * image[r, c + k - REACH_PX]
+    for k in range(2 * REACH_PX + 1):
+        for r in range(max(0, REACH_PX - k), min(n, n + REACH_PX - k)):
+            for c in range(n):
+                out[r, c] += along_y[k] * rows[r + k - REACH_PX, c]
