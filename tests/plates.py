@@ -65,7 +65,12 @@ def camera() -> Camera:
 
 
 def plate_scene(
-    plate: PlateFamily, *, rings: bool = False, move: FloatArray | None = None, mark: float = 4.6
+    plate: PlateFamily,
+    *,
+    rings: bool = False,
+    move: FloatArray | None = None,
+    mark: float = 4.6,
+    border: int = 2,
 ) -> Scene:
     """Return a plate with its first point at the origin, X to the right, Y up.
 
@@ -74,6 +79,7 @@ def plate_scene(
         rings: whether its marks are rings.
         move: shifts its points.
         mark: radius of the marks, 3 that of the other dots.
+        border: modules of the border of the tags of an AprilGrid.
     """
     xyz = plate.plane(PITCH) + (0.0 if move is None else move)
     middle = plate.plane(PITCH).mean(axis=0)
@@ -89,6 +95,11 @@ def plate_scene(
             radius = np.where(is_mark, 0.52 * mark, 3.0)
         targets = CircularTargets(np.zeros(plate.count, dtype=np.int64), xy, radius, np.arange(plate.count))
         return Scene(faces, join_marks(marks), targets)
+    none = CircularTargets(
+        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64)
+    )
+    if plate.name == "aprilgrid":
+        return Scene(faces, _april_tags(plate, middle, border), none)
     row, column = np.mgrid[-1 : plate.rows, -1 : plate.columns]
     # the square right below the first crossing is dark
     dark = (row + column) % 2 == 0
@@ -97,9 +108,6 @@ def plate_scene(
     squares = rectangles(0, centre, np.full((k, 2), PITCH / 2), np.zeros(k), np.full(k, 0.06))
     if plate.name == "charuco":
         squares = join_marks([squares, _tags_of(plate, middle)])
-    none = CircularTargets(
-        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64)
-    )
     return Scene(faces, squares, none)
 
 
@@ -116,6 +124,28 @@ def _tags_of(plate: PlateFamily, middle: FloatArray) -> Marks:
     joined = np.concatenate(centre)
     k = len(joined)
     return rectangles(0, joined, np.full((k, 2), side / 2), np.zeros(k), np.full(k, 0.06))
+
+
+def _april_tags(plate: PlateFamily, middle: FloatArray, border: int) -> Marks:
+    """Return the tags of an AprilGrid, upside down as Kalibr prints them, and squares at their corners."""
+    size, family = plate.tag_share * PITCH, tag_family(plate.dictionary)
+    centre, half = [], []
+    gap = PITCH - size
+    for corner in plate.plane(PITCH)[:, :2].reshape(plate.rows, plate.columns, 2)[::2, ::2].reshape(-1, 2):
+        row, column = round(-corner[1] / PITCH), round(corner[0] / PITCH)
+        number = plate.first_tag + (plate.rows // 2 - 1 - row) * plate.columns // 2 + column
+        black = np.rot90(np.pad(tag_modules(family, number), border - 1, constant_values=True), 2)
+        side = size / len(black)
+        r, c = np.nonzero(black)
+        centre.append(corner + side * np.stack([c + 0.5, -r - 0.5], axis=1))
+        half.append(np.full((len(r), 2), side / 2))
+        for x in (-gap / 2, size + gap / 2):
+            for y in (gap / 2, -size - gap / 2):
+                centre.append(corner[None] + [x, y])
+                half.append(np.full((1, 2), gap / 2))
+    joined = np.concatenate(centre)
+    k = len(joined)
+    return rectangles(0, joined - middle[:2], np.concatenate(half), np.zeros(k), np.full(k, 0.06))
 
 
 def stations(rng: np.random.Generator, count: int, plate: PlateFamily) -> tuple[FloatArray, FloatArray]:

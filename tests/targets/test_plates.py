@@ -266,6 +266,20 @@ def survey_text(**changes: str) -> str:
         ({"marks": "marks = [[3, 3], [5, 3]]"}, "the marks look alike turned by 180 degrees"),
         ({"marks": "", "kind": 'kind = "free"'}, "looks alike turned by 180 degrees has no"),
         ({"codes": 'codes = "charuco"', "marks": ""}, "targets.dictionary = '', codes = 'charuco' needs"),
+        (
+            {"codes": 'codes = "aprilgrid"\ndictionary = "apriltag36h11"\ntag_size = 9.0', "marks": ""},
+            "an AprilGrid of 9 x 11 corners, even numbers",
+        ),
+        (
+            {
+                "codes": 'codes = "aprilgrid"\ndictionary = "apriltag16h5"\ntag_size = 9.0\nfirst_tag = 8',
+                "rows": "rows = 12",
+                "columns": "columns = 10",
+                "marks": "",
+            },
+            "the board has tags 8 to 37, dictionary 'apriltag16h5' has 0 to 29",
+        ),
+        ({"marks": "first_tag = 3"}, "targets.first_tag is of codes = 'charuco' and 'aprilgrid'"),
         ({"codes": 'codes = "checkerboard"'}, "targets.marks are of grid, asymmetric-grid"),
         ({"codes": 'codes = "checkerboard"', "rows": "rows = 2", "marks": ""}, "board of 2 x 11 cross"),
         ({"unit": 'unit = "mm"\n[control]\nfile = "c.csv"'}, r"\[control\] beside a calibration plate"),

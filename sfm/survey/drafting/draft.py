@@ -177,9 +177,9 @@ def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
     lines = [
         "[targets]",
         f"codes = {_quoted(plate.name)}",
-        f"rows = {plate.rows}  # of dots, or of crossings inside the board",
+        f"rows = {plate.rows}  # of dots, of crossings inside the board, or of corners of tags",
         f"columns = {plate.columns}",
-        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots or crossings{assumed}",
+        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots, crossings or tags{assumed}",
     ]
     if plate.marks:
         lines.append(f"marks = {json.dumps([list(mark) for mark in plate.marks])}  # row and column, from 0")
@@ -189,6 +189,8 @@ def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
             f"tag_size = {plate.tag_share * (pitch or PITCH):.4g}  # {UNIT}, side of the tags: "
             f"{plate.tag_share:g} of the pitch",
         ]
+    if plate.first_tag:
+        lines.append(f"first_tag = {plate.first_tag}  # number of the first tag of the board")
     return lines
 
 

@@ -20,7 +20,13 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.codes.families import code_family
-from sfm.targets.codes.plate_search import search_charuco, search_checkerboard, search_dots, shows_a_lattice
+from sfm.targets.codes.plate_search import (
+    search_april_grid,
+    search_charuco,
+    search_checkerboard,
+    search_dots,
+    shows_a_lattice,
+)
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.ring_reading import read_codes
 from sfm.targets.codes.rings import RINGS, CodeFamily
@@ -123,6 +129,9 @@ def _tags_and_boards(
     A checkerboard may be a ChArUco board, which its tags show.
     """
     none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
+    plate = search_april_grid(tried)  # first, since modules of tags may pass for squares
+    if plate is not None:
+        return "", plate
     plate = search_checkerboard(
         [read_already[path] if path in read_already else _as_bytes(read_photograph(path)) for path in more]
     )

@@ -7,10 +7,10 @@ import numpy as np
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.settings import TargetSettings
-from sfm.targets.codes.plates import GRIDS, PLATES, PlateFamily, refuse_unusable_plate
-from sfm.targets.codes.tags import DICTIONARIES
+from sfm.targets.codes.plates import GRIDS, PLATES, TAGGED, PlateFamily, refuse_unusable_plate
+from sfm.targets.codes.tags import DICTIONARIES, tag_family
 
-OF_PLATES = ("rows", "columns", "pitch", "marks", "plate_sigma", "dictionary")
+OF_PLATES = ("rows", "columns", "pitch", "marks", "plate_sigma", "dictionary", "first_tag")
 MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
 
 
@@ -22,7 +22,13 @@ def plate_family(targets: TargetSettings) -> PlateFamily | None:
     if targets.tag_size is not None and targets.pitch is not None:
         share = targets.tag_size / targets.pitch
     return PlateFamily(
-        targets.codes, targets.rows, targets.columns, targets.marks, targets.dictionary or "", share
+        targets.codes,
+        targets.rows,
+        targets.columns,
+        targets.marks,
+        targets.dictionary or "",
+        share,
+        targets.first_tag,
     )
 
 
@@ -61,19 +67,32 @@ def refuse_contradicting_plates(targets: TargetSettings, where: str) -> None:
             raise SurveyFileError(f"{where}: targets.{name} is missing, codes = '{targets.codes}' needs it")
     plate = plate_family(targets)
     assert plate is not None
-    board = targets.codes == "charuco"
+    board = targets.codes in TAGGED
     if board and targets.dictionary not in DICTIONARIES:
         raise SurveyFileError(
-            f"{where}: targets.dictionary = '{targets.dictionary or ''}', codes = 'charuco' needs one of "
-            f"{', '.join(DICTIONARIES)}"
+            f"{where}: targets.dictionary = '{targets.dictionary or ''}', codes = '{targets.codes}' needs "
+            f"one of {', '.join(DICTIONARIES)}"
         )
     if board and not 0 < plate.tag_share < 1:
         raise SurveyFileError(
-            f"{where}: targets.tag_size is the side of the tags of a ChArUco board, needed between 0 and the "
-            "pitch"
+            f"{where}: targets.tag_size is the side of the tags of a ChArUco board or AprilGrid, needed "
+            "between 0 and the pitch"
         )
-    if not board and targets.dictionary is not None:
-        raise SurveyFileError(f"{where}: targets.dictionary is of codes = 'charuco', found '{targets.codes}'")
+    if board and plate.last_tag >= tag_family(plate.dictionary).count:
+        raise SurveyFileError(
+            f"{where}: the board has tags {plate.first_tag} to {plate.last_tag}, dictionary "
+            f"'{plate.dictionary}' has 0 to {tag_family(plate.dictionary).count - 1}"
+        )
+    if targets.codes == "aprilgrid" and (plate.rows % 2 or plate.columns % 2):
+        raise SurveyFileError(
+            f"{where}: an AprilGrid of {plate.rows} x {plate.columns} corners, even numbers are needed (rows "
+            "and columns count corners, two for each tag)"
+        )
+    for name in ("dictionary", "first_tag"):
+        if not board and name in targets.model_fields_set:
+            raise SurveyFileError(
+                f"{where}: targets.{name} is of codes = 'charuco' and 'aprilgrid', found '{targets.codes}'"
+            )
     if targets.codes not in GRIDS and targets.marks:
         raise SurveyFileError(f"{where}: targets.marks are of {', '.join(GRIDS)}, found '{targets.codes}'")
     if targets.codes == "checkerboard" and min(plate.rows, plate.columns) < MIN_SIDE:

@@ -66,6 +66,7 @@ Observed = Annotated[
     BeforeValidator(_pairs),
 ]
 
+TagNumber = Annotated[int, Field(ge=0, le=100_000)]
 PlateSide = Annotated[int, Field(ge=2, le=500)]
 Marks = Annotated[
     tuple[Annotated[tuple[int, int], Field(strict=False)], ...], Field(strict=False, max_length=1000)
@@ -157,7 +158,8 @@ class TargetSettings(Section):
     pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
     marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
     plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
-    dictionary: Name | None = None  # tags of a ChArUco board, whose side is tag_size
+    dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid, whose side is tag_size
+    first_tag: TagNumber = 0  # of the first of these
 
 
 class TiePointSettings(Section):

@@ -1,4 +1,4 @@
-"""Boards as targets: the crossings of checkerboards and ChArUco boards, and which of the board they are.
+"""Boards as targets: the crossings of checkerboards, ChArUco boards and AprilGrids, and which they are.
 
 A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
 follows from its colours, the first square being the dark one. Of the turns that look alike (see
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.codes.april_grids import name_corners, read_april_tags, squares_beside
 from sfm.targets.codes.cut_boards import name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
@@ -27,7 +28,7 @@ OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.
 def find_crossings(
     photograph: AnyArray, plate: PlateFamily, *, scale: float, noise: float
 ) -> tuple[Saddles, IntArray]:
-    """Find, name and measure the crossings of a checkerboard or ChArUco board in a photograph.
+    """Find, name and measure the crossings of a board in a photograph.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
@@ -42,11 +43,13 @@ def find_crossings(
     `measure_saddles`.
     """
     grey = as_bytes(photograph, scale)
-    if plate.name == "charuco":
-        xy, code = _charuco(grey, plate)
+    if plate.name == "aprilgrid":
+        xy, code = name_corners(*read_april_tags(grey, plate.dictionary), plate)
+        spacing = squares_beside(xy, plate)
     else:
-        xy, code = _checkerboard(grey, plate)
-    saddles = measure_saddles(photograph, xy, _spacing(xy), noise=noise)
+        xy, code = _charuco(grey, plate) if plate.name == "charuco" else _checkerboard(grey, plate)
+        spacing = _spacing(xy)
+    saddles = measure_saddles(photograph, xy, spacing, noise=noise)
     good = np.isfinite(saddles.xy[:, 0])
     return saddles.select(good), code[good]
 
@@ -99,9 +102,10 @@ def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:
 
 def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
     """Return the crossings of a ChArUco board and their points."""
-    board = cv2.aruco.CharucoBoard(
-        (plate.columns + 1, plate.rows + 1), 1.0, plate.tag_share, opencv_dictionary(plate.dictionary)
-    )
+    size = plate.columns + 1, plate.rows + 1
+    numbers = plate.first_tag + np.arange(size[0] * size[1] // 2)
+    dictionary = opencv_dictionary(plate.dictionary)
+    board = cv2.aruco.CharucoBoard(size, 1.0, plate.tag_share, dictionary, numbers)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
     if ids is None or len(ids) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)

@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.targets.codes.april_grids import name_corners, read_april_tags
 from sfm.targets.codes.boards import find_crossings, reduced
 from sfm.targets.codes.cut_boards import board_ends
 from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
@@ -29,6 +30,7 @@ MARK_SIGMAS = 5.0
 # Boards are sought in photographs of at most this size, px.
 SEARCHED_PX = 1600
 SMALLEST = (3, 3)  # board that OpenCV is asked for, and for any larger one
+KALIBR_TAGS, LEAST_TAGS = "apriltag36h11", 4
 MAX_SQUARES = 40  # along a side of a ChArUco board
 OFF_PLACE = 0.15  # of a square, between a tag and its place on the board
 _LARGER = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
@@ -81,6 +83,53 @@ def search_charuco(
         if min(plate.rows, plate.columns) > 1 and _named(photographs, plate):
             return plate
     return None
+
+
+def search_april_grid(photographs: Sequence[AnyArray]) -> PlateFamily | None:
+    """Return the AprilGrid that photographs (uint8) show, of tags of Kalibr's family; None without.
+
+    The first photograph decides whether others are read.
+    """
+    seen = [read_april_tags(photographs[0], KALIBR_TAGS)] if photographs else []
+    if not seen or len(seen[0][0]) < LEAST_TAGS:
+        return None
+    seen += [read_april_tags(grey, KALIBR_TAGS) for grey in photographs[1:]]
+    first = min(int(number.min()) for number, _ in seen if len(number))
+    last = max(int(number.max()) for number, _ in seen if len(number)) - first
+    for across in range(2, last + 1):
+        down = last // across + 1
+        row, column = np.divmod(np.arange(across * down), across)
+        middle = np.stack([column, -row], axis=1).astype(float)
+        shares = [share for number, quads in seen if (share := _tag_share(number - first, quads, middle))]
+        if len(shares) < 2:
+            continue
+        share = round(float(np.median(shares)), 3)
+        plate = PlateFamily("aprilgrid", 2 * down, 2 * across, (), KALIBR_TAGS, share, first)
+        named = [name_corners(number, quads, plate) for number, quads in seen]
+        squares = [_shows_squares(grey, *one, plate) for grey, one in zip(photographs, named, strict=True)]
+        if sum(squares) > 1:
+            return plate
+    return None
+
+
+def _shows_squares(grey: AnyArray, xy: FloatArray, code: IntArray, plate: PlateFamily) -> bool:
+    """Return whether squares between the corners of tags are as dark as the border of the tags."""
+    if len(code) < 4 * LEAST_TAGS:
+        return False
+    H, _ = cv2.findHomography(plate.plane(1.0)[code, :2], xy, cv2.LMEDS)
+    if H is None:
+        return False
+    gap, corner = 1 - plate.tag_share, plate.plane(1.0)[code[code // plate.columns % 2 + code % 2 == 0], :2]
+    # right above and to the left of the corner, between this tag and the next one, and in its border
+    places = (
+        (-gap / 2, gap / 2),
+        (-gap / 2, -plate.tag_share / 2),
+        (plate.tag_share / 16, -plate.tag_share / 2),
+    )
+    at = [cv2.perspectiveTransform((corner + place)[None], H)[0] for place in places]
+    inside = [np.rint(one).astype(int).clip(0, np.array(grey.shape[::-1]) - 1) for one in at]
+    square, white, black = (float(np.median(grey[one[:, 1], one[:, 0]])) for one in inside)
+    return square < (white + black) / 2 < white
 
 
 def search_dots(

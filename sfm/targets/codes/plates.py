@@ -1,4 +1,4 @@
-"""Calibration plates: grids of dots, checkerboards, and ChArUco boards, and the numbers of their points.
+"""Calibration plates: grids of dots, checkerboards, ChArUco boards, AprilGrids; numbers of their points.
 
 Point `row * columns + column` is the dot or crossing in that row and column, both from 0, rows downwards and
 columns to the right as the plate is printed. Any side may be called the upper one, as long as marks and the
@@ -35,7 +35,9 @@ GRIDS = {
     "asymmetric-grid": Grid(0.5, 0.5, 4),
     "hexagonal-grid": Grid(0.5, math.sqrt(3) / 2, 6),
 }
-BOARDS = ("checkerboard", "charuco")
+BOARDS = ("checkerboard", "charuco", "aprilgrid")
+TAGGED = ("charuco", "aprilgrid")
+APRIL_BORDERS = (2, 1)  # modules of the black border of the tags of an AprilGrid, Kalibr's first
 PLATES = (*GRIDS, *BOARDS)
 UNCODED = -1
 ALIKE = 1e-6  # pitches, of rounding
@@ -48,20 +50,28 @@ class PlateFamily:
     name: str
     """one of PLATES"""
     rows: int
-    """rows of dots, or of crossings inside a board"""
+    """rows of dots, or of crossings inside a board; of an AprilGrid two of corners for each row of tags"""
     columns: int
     """columns of the same"""
     marks: tuple[tuple[int, int], ...] = ()
     """row and column of the dots that are larger than the others, or rings"""
     dictionary: str = ""
-    """tags of a ChArUco board, a name in tags.DICTIONARIES"""
+    """tags of a ChArUco board or AprilGrid, a name in tags.DICTIONARIES"""
     tag_share: float = 0.0
-    """side of these tags, in squares"""
+    """side of these tags, in squares, or in the distance from a tag to the next one"""
+    first_tag: int = 0
+    """number of the first of them"""
 
     @property
     def count(self) -> int:
         """Number of points."""
         return self.rows * self.columns
+
+    @property
+    def last_tag(self) -> int:
+        """Number of the last tag of a ChArUco board or AprilGrid."""
+        size = (self.rows + 1) * (self.columns + 1) // 2
+        return self.first_tag - 1 + (self.count // 4 if self.name == "aprilgrid" else size)
 
     @property
     def is_shifted(self) -> bool:
@@ -76,7 +86,7 @@ class PlateFamily:
         one turned by 180 degrees, and one with an odd number of each, as many rows as columns, from one
         turned by 90 degrees. Marks and tags tell every turn.
         """
-        if self.marks or self.name == "charuco":
+        if self.marks or self.name in TAGGED:
             return ()
         fold = GRIDS[self.name].turns if self.name in GRIDS else 4
         points = self.plane(1.0)[:, :2] @ [1, 1j]
@@ -110,6 +120,9 @@ class PlateFamily:
     def plane(self, pitch: float) -> FloatArray:
         """Return the points in the plane of the plate, x to the right, y up, z towards the camera, (n, 3)."""
         row, column = np.divmod(np.arange(self.count), self.columns)
+        if self.name == "aprilgrid":
+            x, y = (pitch * (k // 2 + k % 2 * self.tag_share) for k in (column, row))
+            return np.stack([x, -y, np.zeros(self.count)], axis=1)
         grid = GRIDS.get(self.name, GRIDS["grid"])
         x, y = pitch * (column + grid.shift * (row % 2)), -pitch * grid.apart * row
         return np.stack([x, y, np.zeros(self.count)], axis=1)

@@ -29,7 +29,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.targets.codes.families import FAMILIES, is_table
-from sfm.targets.codes.plates import PLATES
+from sfm.targets.codes.plates import PLATES, TAGGED
 from sfm.targets.codes.tags import DICTIONARIES
 
 CALIBRATION_KEYS = {"calibration", "calibration_use"}
@@ -172,7 +172,7 @@ def refuse_contradictions(survey: SurveySettings) -> None:
 
 def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
     """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
-    if targets.tag_size is not None and targets.codes not in (*DICTIONARIES, "charuco"):
+    if targets.tag_size is not None and targets.codes not in (*DICTIONARIES, *TAGGED):
         raise SurveyFileError(
             f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
             f"tags are {', '.join(list(DICTIONARIES)[:4])} ..."

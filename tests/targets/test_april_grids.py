@@ -1,0 +1,103 @@
+"""AprilGrids: tags that squares touch are read, and their corners named and measured as crossings."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.targets.codes.april_grids import name_corners, read_april_tags
+from sfm.targets.codes.plate_search import search_april_grid
+from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.tags import tag_family, tag_modules
+from sfm.targets.detect import find_targets
+from tests.synthetic import seed_of
+
+MODULE_PX = 8
+GRID = PlateFamily("aprilgrid", 6, 8, (), "apriltag36h11", 0.8, 17)
+H = np.array([[0.94, -0.21, 90.0], [0.17, 0.9, 30.0], [9e-5, 1.4e-4, 1.0]])  # the oblique view
+
+
+def drawn(plate: PlateFamily, *, border: int = 2, squares: bool = True, turn: int = 2) -> AnyArray:
+    """Return a grid as it is printed, uint8."""
+    family = tag_family(plate.dictionary)
+    side = MODULE_PX * (family.modules - 2 + 2 * border)
+    step = round(side / plate.tag_share)
+    gap = step - side
+    rows, columns = plate.rows // 2, plate.columns // 2
+    sheet = np.full((rows * step + 3 * gap, columns * step + 3 * gap), 225, dtype=np.uint8)
+    for number in range(rows * columns):
+        row, column = rows - 1 - number // columns, number % columns
+        y, x = row * step + 2 * gap, column * step + 2 * gap
+        tag = np.pad(tag_modules(family, plate.first_tag + number), border - 1, constant_values=True)
+        tag = np.rot90(tag, turn).repeat(MODULE_PX, 0).repeat(MODULE_PX, 1)
+        sheet[y : y + side, x : x + side] = np.where(tag, 30, 225)
+        for dy in (-gap, side) if squares else ():
+            for dx in (-gap, side):
+                sheet[y + dy : y + dy + gap, x + dx : x + dx + gap] = 30
+    return sheet
+
+
+def photographed(sheet: AnyArray, name: str) -> AnyArray:
+    """Return an oblique photograph of a sheet."""
+    seen = cv2.warpPerspective(sheet, H, (640, 520), flags=cv2.INTER_AREA, borderValue=120)
+    noisy = cv2.GaussianBlur(seen.astype(float), (0, 0), 1.0) + 2 * seed_of(name).standard_normal(seen.shape)
+    return np.rint(noisy).clip(0, 255).astype(np.uint8)
+
+
+def true_corners(plate: PlateFamily, border: int) -> FloatArray:
+    """Return where the corners are in the photograph, px, (n, 2)."""
+    side = MODULE_PX * (6 + 2 * border)
+    step = round(side / plate.tag_share)
+    xy = plate.plane(step)[:, :2] * [1, -1] + 2 * (step - side) - 0.5
+    return np.asarray(cv2.perspectiveTransform(xy[None], H)[0])
+
+
+@pytest.mark.parametrize(("border", "turn"), [(2, 2), (2, 0), (1, 1)])
+def test_corners_are_named_and_measured(border: int, turn: int) -> None:
+    """With Kalibr's border and a narrow one, however the tags are turned in their rows."""
+    picture = photographed(drawn(GRID, border=border, turn=turn), f"named {border} {turn}")
+    found = find_targets(picture, codes=GRID)
+    assert len(found) == GRID.count
+    off = np.linalg.norm(found.xy - true_corners(GRID, border)[found.code], axis=1)
+    print("corners:", np.sqrt((off**2).mean()), "px")
+    assert off.max() < 0.25
+    assert sorted(found.code.tolist()) == list(range(GRID.count))
+
+
+def test_points_are_numbered_from_the_upper_left_as_printed() -> None:
+    number, quads = read_april_tags(drawn(GRID), GRID.dictionary)
+    assert number.tolist() == list(range(17, 17 + 12))
+    xy, code = name_corners(number, quads, GRID)
+    at = dict(zip(code.tolist(), xy, strict=True))
+    assert at[0] == pytest.approx([39.5, 39.5], abs=1.0)
+    assert at[7] == pytest.approx([39.5 + 380, 39.5], abs=1.0)
+    assert at[40] == pytest.approx([39.5, 39.5 + 280], abs=1.0)
+
+
+def test_tags_of_another_grid_have_no_names() -> None:
+    number, quads = read_april_tags(drawn(GRID), GRID.dictionary)
+    assert len(name_corners(number + 12, quads, GRID)[1]) == 0
+    moved = quads.copy()
+    moved[3] += 200.0  # a tag that lies beside the grid
+    code = name_corners(number, moved, GRID)[1]
+    assert len(code) == GRID.count - 4
+    assert len(name_corners(number[:1], quads[:1], GRID)[1]) == 0  # one tag does not show its turn
+
+
+@pytest.mark.parametrize("border", [1, 2])
+def test_a_grid_is_found(border: int) -> None:
+    pictures = [photographed(drawn(GRID, border=border), f"found {k}") for k in range(2)]
+    plate = search_april_grid(pictures)
+    assert plate is not None
+    assert (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
+    assert plate.tag_share == pytest.approx(GRID.tag_share, abs=0.01)
+
+
+def test_tags_without_squares_are_no_grid() -> None:
+    """Their corners are corners, and measured as such."""
+    assert (
+        search_april_grid([photographed(drawn(GRID, squares=False), f"bare {k}") for k in range(2)]) is None
+    )
+    assert search_april_grid([np.full((300, 400), 128, dtype=np.uint8)] * 2) is None
