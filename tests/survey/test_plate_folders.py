@@ -1,14 +1,25 @@
-"""Photographs of plates and boards in a folder, and nothing else: found, and the camera as it truly is."""
+"""Photographs of plates and boards in a folder, and nothing else: found, and the camera as it truly is.
+
+The calibration is that of OpenCV on the same image points."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values
+from sfm.conventions import FloatArray
+from sfm.network import ObjectPoints, rows_of
 from sfm.pipeline import run_survey
 from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.plate import plate_family
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import TAGGED, PlateFamily
 from tests.plates import GRID, PITCH, PIXEL_MM, TRUTH, plate_pictures
@@ -52,7 +63,8 @@ def test_a_folder_of_a_plate_calibrates_the_camera(kind: str, tmp_path: Path) ->
         assert survey.targets.tag_size == pytest.approx(plate.tag_share * PITCH, rel=0.05)
     result = run_survey(survey)
     assert len(result.failed) <= 1  # some show a part of it
-    adjustment = result.adjustment
+    adjustment, family = result.adjustment, plate_family(survey.targets)
+    assert family is not None
     (found,) = adjustment.estimate.cameras
     covariance = adjustment.covariance.interior[0]
     free = [name for name, is_free in zip(found.names, found.free, strict=True) if is_free]
@@ -60,3 +72,47 @@ def test_a_folder_of_a_plate_calibrates_the_camera(kind: str, tmp_path: Path) ->
         sigma = covariance[free.index(name), free.index(name)] ** 0.5
         error = found.value(name) - TRUTH[name] * found.pixel_mm[0] / PIXEL_MM
         assert abs(error) < 4.5 * sigma, name
+    off = beside_opencv(adjustment, family.plane(PITCH).astype(np.float32))
+    print(f"{kind}: largest difference from OpenCV {off.max():.1e} sigma")
+    assert off.max() < 0.1
+
+
+def beside_opencv(found: Adjustment, plane: FloatArray) -> FloatArray:
+    """Return differences from OpenCV's calibration on the accepted image points, over sigmas, (8,).
+
+    Args:
+        found: calibration from a plate.
+        plane: the points of the plate, mm, (n, 3), float32.
+
+    Both adjust fx, fy, cx, cy, k1, k2, p1, p2 and all orientations, with equal weights.
+    """
+    points = found.network.image_points.select(~found.rejected)
+    xy, X = points.xy.astype(np.float32), plane[[int(name) for name in found.network.points]]
+    rows = [one for one in rows_of(points.image, len(found.network.images)) if len(one)]
+    camera = found.estimate.cameras[0]
+    rms, K, distortion, *_ = cv2.calibrateCamera(
+        [X[points.point[one]] for one in rows],
+        [xy[one][:, None] for one in rows],
+        camera.size_px,
+        None,
+        None,
+        flags=cv2.CALIB_FIX_K3,
+        criteria=(3, 1000, 1e-15),
+    )  # type: ignore[call-overload]
+    free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    c_px = camera.parameters[0] / camera.pixel_mm[0]
+    start = camera_from_values("plate", "opencv", camera.size_px, (1.0, 1.0), c_mm=c_px, free=free)
+    network = replace(
+        found.network,
+        image_points=replace(
+            points, xy=xy.astype(float), covariance=np.tile(0.01 * np.eye(2), (len(xy), 1, 1))
+        ),
+        control=ObjectPoints(np.arange(len(X)), X.astype(float), np.zeros((len(X), 3, 3))),
+    )
+    estimate = replace(found.estimate, cameras=(start,), points=X.astype(float))
+    mine = adjust(network, estimate, datum=Datum("control"), reject="none")
+    values = np.array([mine.estimate.cameras[0].value(name) for name in free])
+    theirs = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion.ravel()[:4]])
+    sigma = mine.interior_sigma(0)[[start.names.index(name) for name in free]]
+    assert np.sqrt((mine.residuals**2).sum() / len(xy)) == pytest.approx(rms, rel=1e-4)
+    return np.abs(values - theirs) / sigma
