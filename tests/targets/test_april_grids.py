@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -93,6 +95,15 @@ def test_a_grid_is_found(border: int) -> None:
     assert plate is not None
     assert (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
     assert plate.tag_share == pytest.approx(GRID.tag_share, abs=0.01)
+
+
+def test_of_two_grids_the_first_is_found() -> None:
+    other = replace(GRID, first_tag=29)
+    sheets = [np.hstack([drawn(GRID), drawn(other)]), np.hstack([drawn(other), drawn(GRID)])]
+    plate = search_april_grid(sheets)
+    assert plate is not None and (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
+    for one in (GRID, other):
+        assert len(find_targets(sheets[0], codes=one)) == one.count
 
 
 def test_tags_without_squares_are_no_grid() -> None:

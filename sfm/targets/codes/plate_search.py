@@ -88,7 +88,8 @@ def search_charuco(
 def search_april_grid(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     """Return the AprilGrid that photographs (uint8) show, of tags of Kalibr's family; None without.
 
-    The first photograph decides whether others are read.
+    The first photograph decides whether others are read. Of several grids side by side it is the one with
+    the lowest numbers.
     """
     seen = [read_april_tags(photographs[0], KALIBR_TAGS)] if photographs else []
     if not seen or len(seen[0][0]) < LEAST_TAGS:
@@ -96,11 +97,19 @@ def search_april_grid(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     seen += [read_april_tags(grey, KALIBR_TAGS) for grey in photographs[1:]]
     first = min(int(number.min()) for number, _ in seen if len(number))
     last = max(int(number.max()) for number, _ in seen if len(number)) - first
-    for across in range(2, last + 1):
-        down = last // across + 1
+    sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # whole, or with other grids behind it
+    sizes += sorted(
+        ((m, n) for n in range(2, last) for m in range(2, last // n + 1)), key=lambda one: -one[0] * one[1]
+    )
+    for down, across in sizes:
         row, column = np.divmod(np.arange(across * down), across)
         middle = np.stack([column, -row], axis=1).astype(float)
-        shares = [share for number, quads in seen if (share := _tag_share(number - first, quads, middle))]
+        parts = [
+            (number[own] - first, quads[own])
+            for number, quads in seen
+            for own in [number < first + down * across]
+        ]
+        shares = [share for one in parts if (share := _tag_share(*one, middle))]
         if len(shares) < 2:
             continue
         share = round(float(np.median(shares)), 3)
