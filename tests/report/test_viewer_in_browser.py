@@ -128,6 +128,7 @@ def test_a_click_on_a_point_shows_its_crops(tab: Tab, scene: ViewerScene) -> Non
     hint = page.locator(".v-hint").last  # no warning
     assert hint.evaluate("(one) => Number(getComputedStyle(one).fontWeight)") == 400
     for j in (5, 11):
+        page.get_by_role("button", name="reset").click()  # a chosen point is seen from near
         page.mouse.click(*page.evaluate(PLACE, j))
         page.wait_for_selector(f".v-title:text-is('Point {scene.points[j]}')")
         own = np.flatnonzero(scene.rays.point == j)
@@ -157,8 +158,8 @@ def test_colours_follow_the_legend(tab: Tab, scene: ViewerScene) -> None:
         " return [point.from, point.to] }"
     )
     assert low <= sigma.min() < sigma.max() <= high
-    for value in (low, high):  # whole decades of the unit of the legend, here µm
-        assert np.log10(value * 1e6) == pytest.approx(round(np.log10(value * 1e6)), abs=1e-9)
+    for value in (low, high):  # round numbers in the unit of the legend, here µm
+        assert f"{value * 1e6:.3e}"[:5] in ("1.000", "2.000", "5.000")
     places = np.log(sigma / low) / np.log(high / low) * (len(colours) - 1)
     away = np.abs(colours[np.rint(places).astype(int)] - np.array(page.evaluate(PIXELS))).max(axis=1)
     assert (away <= 6).mean() >= 0.8  # some points lie behind others
@@ -166,6 +167,103 @@ def test_colours_follow_the_legend(tab: Tab, scene: ViewerScene) -> None:
     page.select_option("#points-by", "rays")
     assert page.locator(".v-legend-name").first.inner_text() == "rays of a point"
     page.select_option("#points-by", "sigma")
+
+
+EXTENT = """() => {
+  const { scene, model } = document.getElementById('explore').viewer
+  const seen = model.points.map((_, j) => scene.project(scene.local(model.xyz(j))))
+  const { clientWidth, clientHeight } = scene.canvas
+  return [seen.map((p) => p[0] / clientWidth), seen.map((p) => p[1] / clientHeight)]
+}"""
+
+
+@pytest.mark.parametrize("width", [1300, 400])
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_the_object_fills_the_canvas_and_a_chosen_point_is_in_its_middle(
+    browser: Any, page_file: Path, width: int, orthographic: bool
+) -> None:
+    tab = Tab(browser, page_file, width=width)
+    page = tab.ready()
+    if orthographic:
+        page.get_by_label("orthographic").check()
+    for _ in range(2):
+        seen = np.array(page.evaluate(EXTENT))
+        assert seen.min() >= 0.04 and seen.max() <= 0.96
+        assert np.ptp(seen, axis=1).max() == pytest.approx(0.9, abs=0.01)
+        before = np.linalg.norm(np.diff(seen[:, [4, 9]]))
+        page.evaluate(SELECT, ["point", 9])
+        chosen = np.array(page.evaluate(EXTENT))
+        np.testing.assert_allclose(chosen[:, 9], 0.5, atol=0.01)
+        assert np.linalg.norm(np.diff(chosen[:, [4, 9]])) > 1.3 * before
+        page.get_by_role("button", name="reset").click()
+    page.evaluate(SELECT, ["photograph", 2])  # not seen: the view takes it in
+    at = np.array(
+        page.evaluate(
+            "() => { const { scene, model } = document.getElementById('explore').viewer;"
+            " return scene.project(scene.local(model.centre(2))).map((x, k) =>"
+            " x / [scene.canvas.clientWidth, scene.canvas.clientHeight][k]) }"
+        )
+    )
+    assert at.min() >= 0 and at.max() <= 1
+    assert tab.complaints == []
+    tab.close()
+
+
+def test_legends_are_beside_the_scene_and_rays_are_drawn_on_demand(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    stage = page.locator(".v-stage").bounding_box()
+    for legend in page.locator(".v-legend:visible").all():
+        box = legend.bounding_box()
+        assert box["y"] + box["height"] <= stage["y"] or box["y"] >= stage["y"] + stage["height"]
+    drawn = (
+        "() => document.getElementById('explore').viewer.scene.rays.accepted"
+        ".geometry.attributes.position.count"
+    )
+    page.evaluate(SELECT, ["point", 8])
+    assert page.evaluate(drawn) == 0
+    page.get_by_label("rays of what is chosen").check()
+    assert page.evaluate(drawn) == 2 * int((scene.rays.point == 8).sum())
+    page.get_by_label("rays of what is chosen").uncheck()
+    assert page.evaluate(drawn) == 0
+    page.get_by_role("button", name="reset").click()
+
+
+def test_every_scale_spans_the_values_of_the_page(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    values = {"rays": scene.rays_of_point, "rms": scene.point_rms_px, "angle": scene.angle_deg}
+    for key, all_of_them in values.items():
+        page.select_option("#points-by", key)
+        low, high = page.evaluate(
+            "() => { const { point } = document.getElementById('explore').viewer.scene.scales;"
+            " return [point.from, point.to] }"
+        )
+        inner = np.quantile(all_of_them, [0.03, 0.97])
+        assert low <= inner[0] and inner[1] <= high
+        assert high - low <= max(5 * np.ptp(all_of_them), 1.0)
+    page.select_option("#points-by", "sigma")
+
+
+def test_colours_are_visible_in_dark_mode(browser: Any, page_file: Path) -> None:
+    """Contrast with the background is 3 : 1 at least (WCAG 2.2, success criterion 1.4.11)."""
+    tab = Tab(browser, page_file, color_scheme="dark")
+    page = tab.ready()
+    shades, background = page.evaluate(
+        "() => { const { scene } = document.getElementById('explore').viewer; scene.draw();"
+        " const copy = document.createElement('canvas'); Object.assign(copy, { width: 9, height: 9 });"
+        " const context = copy.getContext('2d'); context.drawImage(scene.canvas, 0, 0);"
+        " const all = []; for (let k = 0; k <= 20; k++) for (const scale of ['point', 'photograph'])"
+        " all.push(scene.scales[scale].shade(k / 20));"
+        " return [all, [...context.getImageData(2, 2, 1, 1).data].slice(0, 3)] }"
+    )
+
+    def luminance(rgb: Any) -> Any:
+        c = np.asarray(rgb) / 255
+        return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
+
+    assert luminance(background) < 0.02
+    assert ((luminance(shades) + 0.05) / (luminance(background) + 0.05)).min() >= 3
+    assert tab.complaints == []
+    tab.close()
 
 
 def test_tables_are_sorted_filtered_and_walked_through(tab: Tab, scene: ViewerScene) -> None:
@@ -261,6 +359,7 @@ def test_sigma_of_a_distance_is_that_of_the_law_of_propagation() -> None:
 def test_a_photograph_shows_its_thumbnail_under_the_pointer(tab: Tab, scene: ViewerScene) -> None:
     page = tab.page
     page.evaluate("document.getElementById('explore').viewer.hub.tell('select', null)")
+    page.locator(".v-choice select", has_text="view").select_option("all")
     page.locator(".v-scene").scroll_into_view_if_needed()
     seen = set()
     for i in range(IMAGES):

@@ -1,6 +1,6 @@
-// Values as colours on absolute scales: the same value has the same colour in every report.
+// Values as colours on scales between round numbers about the values of the page.
 
-import { significant } from "./numbers.js"
+import { roundStep, significant } from "./numbers.js"
 
 // Viridis (Smith and van der Walt 2015): light and dark in order of the value, also in grey; without its darkest
 // tenth, which nobody sees on a dark page.
@@ -12,12 +12,15 @@ const STEPS = [
 const SIGNED = [
   [33, 82, 196], [92, 134, 222], [150, 172, 214], [190, 190, 190], [226, 160, 130], [221, 100, 76], [178, 24, 43],
 ]
+// The darker steps of viridis are under the contrast of 3 : 1 with a dark page (WCAG 2.2, criterion 1.4.11).
+const DARK_STEPS = STEPS.slice(3)
 const UNKNOWN = [128, 134, 142]
+const OUTSIDE = 0.02 // of the values lie beyond either end of a scale
 
 /** A scale of colours from one value to another, in equal parts or in equal ratios. */
 export class Scale {
-  constructor(name, unit, from, to, { log = false, factor = 1, reversed = false, steps = STEPS } = {}) {
-    Object.assign(this, { name, unit, from, to, log, factor, reversed, steps })
+  constructor(name, unit, from, to, { log = false, factor = 1, reversed = false, signed = false } = {}) {
+    Object.assign(this, { name, unit, from, to, log, factor, reversed, signed, dark: false })
   }
 
   /** Place of a value on the scale, 0 to 1. */
@@ -33,9 +36,10 @@ export class Scale {
 
   /** Red, green, blue of a place on the scale. */
   shade(place) {
-    const at = (this.reversed ? 1 - place : place) * (this.steps.length - 1)
-    const k = Math.min(this.steps.length - 2, Math.floor(at))
-    return this.steps[k].map((low, c) => Math.round(low + (at - k) * (this.steps[k + 1][c] - low)))
+    const steps = this.signed ? SIGNED : this.dark ? DARK_STEPS : STEPS
+    const at = (this.reversed ? 1 - place : place) * (steps.length - 1)
+    const k = Math.min(steps.length - 2, Math.floor(at))
+    return steps[k].map((low, c) => Math.round(low + (at - k) * (steps[k + 1][c] - low)))
   }
 
   /** Round values between the ends of the scale. */
@@ -47,8 +51,8 @@ export class Scale {
         for (const step of wide ? [1] : [1, 2, 5]) found.push(step * power)
       }
     } else {
-      const step = (this.to - this.from) / 3
-      for (let k = 0; k <= 3; k++) found.push(this.from + k * step)
+      const step = roundStep((1.001 * (this.to - this.from) * this.factor) / 3) / this.factor
+      for (let k = Math.ceil(this.from / step - 1e-3); k * step <= this.to * 1.001; k++) found.push(k * step)
     }
     const slack = this.log ? 0 : 1e-3 * (this.to - this.from)
     return found.filter((x) => x >= this.from * (this.log ? 0.999 : 1) - slack && x <= this.to * (this.log ? 1.001 : 1) + slack)
@@ -61,24 +65,18 @@ export class Scale {
   }
 }
 
-/** Scales of the points; that of sigma takes whole decades of the survey's unit. */
+/** Scales of the points. */
 export function pointScales(model) {
   const sigma = Float64Array.from({ length: model.pointCount }, (_, j) => model.sigma(j))
-  const known = sigma.filter((s) => s > 0).sort()
-  const decade = (x, round) => 10 ** round(Math.log10(x * model.fine.factor)) / model.fine.factor
-  const low = known.length ? decade(known[Math.floor(0.02 * known.length)], Math.floor) : 1e-3
-  const high = known.length ? decade(known[Math.floor(0.98 * known.length)] * 1.0001, Math.ceil) : 1
-  const rms = model.a["point.rms"]
+  const known = sigma.filter((s) => s > 0)
+  const { rays, rms, angle } = { rays: model.a["point.rays"], rms: model.a["point.rms"], angle: model.a["point.angle"] }
   const scales = {
-    sigma: new Scale("sigma of a point", model.fine.unit, low, Math.max(high, 10 * low), {
-      log: true,
-      factor: model.fine.factor,
-    }),
-    rays: new Scale("rays of a point", "", 2, 20, { reversed: true }),
-    rms: new Scale("RMS residual of a point", "px", 0.01, 1, { log: true }),
-    angle: new Scale("intersection angle", "deg", 0, 90, { reversed: true }),
+    sigma: ratioScale("sigma of a point", model.fine.unit, known, { factor: model.fine.factor }),
+    rays: equalScale("rays of a point", "", rays, { reversed: true }),
+    rms: ratioScale("RMS residual of a point", "px", rms),
+    angle: equalScale("intersection angle", "deg", angle, { reversed: true }),
   }
-  const values = { sigma, rays: model.a["point.rays"], rms, angle: model.a["point.angle"] }
+  const values = { sigma, rays, rms, angle }
   if (!known.length) delete scales.sigma
   if (model.a["point.displacement"]) {
     const displacement = Float64Array.from({ length: model.pointCount }, (_, j) => model.displacement(j))
@@ -90,7 +88,7 @@ export function pointScales(model) {
   const deviation = model.a["point.deviation"]
   if (deviation) {
     const most = roundAbove(deviation, model.fine.factor)
-    const options = { factor: model.fine.factor, steps: SIGNED }
+    const options = { factor: model.fine.factor, signed: true }
     const first = new Scale("deviation of a point", model.fine.unit, -most, most, options)
     return { scales: { deviation: first, ...scales }, values: { deviation, ...values } }
   }
@@ -104,8 +102,34 @@ function roundAbove(values, factor) {
   return step * Math.ceil(size / step)
 }
 
-export function photoScale() {
-  return new Scale("RMS residual of a photograph", "px", 0.01, 1, { log: true })
+export function photoScale(model) {
+  return ratioScale("RMS residual of a photograph", "px", model.a["photo.rms"])
+}
+
+/** A scale of equal ratios, from one of 1, 2, 5 times a power of ten to another, about all values but a few. */
+function ratioScale(name, unit, values, { factor = 1 } = {}) {
+  const sorted = Float64Array.from(values).filter((x) => x > 0 && Number.isFinite(x)).sort()
+  const [least, most] = sorted.length ? ends(sorted) : [0.1, 1]
+  const from = roundStep(least * factor)
+  return new Scale(name, unit, from / factor, Math.max(roundUp(most * factor), 2 * from) / factor, { log: true, factor })
+}
+
+/** A scale of equal parts between round numbers about all values but a few. */
+function equalScale(name, unit, values, options) {
+  const sorted = Float64Array.from(values).filter(Number.isFinite).sort()
+  const [least, most] = sorted.length ? ends(sorted) : [0, 1]
+  const step = Math.max(1, roundStep((most - least) / 4 || 1))
+  const from = step * Math.floor(least / step)
+  return new Scale(name, unit, from, Math.max(step * Math.ceil(most / step), from + step), options)
+}
+
+function ends(sorted) {
+  return [OUTSIDE, 1 - OUTSIDE].map((part) => sorted[Math.round(part * (sorted.length - 1))])
+}
+
+/** The smallest of 1, 2, 5 times a power of ten that is not below a value. */
+function roundUp(value) {
+  return 1 / roundStep(1 / value)
 }
 
 /** Draw a scale with its labels; its ends can be typed. */

@@ -5,7 +5,7 @@ import { make } from "./page.js"
 import { fixed, significant, toPrecision } from "./numbers.js"
 import { Table } from "./tables.js"
 
-export function tablesOf(model, hub, element, scene) {
+export function tablesOf(model, hub, element) {
   const { unit, fine } = model
   const a = model.a
   const short = (value) => (Number.isFinite(value) ? significant(value) : "")
@@ -35,7 +35,7 @@ export function tablesOf(model, hub, element, scene) {
       ...(a["point.deviation"] ? [number("deviation", "deviation", (j) => a["point.deviation"][j] * fine.factor, short, fine.unit)] : []),
     ],
     every(model.pointCount),
-    (j) => ({ kind: "point", index: j, from: "table" }),
+    (j) => ({ kind: "point", index: j }),
     "point",
   )
   add(
@@ -50,7 +50,7 @@ export function tablesOf(model, hub, element, scene) {
       number("rms", "RMS", (i) => a["photo.rms"][i], short, "px"),
     ],
     every(model.photoCount),
-    (i) => ({ kind: "photograph", index: i, from: "table" }),
+    (i) => ({ kind: "photograph", index: i }),
     "photograph",
   )
   const ofRay = [
@@ -62,7 +62,7 @@ export function tablesOf(model, hub, element, scene) {
     number("w", "largest |w|", (k) => model.worstW(k), (v) => (Number.isFinite(v) ? v.toFixed(2) : "")),
   ]
   const fresh = () => ofRay.map((column) => ({ ...column }))
-  const pointOf = (k) => ({ kind: "point", index: a["ray.point"][k], ray: k, from: "table" })
+  const pointOf = (k) => ({ kind: "point", index: a["ray.point"][k], ray: k })
   add("image points", fresh(), every(model.rayCount), pointOf, "ray")
   add("rejected image points", fresh(), every(model.rayCount).filter((k) => model.rejected(k)), pointOf, "ray")
   add(
@@ -73,7 +73,7 @@ export function tablesOf(model, hub, element, scene) {
       ...[0, 1].map((c) => number("xy"[c], "xy"[c], (k) => model.pair("mark.xy", k)[c], (v) => fixed(v, 1), "px")),
     ],
     every(a["mark.photo"].length),
-    (k) => ({ kind: "photograph", index: a["mark.photo"][k], from: "table" }),
+    (k) => ({ kind: "photograph", index: a["mark.photo"][k] }),
     "mark",
   )
   add(
@@ -85,14 +85,13 @@ export function tablesOf(model, hub, element, scene) {
       number("sigma", "sigma given", (b) => (model.bars[b].sigma ?? NaN) * fine.factor, short, fine.unit),
     ],
     every(model.bars.length),
-    (b) => ({ kind: "point", index: model.bars[b].from, from: "table" }),
+    (b) => ({ kind: "point", index: model.bars[b].from }),
     "bar",
   )
   tabs(made, element)
   hub.on("select", (found) => {
     if (!found) return
     for (const { kind, table } of made) if (kind === found.kind && table.active !== found.index) table.reveal(found.index)
-    if (found.from === "table") scene?.centre(found.kind === "point" ? model.xyz(found.index) : model.centre(found.index))
   })
 }
 

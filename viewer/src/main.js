@@ -26,11 +26,12 @@ async function start() {
   const overlay = make("canvas", { className: "v-overlay", "aria-hidden": "true" })
   const hover = make("div", { className: "v-hover", hidden: true })
   const legends = make("div", { className: "v-legends" })
-  const stage = make("div", { className: "v-stage" }, canvas, overlay, legends, hover)
+  const stage = make("div", { className: "v-stage" }, canvas, overlay, hover)
+  const view = make("div", { className: "v-view" }, legends, stage)
   const tools = make("div", { className: "v-tools v-top" })
   const panel = make("div", { className: "v-panel", tabIndex: 0, role: "region", "aria-label": "what is chosen" })
   const tables = make("div", { className: "v-tables" })
-  root.querySelector(".v-app").replaceChildren(tools, make("div", { className: "v-main" }, stage, panel), tables)
+  root.querySelector(".v-app").replaceChildren(tools, make("div", { className: "v-main" }, view, panel), tables)
 
   let scene = null
   try {
@@ -51,15 +52,16 @@ async function start() {
     hub.on("select", (found) => scene.select(found))
   }
   new Panel(model, panel, hub, scene ?? { measure() {} })
-  tablesOf(model, hub, tables, scene)
+  tablesOf(model, hub, tables)
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
   })
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.invalidate())
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.paint())
   let printed = null // a copy, since the canvas of the scene is empty by the time its page is laid out on paper
   const print = (on) => {
     if (!scene) return
     scene.printing = on
+    scene.paint()
     printed?.remove()
     printed = on ? pictureOf(scene) : null
     if (printed) stage.append(printed)
@@ -67,20 +69,21 @@ async function start() {
   }
   window.addEventListener("beforeprint", () => print(true))
   window.addEventListener("afterprint", () => print(false))
-  matchMedia("print").addEventListener("change", () => scene?.invalidate())
+  matchMedia("print").addEventListener("change", () => scene?.paint())
   requestAnimationFrame(() => requestAnimationFrame(() => (root.dataset.ready = (performance.now() - begun).toFixed(0))))
   root.viewer = { model, scene, hub } // for who writes a test
 }
 
 function toolbar(model, scene, hub, tools, legends) {
   const { scales, values } = pointScales(model)
-  const photos = photoScale()
+  const photos = photoScale(model)
   const own = make("div", { className: "v-legend" })
   const other = make("div", { className: "v-legend" })
   legends.append(own, other)
   let by = scales.displacement ? "displacement" : scales.deviation ? "deviation" : scales.sigma ? "sigma" : "rms"
   let byPhoto = "rms"
   const paint = () => {
+    for (const scale of [...Object.values(scales), photos]) scale.dark = scene.dark
     scene.points.paint(values[by], scales[by])
     scene.photographs.paint(model.a["photo.rms"], byPhoto === "rms" ? photos : null)
     drawLegend(scales[by], own, make, paint)
@@ -89,14 +92,15 @@ function toolbar(model, scene, hub, tools, legends) {
     scene.scales = { point: scales[by], photograph: photos, values: values[by] }
     scene.invalidate()
   }
-  const find = make("input", { type: "search", placeholder: "name of a point or photograph", "aria-label": "find by name" })
+  scene.paint = paint
+  const find = make("input", { type: "search", placeholder: "point or photograph", "aria-label": "find by name" })
   find.setAttribute("list", "viewer-names")
   const names = make("datalist", { id: "viewer-names" })
   find.addEventListener("input", () => suggest(model, find.value, names))
   find.addEventListener("change", () => findName(model, scene, hub, find))
   const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
-  const views = [["", "view ..."], ["home", "oblique"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
+  const views = [["", "view ..."], ["home", "oblique"], ["all", "with all photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {
     if (name) scene.standard(name)
     standard.firstElementChild.value = ""
@@ -110,6 +114,7 @@ function toolbar(model, scene, hub, tools, legends) {
       paint()
     }),
     standard,
+    button("reset", () => scene.home(), { title: "the whole object, from obliquely above" }),
     tick("orthographic", false, (on) => scene.setOrthographic(on)),
     tick("names", false, (on) => {
       scene.names = on
@@ -119,9 +124,10 @@ function toolbar(model, scene, hub, tools, legends) {
       scene.photographs.object.visible = on
       scene.invalidate()
     }),
-    tick("rays of what is chosen", true, (on) => {
+    tick("rays of what is chosen", false, (on) => {
       scene.rays.on = on
-      scene.select(scene.selected ?? null)
+      scene.rays.show(scene.selected ?? null)
+      scene.invalidate()
     }),
     tick("all rejected rays", false, (on) => {
       scene.rays.showRejected(on)
@@ -205,7 +211,6 @@ function findName(model, scene, hub, input) {
       if (index < 0) continue
       input.classList.remove("v-wrong")
       hub.tell("select", { kind, index })
-      scene.centre(kind === "point" ? model.xyz(index) : model.centre(index))
       return
     }
   }

@@ -4,7 +4,7 @@ import * as THREE from "three"
 
 export class Rays {
   constructor(model, origin) {
-    Object.assign(this, { model, origin, on: true, withRejected: true })
+    Object.assign(this, { model, origin, on: false })
     this.accepted = lines([], "#2f9e5c")
     this.rejected = lines([], "#d8342b")
     this.accepted.material.transparent = true

@@ -15,6 +15,11 @@ const STEP_RAD = 0.12 // that an arrow key turns
 const SLOW_MS = 36 // from frame to frame: then fewer points are drawn while the scene turns
 const MAX_THIN = 16
 const REST_MS = 250 // after which all points are drawn again
+const FILLED = 0.9 // part of the canvas that a view fills
+const FAR_RADII = 1.5 // points farther out than so many radii of the object do not make a view smaller
+const NEIGHBOURS = 6 // points seen around a chosen one
+const CLOSEST = 0.1 // of the object's radius: the smallest radius around a chosen point
+const BACKGROUND = { light: 0xf7f9fb, dark: 0x10151b }
 
 export class Scene {
   constructor(model, canvas, overlay, hub) {
@@ -41,9 +46,9 @@ export class Scene {
     this.names = false
     this.picker = new Picker(this)
     this.home()
+    this.resize()
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement)
     this.listen()
-    this.resize()
   }
 
   /** Choose origin, size and the direction that is up: from the object towards the photographs. */
@@ -56,7 +61,9 @@ export class Scene {
     const stations = Array.from({ length: model.photoCount }, (_, i) => distanceOf(model.centre(i), middle))
     const far = stations.sort((a, b) => a - b)[Math.floor(0.9 * (stations.length - 1))] || 0
     this.radius = Math.max(this.objectRadius, far)
-    this.middle = this.middleOfAll(model)
+    const places = (count, place) => Array.from({ length: count }, (_, k) => this.local(place(k)))
+    this.object = places(n, (j) => model.xyz(j)).filter((p) => p.length() <= FAR_RADII * this.objectRadius)
+    this.stations = places(model.photoCount, (i) => model.centre(i)).filter((p) => p.length() <= FAR_RADII * this.radius)
     this.pyramid = 0.09 * (median(stations) || this.objectRadius) * Math.min(1, Math.sqrt(40 / model.photoCount))
     const towards = new THREE.Vector3()
     for (let i = 0; i < model.photoCount; i++) {
@@ -69,21 +76,6 @@ export class Scene {
     const axis = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((v) => new THREE.Vector3(...v))
     const near = axis.find((v) => Math.abs(v.dot(this.up)) > 0.94)
     if (near) this.up = near.multiplyScalar(Math.sign(near.dot(this.up)))
-  }
-
-  /** Middle of the box around points and photographs, and the radius about it. */
-  middleOfAll(model) {
-    const box = new THREE.Box3()
-    for (let j = 0; j < model.pointCount; j++) {
-      const p = this.local(model.xyz(j))
-      if (p.length() <= this.objectRadius) box.expandByPoint(p)
-    }
-    for (let i = 0; i < model.photoCount; i++) {
-      const p = this.local(model.centre(i))
-      if (p.length() <= this.radius) box.expandByPoint(p)
-    }
-    this.allRadius = box.isEmpty() ? this.radius : 0.5 * box.getSize(new THREE.Vector3()).length()
-    return box.isEmpty() ? new THREE.Vector3() : box.getCenter(new THREE.Vector3())
   }
 
   barEnds() {
@@ -154,6 +146,7 @@ export class Scene {
     if (new THREE.Vector3().crossVectors(up, turned).length() > 0.05 * turned.length()) offset.copy(turned)
     this.camera.position.copy(target).add(offset)
     this.controls.update()
+    this.view = null
     this.moved()
   }
 
@@ -165,22 +158,37 @@ export class Scene {
       this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target)
     }
     this.controls.update()
+    this.view = null
     this.invalidate()
   }
 
-  /** Look at the centre from a direction, so that everything is seen. */
-  look(direction, up, target = this.middle.clone(), radius = this.allRadius) {
+  /** Look along a direction so that positions, the object's unless others are given, fill the canvas. */
+  look(direction, up, seen = this.object) {
+    const from = direction.clone().normalize()
+    const right = new THREE.Vector3().crossVectors(up, from).normalize()
+    const upwards = new THREE.Vector3().crossVectors(from, right)
     const { clientWidth, clientHeight } = this.canvas.parentElement
-    const narrow = Math.max(1, clientHeight / Math.max(1, clientWidth))
-    const distance = (narrow * radius) / Math.sin((FIELD_DEG / 2) * (Math.PI / 180))
+    const high = Math.tan((FIELD_DEG / 2) * (Math.PI / 180)) * FILLED
+    const wide = (high * Math.max(1, clientWidth)) / Math.max(1, clientHeight)
+    const largest = (value) => seen.reduce((most, p) => Math.max(most, value(p)), -Infinity)
+    const depth = (largest((p) => p.dot(from)) - largest((p) => -p.dot(from))) / 2
+    // The planes through the edges of the canvas touch the outermost positions, in both directions.
+    const [x, y] = [[right, wide], [upwards, high]].map(([axis, tangent]) => {
+      const slope = this.camera.isOrthographicCamera ? 0 : tangent
+      const most = (sign) => largest((p) => sign * p.dot(axis) + slope * (p.dot(from) - depth))
+      return { middle: (most(1) - most(-1)) / 2, distance: (most(1) + most(-1)) / 2 / tangent }
+    })
+    const distance = Math.max(x.distance, y.distance, 1e-3 * this.objectRadius)
+    const target = right.multiplyScalar(x.middle).addScaledVector(upwards, y.middle).addScaledVector(from, depth)
     for (const camera of [this.perspective, this.orthographic]) {
       camera.up.copy(up)
-      camera.position.copy(direction).normalize().multiplyScalar(distance).add(target)
+      camera.position.copy(from).multiplyScalar(distance).add(target)
     }
     this.orthographic.zoom = 1
-    this.span = radius
+    this.span = (distance * high) / FILLED
+    this.view = { direction: from, up: up.clone(), seen }
     this.follow(target)
-    this.resize()
+    this.frame()
   }
 
   follow(target) {
@@ -189,12 +197,14 @@ export class Scene {
     this.controls.zoomToCursor = true
     this.controls.target.copy(target)
     this.controls.addEventListener("change", () => this.moved())
+    this.controls.addEventListener("start", () => (this.view = null))
     this.controls.update()
+    this.camera.updateMatrixWorld()
   }
 
-  home() {
+  home(seen) {
     const [a, b] = across(this.up)
-    this.look(this.up.clone().multiplyScalar(0.75).add(a.multiplyScalar(-0.35)).add(b.multiplyScalar(-0.8)), this.up)
+    this.look(this.up.clone().multiplyScalar(0.75).add(a.multiplyScalar(-0.35)).add(b.multiplyScalar(-0.8)), this.up, seen)
   }
 
   standard(name) {
@@ -203,7 +213,7 @@ export class Scene {
       "+X": [[1, 0, 0], z], "-X": [[-1, 0, 0], z], "+Y": [[0, 1, 0], z], "-Y": [[0, -1, 0], z],
       "+Z": [[0, 0, 1], new THREE.Vector3(0, 1, 0)], "-Z": [[0, 0, -1], new THREE.Vector3(0, 1, 0)],
     }
-    if (!views[name]) return this.home()
+    if (!views[name]) return this.home(name === "all" ? [...this.object, ...this.stations] : undefined)
     this.look(new THREE.Vector3(...views[name][0]), views[name][1])
   }
 
@@ -222,24 +232,51 @@ export class Scene {
       this.camera.position.copy(target).addScaledVector(away, this.span / from.zoom / half)
     }
     this.follow(target)
-    this.resize()
+    if (this.view) this.look(this.view.direction, this.view.up, this.view.seen)
+    else this.frame()
   }
 
-  /** Bring a position to the middle without turning; closer where the view is a wide one. */
-  centre(xyz) {
-    const target = this.local(xyz)
-    const step = target.clone().sub(this.controls.target)
-    this.camera.position.add(step)
+  /** Bring a position to the middle without turning, and a radius about it to fill the canvas unless nearer. */
+  approach(target, radius) {
+    const { clientWidth, clientHeight } = this.canvas
+    const across = Math.min(clientWidth, clientHeight) * this.unitsPerPixel()
+    const factor = Math.min(1, (2 * radius) / across)
+    const offset = this.camera.position.clone().sub(this.controls.target)
+    if (this.camera.isOrthographicCamera) this.camera.zoom /= factor
+    else offset.multiplyScalar(factor)
+    this.camera.position.copy(target).add(offset)
+    this.view = null
     this.follow(target)
-    this.invalidate()
+    this.camera.updateProjectionMatrix()
   }
 
+  /** Radius about a point with its nearest neighbours in it. */
+  surroundings(position) {
+    const lengths = this.object.map((p) => p.distanceTo(position)).sort((a, b) => a - b)
+    const near = lengths[Math.min(NEIGHBOURS, lengths.length - 1)] ?? 0
+    return Math.max(near, CLOSEST * this.objectRadius)
+  }
+
+  /** Show what is chosen: a point in the middle and near; a photograph together with the object if it is not seen. */
   select(found) {
     this.selected = found
     this.points.select(found?.kind === "point" ? found.index : -1)
     this.photographs.select(found?.kind === "photograph" ? found.index : -1)
     this.rays.show(found)
+    if (found?.kind === "point") {
+      const position = this.local(this.model.xyz(found.index))
+      this.approach(position, this.surroundings(position))
+    } else if (found) {
+      const station = this.local(this.model.centre(found.index))
+      if (!this.sees(station)) this.look(this.camera.position.clone().sub(this.controls.target), this.camera.up.clone(), [...this.object, station])
+    }
     this.invalidate()
+  }
+
+  /** Whether a position is on the canvas. */
+  sees(position) {
+    const at = this.project(position)
+    return at !== null && at[0] >= 0 && at[1] >= 0 && at[0] <= this.canvas.clientWidth && at[1] <= this.canvas.clientHeight
   }
 
   /** Draw the line whose length is measured. */
@@ -256,9 +293,16 @@ export class Scene {
     this.renderer.setSize(width, height)
     this.overlay.width = width * this.renderer.getPixelRatio()
     this.overlay.height = height * this.renderer.getPixelRatio()
-    const aspect = width / height
+    if (this.view) this.look(this.view.direction, this.view.up, this.view.seen)
+    else this.frame()
+  }
+
+  /** Fit both cameras to the shape of the canvas. */
+  frame() {
+    const { clientWidth, clientHeight } = this.canvas.parentElement
+    const aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight)
     this.perspective.aspect = aspect
-    const half = this.span * (aspect < 1 ? 1 / aspect : 1)
+    const half = this.span
     Object.assign(this.orthographic, { left: -half * aspect, right: half * aspect, top: half, bottom: -half })
     this.perspective.updateProjectionMatrix()
     this.orthographic.updateProjectionMatrix()
@@ -304,11 +348,15 @@ export class Scene {
     this.hub.tell("thin", part)
   }
 
+  get dark() {
+    return matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
+  }
+
   draw() {
     this.due = false
     this.pace()
-    const dark = matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
-    this.renderer.setClearColor(dark ? 0x10151b : 0xf7f9fb)
+    const { dark } = this
+    this.renderer.setClearColor(dark ? BACKGROUND.dark : BACKGROUND.light)
     this.points.setDark(dark)
     this.renderer.render(this.world, this.camera)
     if (!this.overlay.hidden) drawLabels(this, dark)
