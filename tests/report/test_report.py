@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,6 +43,7 @@ from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
+from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of
 
@@ -284,6 +286,28 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     assert "too small" in tags.text
     assert "1 of 9 photographs is not in the result." in tags.text
     assert f"{result.adjustment.sigma0_px:.4f} px" in tags.text
+
+
+def test_plots_are_legible_on_a_telephone(browser: Any, result: SurveyResult, tmp_path: Path) -> None:
+    """They keep a width at which their numbers can be read and are moved sideways, the page is not."""
+    found = findings_of(result)
+    (tmp_path / "report.html").write_text(report_page(found, all_plots(plot_data(found)), ()), "utf-8")
+    tab = Tab(browser, tmp_path / "report.html", width=390)
+    widths = tab.page.locator(".plot img").evaluate_all("all => all.map((one) => one.clientWidth)")
+    assert min(widths) >= 700
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
+    tab.close()
+
+
+def test_fixed_coordinates_have_neither_unknown_precision_nor_residuals() -> None:
+    network, truth = make_network(seed_of("all fixed"), images=4, points=12, noise_px=0.1)
+    fixed = ObjectPoints(np.arange(12), truth.points, np.zeros((12, 3, 3)))
+    a = adjust(replace(network, control=fixed), truth, datum=Datum("control"))
+    found = findings_of(SurveyResult("fixed", "mm", 4, (), a, np.arange(12), None))
+    page = report_page(found, (), ())
+    assert np.isnan(found.precision.rms).all() and "standard deviation [" not in page
+    assert ">rX</th>" not in page and page.count(">sX [") == 2  # of points and photographs
+    assert "None of the" in page and " 0 of " not in page
 
 
 def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> None:
