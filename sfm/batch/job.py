@@ -298,3 +298,6 @@ class _Telling:
 
     def advance(self, step: str = "") -> None:
         """Photographs are told where they are measured."""
+
+    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
+        """A batch shows the stages only."""

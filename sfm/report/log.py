@@ -120,6 +120,10 @@ class SurveyLog:
         with self._lock:
             self._steps += 1
 
+    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
+        """Pass on what the stage does; the log has the stages only."""
+        self._watch.step(name, done, total)
+
     def end_stage(self) -> None:
         """Write down the stage that is under way, if there is one."""
         if self._stage is not None:

@@ -1,14 +1,22 @@
-"""Progress: how a long run tells whoever watches which stage it is in and how far it got."""
+"""Progress: how a long run tells whoever watches which stage it is in and how far it got.
+
+Functions deep in a stage that know what they do, and of how many parts how many are done, call `report_step`.
+Whoever watches the stage is found by the context that `StageClock` sets, so that no call in between passes it
+on; without a stage, as where a function is used by itself, the report is ignored.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from contextvars import ContextVar
+from typing import Protocol, TypeVar
 
 from sfm.runtime.faults import working_on
 from sfm.runtime.memory import give_back_memory
+
+T = TypeVar("T")
 
 
 class Progress(Protocol):
@@ -20,6 +28,9 @@ class Progress(Protocol):
     def advance(self, step: str = "") -> None:
         """One step of the stage, such as a photograph of that name, is done."""
 
+    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
+        """Announce what the stage does now, and how many of how many parts of it are done, if known."""
+
 
 class Silent:
     """Progress that nobody watches."""
@@ -30,8 +41,31 @@ class Silent:
     def advance(self, step: str = "") -> None:
         """Take note of nothing."""
 
+    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
+        """Take note of nothing."""
+
 
 SILENT: Progress = Silent()
+_watching: ContextVar[Progress] = ContextVar("watching", default=SILENT)
+
+
+def report_step(name: str, done: int | None = None, total: int | None = None) -> None:
+    """Report what the present stage does, and how many of how many parts are done, if that is known."""
+    _watching.get().step(name, done, total)
+
+
+def reported(name: str, items: Iterator[T] | Collection[T], total: int) -> Iterator[T]:
+    """Yield items and report each as done when the next one is asked for.
+
+    Args:
+        name: what is done with them.
+        items: so many as `total`.
+        total: how many they are.
+    """
+    report_step(name, 0, total)
+    for k, item in enumerate(items):
+        yield item
+        report_step(name, k + 1, total)
 
 
 class StageClock:
@@ -49,7 +83,11 @@ class StageClock:
         """
         self.progress.stage(name, total)
         begun = time.perf_counter()
-        with working_on(f"stage {name}"):
-            yield
+        watching = _watching.set(self.progress)
+        try:
+            with working_on(f"stage {name}"):
+                yield
+        finally:
+            _watching.reset(watching)
         give_back_memory()
         self.seconds.append((name, time.perf_counter() - begun))

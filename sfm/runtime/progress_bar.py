@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.text import Text
 
 
 @contextmanager
-def drawn_progress() -> Iterator[Drawn]:
-    """Show a progress bar on stderr while it is a terminal; nothing else ever goes there but an error."""
-    console = Console(stderr=True)
+def drawn_progress(console: Console | None = None) -> Iterator[Drawn]:
+    """Show a progress bar while stderr is a terminal; nothing else ever goes there but an error.
+
+    Args:
+        console: in place of stderr.
+    """
+    console = console or Console(stderr=True)
     with Progress(
         TextColumn("{task.description:12}"),
         BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
+        _Counted(),
+        _Times(),
         TextColumn("{task.fields[step]}", style="dim"),
         console=console,
         disable=not console.is_terminal,
@@ -29,7 +35,7 @@ def drawn_progress() -> Iterator[Drawn]:
 
 
 class Drawn:
-    """Progress as a bar on the terminal: the stage, and the photographs done."""
+    """Progress as a bar on the terminal: the stage, what it does, and the photographs done."""
 
     def __init__(self, bar: Progress) -> None:
         self._bar = bar
@@ -40,13 +46,53 @@ class Drawn:
         if self._task is not None:
             task = self._bar.tasks[-1]
             if task.description == name:
-                self._bar.update(self._task, total=total)
+                self._bar.update(self._task, total=total, counted=total is not None)
                 return
             self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
             self._bar.stop_task(self._task)
-        self._task = self._bar.add_task(name, total=total, step="")
+        self._task = self._bar.add_task(name, total=total, step="", part="", counted=total is not None)
 
     def advance(self, step: str = "") -> None:
         """Count one step and name it."""
         if self._task is not None:
             self._bar.update(self._task, advance=1, step=step)
+
+    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
+        """Name what the stage does and count its parts; the count of other work begins anew."""
+        if self._task is None:
+            return
+        task = self._bar.tasks[-1]
+        if name != task.fields["part"] or total != task.total or (done or 0) < task.completed:
+            # what is left is estimated from the parts of this work alone; the time of the stage goes on
+            begun = task.start_time
+            self._bar.reset(self._task, total=total)
+            task.start_time, task.total = begun, total
+        self._bar.update(self._task, completed=done or 0, step=name, part=name)
+
+
+class _Counted(ProgressColumn):
+    """Parts done of all; nothing where nobody knows how many there are."""
+
+    def render(self, task: Task) -> Text:
+        """Return what is written."""
+        known = task.total is not None and (task.fields["counted"] or task.stop_time is None)
+        return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "", "progress.download")
+
+
+class _Times(ProgressColumn):
+    """Time since the stage began, and an estimate of what is left where the number of parts is known."""
+
+    max_refresh = 0.5  # s
+
+    def render(self, task: Task) -> Text:
+        """Return what is written."""
+        text = Text(_clock(task.elapsed or 0.0), "progress.elapsed")
+        left = task.time_remaining
+        if left and not task.finished:
+            text.append(f", about {_clock(left)} left", "progress.remaining")
+        return text
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as hours, minutes and seconds."""
+    return str(timedelta(seconds=max(0, round(seconds))))

@@ -17,6 +17,7 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.runtime.progress import reported
 from sfm.survey.adjusting.settling import MIN_IMAGE_POINTS, determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
@@ -164,7 +165,7 @@ def _match_and_adjust(
         The naming, its network, and the adjusted estimate.
     """
     estimate, tolerance_px = start.estimate, float(start.tolerance_px.max())
-    for _ in range(ROUNDS):
+    for _ in reported("rounds of matching", range(ROUNDS), ROUNDS):
         naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
         network = build_network(survey, photographs, naming)
         everything = np.ones(len(network.image_points), dtype=bool)

@@ -36,6 +36,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.runtime.progress import reported
 
 MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
@@ -140,11 +141,15 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
             if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
                 once.setdefault(one.family.cause(one), one)
     of_kind: Counter[object] = Counter()
-    tried = []
+    to_try = []
     for cause, one in once.items():
         of_kind[cause[0]] += 1
         if of_kind[cause[0]] <= MAX_TRIED:
-            tried.append((one, refit(plain, one, current, before)))
+            to_try.append(one)
+    tried = [
+        (one, refit(plain, one, current, before))
+        for one in reported("alternatives adjusted", to_try, len(to_try))
+    ]
     holding = [
         ((_beyond_spread(one, found.gain, reduced) if causes else found.gain) - one.price, one, found)
         for one, found in tried

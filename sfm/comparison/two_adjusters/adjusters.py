@@ -25,9 +25,11 @@ from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
 from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
+from sfm.display import program_name
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.network import Estimate, Network
+from sfm.runtime.progress import report_step
 
 # The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
 # does not tell whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
@@ -131,6 +133,7 @@ def compare_adjusters(
     adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=cameras))
     network, start, conversions, freed = common_problem(adjustment, model=model)
     rational = bool(start.cameras[0].plays(Role.DENOMINATOR).any())
+    report_step(f"adjusting with {program_name('kolinear')}")
     ours = _adjusted(network, start, adjustment.sigma_px)
     held: tuple[str, ...] = ()
     if rational and (ours.undetermined or not ours.converged):
@@ -142,6 +145,7 @@ def compare_adjusters(
         if held:
             start = replace(start, cameras=tuple(distortion_held(camera) for camera in start.cameras))
             ours = _adjusted(network, start, adjustment.sigma_px)
+        report_step(f"adjusting with {program_name(name)}")
         theirs = backend(network, start)
         found = compare(
             ours.estimate, theirs.estimate, network, covariance=ours.covariance, names=("kolinear", name)

@@ -23,6 +23,7 @@ from sfm.matching.tracks.features import Features, matched_features
 from sfm.matching.tracks.natural_points import NaturalPoints
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
 from sfm.network import rows_of
+from sfm.runtime.progress import reported
 
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
@@ -109,11 +110,10 @@ def link_features(
     pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
 
     def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
-        return list(
-            in_threads(
-                lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of.tolist(), threads
-            )
+        matches = in_threads(
+            lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of.tolist(), threads
         )
+        return list(reported("pairs of photographs matched", matches, len(of)))
 
     matched = matched_pairs(pairs)
     linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
@@ -242,7 +242,8 @@ def measure_tracks(
         at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
 
     of_pair = rows_of(pair.ravel(), len(pairs))
-    for _ in in_threads(match, range(len(pairs)), threads):
+    matches = in_threads(match, range(len(pairs)), threads)
+    for _ in reported("pairs of photographs measured", matches, len(pairs)):
         pass
     good = np.isfinite(measured).all(axis=1)
     matched = np.bincount(tracks.point[good], minlength=n)

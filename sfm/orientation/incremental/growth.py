@@ -19,6 +19,7 @@ from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.runtime.progress import report_step
 
 FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
@@ -187,6 +188,7 @@ class Growth:
             position[i], rotation[i] = result.position, result.rotation
             self.reasons.pop(i, None)
         self.estimate = replace(self.estimate, position=position, rotation=rotation)
+        report_step("photographs oriented", int(self.estimate.oriented.sum()), len(position))
         return added
 
     def resection(self, i: int, own: IntArray, uv: FloatArray) -> RobustResection:

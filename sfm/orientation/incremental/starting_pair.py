@@ -17,6 +17,7 @@ from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.ransac import resect_robust
+from sfm.runtime.progress import report_step
 from sfm.similarity import fit_similarity
 
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
@@ -97,6 +98,7 @@ def best_start(
     for tried, (i, j) in enumerate(pairs):
         if tried == BARREN_PAIRS and not holds:
             break
+        report_step("pairs tried as a start", tried, len(pairs))
         points, first, second = _common(network, tangents, own[i], own[j])
         limit = float(max(tolerance[i], tolerance[j]))
         try:

@@ -26,6 +26,7 @@ from sfm.result import (
     LeftOutPoint,
     PhotographTargets,
 )
+from sfm.runtime.progress import report_step
 from sfm.stored_result import NO_SCALE
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
@@ -129,6 +130,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
     given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
     unit = survey.unit if given else NO_SCALE
+    report_step("testing the assumptions")
     judged = judge_alternatives(final, unit=unit)
     return Solution(
         final,
@@ -184,6 +186,7 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
     placed = add_exterior(matched.network, matched.estimate, survey.exterior, survey.datum.kind)
     network, estimate = placed.network, placed.estimate
     datum = Datum(survey.datum.kind)
+    report_step("choosing the free parameters of the cameras")
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
     known, oriented = estimate.determined, estimate.oriented
@@ -233,6 +236,7 @@ def _free_network(start: _Prepared) -> _Free | None:
     task, estimate = start.task, start.estimate
     if _has_no_identity(task.survey):
         return None
+    report_step("adjusting the image points alone")
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations())
     task = replace(task, network=network)
     if task.datum.kind == "control":
@@ -267,6 +271,7 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
         )
     if _has_no_identity(task.survey):
         return task, JudgedGiven(network, task.datum)
+    report_step("testing the given values")
     # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
     adjustment = None if free is None or free.settled.held else free.settled.adjustment
     given = judge_given(
@@ -325,6 +330,7 @@ def _solved(start: _Prepared) -> _Solved:
     first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     better: tuple[Remark, ...] = ()
     while True:
+        report_step("adjusting all observations")
         settled = settle(task, estimate) if ready is None else ready
         iterations += settled.iterations if ready is None else 0
         ready = None
@@ -332,6 +338,7 @@ def _solved(start: _Prepared) -> _Solved:
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
         starts = (*_of_pair(final), *(() if first is None else _left(final, first[1])))
+        report_step("looking for other solutions")
         others = other_solutions(final, starts=starts, had_to_be_held=c_held)
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()

@@ -27,6 +27,7 @@ from sfm.matching.lsm.warp import linear_part
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
+from sfm.runtime.progress import reported
 
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
 FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it
@@ -117,7 +118,8 @@ def find_covering_points(
     covered = Covered([one.shape for one in photographs])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
-    for i in np.asarray(order).tolist():
+    in_order = np.asarray(order).tolist()
+    for i in reported(f"photographs covered by windows of {window_px} px", in_order, len(in_order)):
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
             continue
         xy = textured_squares(photographs[i], side_px, covered.free_middles(i, side_px), border_px=margin)
