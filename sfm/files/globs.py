@@ -6,13 +6,32 @@ import fnmatch
 import os
 import re
 from collections.abc import Callable, Iterator
+from difflib import get_close_matches
 from glob import has_magic
 from pathlib import Path
 
 from sfm.errors import SurveyFileError
+from sfm.files.plain_text import as_plain
 
 MAX_ENTRIES = 500_000  # files and folders that are looked at
 BELOW = "**"  # a folder and all below it
+
+
+def why_no_folder(path: Path) -> str:
+    """Return why something is no folder: a file, or nothing, with the nearest name there is."""
+    return (
+        "is a file, a folder is needed" if path.exists() else f"there is no such folder{nearest_name(path)}"
+    )
+
+
+def nearest_name(path: Path) -> str:
+    """Return a question for the name beside a path that does not exist which is most like it, or nothing."""
+    try:
+        names = sorted(os.listdir(path.parent))[:MAX_ENTRIES]
+    except OSError:
+        return ""
+    like = get_close_matches(path.name, names, 1)
+    return f", did you mean {as_plain(str(path.with_name(like[0])))}?" if like else ""
 
 
 def find_files(

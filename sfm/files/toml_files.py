@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with the
 
 # What people write in place of TOML: what the line looks like, and what to write.
 SLIPS = (
-    (re.compile(r"=\s*[-+]?\d+,\d+\s*(?:#.*)?$"), "a number has a decimal point, not a comma"),
+    (
+        re.compile(r"=\s*(?:[-+]?\d+,\d+\s*(?:#.*)?$|\[[^\]\"']*\d,0\d)"),
+        "a number has a decimal point, not a comma",
+    ),
     (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text stands between straight quotation marks, \" or '"),
     (
         re.compile(r'"[^"\n]*\\[^"\n]*"'),
@@ -32,16 +36,18 @@ SLIPS = (
     (re.compile(r"^[^=\[#]+$"), "neither a section in [ ] nor a key with = and its value"),
 )
 
+_SECTION = re.compile(r"^\s*\[{1,2}\s*([^\[\]]+?)\s*\]{1,2}\s*(?:#.*)?$")
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_KEY_PARTS}}}")
 
 
-def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
+def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple[str, dict[str, Any]]:
     """Return the text of a file and its table.
 
     Args:
         path: the file.
         what: it is, with its article, for messages.
+        repeated: sections of which a file may have several, each in [[ ]].
 
     Raises:
         SurveyFileError: unreadable, too large, or no TOML.
@@ -66,25 +72,35 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     try:
         return text, tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise SurveyFileError(f"{path}{_slip(text, str(error))}") from error
+        raise SurveyFileError(f"{path}{_slip(text, str(error), repeated)}") from error
     except (ValueError, RecursionError) as error:
         told = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
         raise SurveyFileError(f"{path}: not a TOML file: {told}") from error
 
 
-def _slip(text: str, message: str) -> str:
+def _slip(text: str, message: str, repeated: Collection[str]) -> str:
     """Return where and what is wrong in words for people; what the parser says where it is nothing usual."""
     found = re.search(r"\(at line (\d+), column \d+\)$", message)
     number = int(found[1]) if found else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
-    if twice := re.match(r"Cannot declare \('(.{1,40}?)',?\) twice", message):
-        return f", line {number}: [{as_plain(twice[1])}] stands twice; put its keys into one section"
+    if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
+        return f", line {number}: {_doubled(text.splitlines(), number, section[1], repeated)}"
     if message.startswith("Cannot overwrite a value"):
         return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} stands twice"
     for looks, write in SLIPS if len(line) <= MAX_SAID else ():
         if looks.search(line):
             return f", line {number}: {as_plain(line.strip())}: {write}"
     return f": not a TOML file: {_cut(message)}"
+
+
+def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
+    """Return where a section that stands twice stands first, and what to write."""
+    found = (_SECTION.match(one) for one in lines[: number - 1])
+    first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
+    shown = as_plain(name[:MAX_SAID])
+    where = "" if first is None else f", first in line {first}"
+    write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"
+    return f"[{shown}] stands twice{where}; {write}"
 
 
 def _cut(message: str) -> str:

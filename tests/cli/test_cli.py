@@ -236,7 +236,7 @@ def test_no_photographs_found(
     line = refused(monkeypatch, capsys, "run", survey, "--images", tmp_path / "empty")
     assert "no photographs found: camera kamera needs '*.jpg'" in line
     line = refused(monkeypatch, capsys, "run", survey, "--images", tmp_path / "nowhere")
-    assert "nowhere: no such folder" in line
+    assert "nowhere: there is no such folder" in line
 
 
 def test_photographs_of_different_sizes(
@@ -285,6 +285,18 @@ def test_wrong_survey_files(
 
 def test_no_survey_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert "none.toml: neither a survey file nor a folder" in refused(monkeypatch, capsys, "run", "none.toml")
+
+
+def test_what_is_no_folder_is_said_and_the_nearest_name_is_offered(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "one.jpg").touch()
+    for command in ("run", "init"):
+        assert f"mean {tmp_path / 'photos'}?" in refused(monkeypatch, capsys, command, tmp_path / "fotos")
+        assert "mean" not in refused(monkeypatch, capsys, command, tmp_path / "else.where")
+    assert "is a file" in refused(monkeypatch, capsys, "init", tmp_path / "one.jpg")
+    assert "is a photograph" in refused(monkeypatch, capsys, "run", tmp_path / "one.jpg")
 
 
 def test_run_and_adjust_know_their_surveys(

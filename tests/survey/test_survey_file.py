@@ -182,7 +182,13 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         ('name = "camcal"', "name =", r"line 2: name =: no value follows"),
         ('name = "camcal"', "camcal", r"line 2: camcal: neither a section in \[ \] nor a key"),
         ('name = "camcal"', 'name = "camcal"\nname = "b"', r"line 3: name stands twice"),
-        ("[control]", "[survey]", r"line \d+: \[survey\] stands twice"),
+        ("[control]", "[survey]", r"line \d+: \[survey\] stands twice, first in line 1; put"),
+        (
+            "[control]",
+            "[camera]",
+            r"line \d+: \[camera\] stands twice, first in line 4; write \[\[camera\]\]",
+        ),
+        ("c_mm = 7.3", "c_mm = 7.3\npixel_mm = [0,005, 0,005]", r"line \d+: .*: a number has a decimal"),
         ('name = "camcal"', "name = [1 2]", r"not a TOML file: .*line 2"),
     ],
 )

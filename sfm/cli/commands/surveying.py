@@ -181,6 +181,7 @@ def _run_survey(
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import tell_result
+        from sfm.files.globs import nearest_name
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings.findings import findings_of
@@ -188,6 +189,7 @@ def _run_survey(
         from sfm.report.output import write_result
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.survey.drafting.draft import SUFFIXES
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.photograph_list import find_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
@@ -195,7 +197,9 @@ def _run_survey(
         from sfm.survey.measuring.measured_store import MeasuredStore
 
     if not survey_file.exists():
-        raise KolinearError(f"{survey_file}: neither a survey file nor a folder of photographs is there")
+        raise KolinearError(f"{survey_file}: neither a survey file nor a folder{nearest_name(survey_file)}")
+    if survey_file.suffix.lower() in SUFFIXES:
+        raise KolinearError(f"{survey_file}: is a photograph, not a survey file; give its folder")
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
     if from_photographs is None:  # whichever it is

@@ -60,6 +60,7 @@ def view(
 
         from adapters.formats.registry import format_of, read_comparable
         from adapters.formats.targets_table import read_targets
+        from sfm.files.globs import why_no_folder
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.html.view_page import photographs_in, refuse_foreign_page, write_view
         from sfm.report.viewer.stored_scene import scene_of_stored
@@ -70,7 +71,7 @@ def view(
     page = place.with_name(f"{place.name}.html") if out is None else out
     refuse_foreign_page(page)
     if images is not None and not images.is_dir():
-        raise OutputError(f"--images {images}: is no folder")
+        raise OutputError(f"--images {images}: {why_no_folder(images)}")
     with working_on(str(source)):
         stored = read_comparable(source, from_format)
         rejected = w = seen = None

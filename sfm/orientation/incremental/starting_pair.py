@@ -98,7 +98,7 @@ def best_start(
     for tried, (i, j) in enumerate(pairs):
         if tried == BARREN_PAIRS and not holds:
             break
-        report_step("pairs tried as a start", tried, len(pairs))
+        report_step("starting pairs tried", tried, len(pairs))
         points, first, second = _common(network, tangents, own[i], own[j])
         limit = float(max(tolerance[i], tolerance[j]))
         try:

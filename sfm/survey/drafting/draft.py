@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.files.globs import why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.file_checks import conversion_of
@@ -85,7 +86,7 @@ def draft_survey(
 def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
     """Size and EXIF data of the photographs of a folder, and which cannot be read."""
     if not folder.is_dir():
-        raise SurveyFileError(f"{folder}: no such folder")
+        raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
     every = sorted(folder.iterdir())
     files = [
         path for path in every if (path.suffix.lower() in SUFFIXES or conversion_of(path)) and path.is_file()

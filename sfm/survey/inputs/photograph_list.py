@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.errors import SurveyFileError
-from sfm.files.globs import find_files
+from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.survey.inputs.checks.contradictions import SurveySettings
 from sfm.survey.inputs.interior import refuse_ungrouped
@@ -53,7 +53,9 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
     """
     folder = Path(images_dir) if images_dir is not None else survey.folder
     if not folder.is_dir():
-        raise SurveyFileError(f"{folder}: no such folder; photographs of survey {survey.name} were needed")
+        raise SurveyFileError(
+            f"{folder}: {why_no_folder(folder)}; photographs of survey {survey.name} were needed"
+        )
 
     def refuse_outside(path: Path) -> None:
         if images_dir is not None and is_own_file(path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_origin
 
 from pydantic import Field, PrivateAttr, ValidationError
 
@@ -179,7 +179,9 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
         raise SurveyFileError(
             f"{as_plain(str(path))}: the path has control or invisible characters; rename the file or folder"
         )
-    text, table = read_toml(path, "a survey file")
+    fields = SurveyFile.model_fields.items()
+    repeated = {one.alias or name for name, one in fields if get_origin(one.annotation) is tuple}
+    text, table = read_toml(path, "a survey file", repeated=repeated)
     try:
         survey = SurveyFile.model_validate(table)
     except ValidationError as error:

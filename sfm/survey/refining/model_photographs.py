@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray
 from sfm.errors import PhotographError, SurveyFileError
+from sfm.files.globs import why_no_folder
 from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.radiometry import Grey
 from sfm.network import Estimate, Network
@@ -74,7 +75,7 @@ def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list
         SurveyFileError: one with an orientation is not in the folder, or outside of it.
     """
     if not folder.is_dir():
-        raise SurveyFileError(f"{folder}: no such folder; the photographs of the model were needed")
+        raise SurveyFileError(f"{folder}: {why_no_folder(folder)}; the photographs of the model were needed")
     paths = [_path_in(folder, name) for name in network.images]
     lost = [i for i in np.flatnonzero(estimate.oriented) if not paths[i].is_file()]
     if lost:
