@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, WIDE_ANGLE, Role, number_of, observe
 from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
@@ -50,7 +51,8 @@ class Camera:
         n = len(self.names)
         if len(self.parameters) != n:
             raise SurveyFileError(
-                f"camera {self.name}: {len(self.parameters)} parameters, model {self.model} has {n}"
+                f"camera {self.name}: {counted(len(self.parameters), 'parameter')}, model "
+                f"{self.model} has {n}"
             )
         if len(self.shared) not in (0, n):
             raise SurveyFileError(f"camera {self.name}: {len(self.shared)} groups of {n} parameters")
@@ -176,7 +178,7 @@ def camera_from_values(
     for what, value, count in (("size_px", size, 2), ("pixel_mm", pixel, 2), ("c_mm", np.asarray([c_mm]), 1)):
         if value.shape != (count,) or not (np.isfinite(value) & (value > 0)).all():
             raise SurveyFileError(
-                f"camera {name}: {what} {value.tolist()}, expected {count} positive number{'s' * (count > 1)}"
+                f"camera {name}: {what} {value.tolist()}, expected {counted(count, 'positive number')}"
             )
     names = MODELS[model].names
     free = (free,) if isinstance(free, str) else free

@@ -40,6 +40,25 @@ def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
     return "\n".join([title, *told])
 
 
+def plural(noun: str, count: float) -> str:
+    """Return a noun as it stands after a number, with an s unless that is 1."""
+    return noun if count == 1 else f"{noun}s"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return how many of something there are.
+
+    Args:
+        count: of them.
+        noun: what one of them is.
+
+    Examples:
+        >>> counted(1, "photograph"), counted(12, "image point")
+        ('1 photograph', '12 image points')
+    """
+    return f"{count} {plural(noun, count)}"
+
+
 def listed(texts: Iterable[str], *, most: int = MAX_LISTED, separator: str = ", ") -> str:
     """Return texts one after the other, the first few of many, and how many more there are.
 

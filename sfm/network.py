@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix, triu
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
 
 MAX_NAMES = 10  # in a message
@@ -184,7 +184,8 @@ class Network:
         k = len(image)
         if not k or len(point) != k or measured.shape != (k, 2) or not np.isfinite(measured).all():
             raise GeometryError(
-                f"network: {k} photographs, {len(point)} points and positions {measured.shape} of image "
+                f"network: {counted(k, 'photograph')}, {counted(len(point), 'point')} and "
+                f"positions {measured.shape} of image "
                 "points; expected k names, k names and finite numbers (k, 2)"
             )
         try:
@@ -274,14 +275,14 @@ class Network:
         return pairs.row.astype(np.int64), pairs.col.astype(np.int64), pairs.data.astype(np.int64)
 
     def __repr__(self) -> str:
-        counted = (
+        parts = (
             (len(self.images), "photograph"),
             (len(self.points), "point"),
             (len(self.image_points), "image point"),
             (len(self.control), "control point"),
             (len(self.scale_bars), "scale bar"),
         )
-        told = [f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count]
+        told = [counted(count, what) for count, what in parts if count]
         return f"<Network: {', '.join(told)}>"
 
 

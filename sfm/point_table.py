@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.display import html_table, text_table
+from sfm.display import counted, html_table, text_table
 from sfm.errors import BackendError
 from sfm.network import index_of
 
@@ -106,7 +106,7 @@ class PointTable(Sequence[Point]):
     @property
     def _title(self) -> str:
         more = f", the first {SHOWN}" if len(self) > SHOWN else ""
-        return f"{len(self)} points{f', {self.unit}' if self.unit else ''}{more}"
+        return f"{counted(len(self), 'point')}{f', {self.unit}' if self.unit else ''}{more}"
 
     def __repr__(self) -> str:
         return text_table(self._title, HEADER, self._rows())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
 from sfm.remarks.remark import Remark
 from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
-from sfm.targets.flags import Flag, count_flags
+from sfm.targets.flags import LIKEST_FIRST, Flag, count_flags
 
 COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
 
@@ -332,6 +333,15 @@ def _reason(flag: int) -> str:
     """Return in words why a candidate was not measured."""
     names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
     return ", ".join(names) or "no reason kept"
+
+
+def likest_first(reasons: Iterable[str]) -> list[str]:
+    """Return reasons against candidates in words, those of candidates that are most like targets first.
+
+    What is no reason against a candidate, such as that a target was measured and not used, comes before them.
+    """
+    rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKEST_FIRST)}
+    return sorted(reasons, key=lambda reason: (rank.get(reason, -1), reason))
 
 
 def in_words(flag_name: str) -> str:

@@ -44,8 +44,12 @@ def text_of(node: ast.expr) -> str:
         return node.value if isinstance(node.value, str) else VARIES
     if isinstance(node, ast.JoinedStr):
         return "".join(text_of(one) for one in node.values)
+    if isinstance(node, ast.FormattedValue):
+        return text_of(node.value) if isinstance(node.value, ast.Call) else VARIES
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
         return text_of(node.left) + text_of(node.right)
+    if isinstance(node, ast.Call) and called(node) == "counted" and isinstance(node.args[1], ast.Constant):
+        return f"{VARIES} {node.args[1].value}s"
     return VARIES
 
 

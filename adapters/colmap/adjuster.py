@@ -29,6 +29,7 @@ from adapters.colmap.reconstruction import (
 )
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import BackendError, MissingLibraryError, one_line
 from sfm.files.plain_text import as_plain
 from sfm.network import Estimate, Network
@@ -118,7 +119,7 @@ def adjust_with_colmap(
     behind = int(np.isnan(residuals[:, 0]).sum())
     if behind:
         # Ceres gives them no residual, so that losing a point behind a camera lowers its cost.
-        converged, message = False, f"{behind} image points ended behind their camera"
+        converged, message = False, f"{counted(behind, 'image point')} ended behind their camera"
     return ColmapAdjustment(
         adjusted,
         residuals,

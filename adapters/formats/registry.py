@@ -36,6 +36,7 @@ from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
 from sfm.camera import Camera
+from sfm.display import counted
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links
@@ -233,7 +234,8 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
     network, estimate = read_any(path, form.name)
     if not (estimate.oriented.any() or estimate.determined.any()):
         raise SurveyFileError(
-            f"{path}: {len(network.image_points)} image points as format {form.name}, but no coordinates of "
+            f"{path}: {counted(len(network.image_points), 'image point')} as format "
+            f"{form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
     points_named, images_named = form.names
@@ -300,13 +302,16 @@ def written(name: str, network: Network, estimate: Estimate) -> str:
     """Return what of a network a format holds, in words."""
     form = format_named(name)
     if not form.models:
-        return f"{int(estimate.determined.sum())} points"
-    image_points = f"{len(network.image_points)} image points"
+        return counted(int(estimate.determined.sum()), "point")
+    image_points = counted(len(network.image_points), "image point")
     if name == "colmap-database":
-        return f"{len(network.images)} photographs, {image_points}, no coordinates of points"
+        return f"{counted(len(network.images), 'photograph')}, {image_points}, no coordinates of points"
     images, points = estimate.oriented, estimate.determined
     if not form.placed:
         images, points = np.ones_like(images), np.ones_like(points)
     seen = network.image_points
     kept = images[seen.image] & (points[seen.point] | (name != "tables"))
-    return f"{int(images.sum())} photographs, {int(points.sum())} points, {int(kept.sum())} image points"
+    return (
+        f"{counted(int(images.sum()), 'photograph')}, "
+        f"{counted(int(points.sum()), 'point')}, {counted(int(kept.sum()), 'image point')}"
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray
-from sfm.display import html_table, text_table
+from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
 
@@ -92,7 +92,7 @@ class Adjustment:
     def steps(self) -> str:
         """How many iterations there were, in words; the start values of a survey are adjusted already."""
         return (
-            f"{self.iterations} iterations"
+            counted(self.iterations, "iteration")
             if self.iterations
             else "0 further iterations after the orientation"
         )

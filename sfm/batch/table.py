@@ -18,6 +18,7 @@ from rich.text import Text
 
 from sfm.batch.job import SurveyRow
 from sfm.batch.pages import totals
+from sfm.display import counted
 from sfm.kernels.compiling import COMPILING
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
@@ -140,9 +141,9 @@ def told_of(row: SurveyRow) -> str:
 def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None:
     """Print the outcome of a batch: how many worked, which did not and why, and where the page is."""
     count = [(name, n) for name, n in totals(rows).items() if name != "surveys"]
-    counted = [f"{len(rows)} survey{'' if len(rows) == 1 else 's'}"]
-    counted += [f"{n} {name}" for name, n in count if n or name == "done"]
-    console.print(Text(", ".join(counted), "bold"))
+    parts = [counted(len(rows), "survey")]
+    parts += [f"{n} {name}" for name, n in count if n or name == "done"]
+    console.print(Text(", ".join(parts), "bold"))
     for row in rows:
         if not row.succeeded:
             told = told_of(row) if row.status != "done" else f"{told_of(row)}: see its report"

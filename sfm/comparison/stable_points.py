@@ -22,6 +22,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
@@ -117,7 +118,7 @@ def find_stable_points(
     left = np.ones(len(chosen), dtype=bool) if start is None else start[chosen]
     begun = int(left.sum())
     if begun < least:
-        raise GeometryError(f"congruency: {begun} points, expected {least} or more")
+        raise GeometryError(f"congruency: {counted(begun, 'point')}, expected {least} or more")
     P = among.P.copy()
     w = P @ d
     if begun < len(chosen):

@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from sfm.comparison.stable_points import critical_value, in_datum
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.epochs.displacements import Displacements
 from sfm.errors import GeometryError
 from sfm.similarity import similarity_motions
@@ -94,7 +95,8 @@ def block_motion(
     chosen = np.flatnonzero(group)
     if len(chosen) < MIN_POINTS[model]:
         raise GeometryError(
-            f"group {name}: {len(chosen)} points, a {model} motion needs {MIN_POINTS[model]} or more"
+            f"group {name}: {counted(len(chosen), 'point')}, a {model} motion needs "
+            f"{MIN_POINTS[model]} or more"
         )
     d, Q, G = found.differences.difference, found.differences.covariance, found.differences.motions
     outside = found.stable & ~group

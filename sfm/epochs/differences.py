@@ -25,6 +25,7 @@ from sfm.comparison.pairing import fit_robustly, pair_results
 from sfm.comparison.point_pairs import PointPairs, coordinates_of, held_points, pairs_of_results
 from sfm.comparison.point_tests import known_scale
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import counted
 from sfm.epochs.epoch import SAME, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.stored_result import StoredResult
@@ -97,7 +98,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     pa, pb = pairs.T
     if len(pa) < 4:
         raise GeometryError(
-            f"{first.name} and {second.name} have {len(pa)} points in common, a test needs 4 or more"
+            f"{first.name} and {second.name} have {counted(len(pa), 'point')} in common, a "
+            "test needs 4 or more"
         )
     scale = known_scale(a, b)
     if scale is None and a.has_scale and b.has_scale:

@@ -21,6 +21,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sfm.comparison.pairing import fit_robustly
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.geometry.functions import joined
 from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of
@@ -148,7 +149,8 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
     """
     if len(plane) != 3 or len(line) != 2:
         raise GeometryError(
-            f"alignment 3-2-1: {len(plane)} points of the plane and {len(line)} of the line, expected 3 and 2"
+            f"alignment 3-2-1: {counted(len(plane), 'point')} of the plane and {len(line)} "
+            "of the line, expected 3 and 2"
         )
     a, b, c = (points.xyz[points.index(name)] for name in plane)
     d, e = (points.xyz[points.index(name)] for name in line)
@@ -325,7 +327,7 @@ def _agreeing(
     """Return the points that most of the others agree with, (n,)."""
     n = len(source)
     if n < 5:
-        raise GeometryError(f"alignment: {n} common points, a robust best fit needs 5 or more")
+        raise GeometryError(f"alignment: {counted(n, 'common point')}, a robust best fit needs 5 or more")
     d = fit_robustly(source, target, scale=scale).apply(source) - target
     length = np.linalg.norm(d, axis=1)
     if blocks is not None:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angles
+from sfm.display import counted
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
@@ -166,7 +167,8 @@ def codes_of(plan: PlannedSurvey, family: CodeFamily) -> IntArray:
     numbers = np.sort(np.asarray(family.number, dtype=np.int64))
     if plan.coded.sum() > len(numbers):
         raise SurveyFileError(
-            f"simulation: {plan.coded.sum()} coded targets, family {family.name} has {len(numbers)}"
+            f"simulation: {counted(plan.coded.sum(), 'coded target')}, family {family.name} "
+            f"has {len(numbers)}"
         )
     code = np.full(len(plan.points), UNCODED, dtype=np.int64)
     code[plan.coded] = numbers[: plan.coded.sum()]
@@ -282,7 +284,7 @@ def achieved(plan: PlannedSurvey, codes: str, result: StoredResult, sigma_px: fl
     pairs = [(names[str(c)], k) for k, c in enumerate(code) if c != UNCODED and str(c) in names]
     pairs = [(j, k) for j, k in pairs if np.isfinite(xyz[j]).all()]
     if len(pairs) < 3:
-        raise SurveyFileError(f"simulation: {len(pairs)} coded targets in the result, needed 3")
+        raise SurveyFileError(f"simulation: {counted(len(pairs), 'coded target')} in the result, needed 3")
     j, k = (np.array(column) for column in zip(*pairs, strict=True))
     placed = fit_similarity(xyz[j], plan.xyz[k]).apply(xyz)
     away = np.linalg.norm(plan.xyz[:, None] - placed[None], axis=2)

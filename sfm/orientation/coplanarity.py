@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import cross, solve_scaled, turn
@@ -38,7 +39,7 @@ def refine_coplanarity(
     """
     n = len(first)
     if n < UNKNOWNS or len(second) != n:
-        raise GeometryError(f"relative orientation: {n} pairs, at least {UNKNOWNS} are needed")
+        raise GeometryError(f"relative orientation: {counted(n, 'pair')}, at least {UNKNOWNS} are needed")
     b, R = np.array(base, dtype=float), np.array(rotation, dtype=float, order="C")
     uv1 = np.ascontiguousarray(first, dtype=float)
     uv2 = np.ascontiguousarray(second, dtype=float)

@@ -16,6 +16,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.design.candidates import Allowed, Candidates, candidates
@@ -72,11 +73,12 @@ def further_photographs(
     Source: Fedorov (1972); limiting error propagation, see `sfm.planning.design.gain`.
     """
     if count < 1:
-        raise GeometryError(f"plan: {count} further photographs, needed 1 or more")
+        raise GeometryError(f"plan: {counted(count, 'further photograph')}, needed 1 or more")
     known, oriented = estimate.determined & (network.rays() >= 2), np.flatnonzero(estimate.oriented)
     if len(oriented) < 2 or known.sum() < 3:
         raise GeometryError(
-            f"plan: {len(oriented)} photographs and {int(known.sum())} points of two rays, needed 2 and 3"
+            f"plan: {counted(len(oriented), 'photograph')} and "
+            f"{counted(int(known.sum()), 'point')} of two rays, needed 2 and 3"
         )
     before = predict(network, estimate)
     variance = np.trace(before.covariance.points, axis1=1, axis2=2) / 3

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.geometry.mesh import Mesh
 from sfm.planning.sight.occlusion import BoxTree, box_tree
@@ -69,7 +70,7 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
     Raises:
         GeometryError: fewer than 3 points, all on one line, or a normal of length 0.
     """
-    count = f"{len(xyz)} point{'s' * (len(xyz) != 1)}"
+    count = counted(len(xyz), "point")
     if len(xyz) < 3:
         raise GeometryError(f"object: {count}, needed 3 or more")
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
@@ -100,7 +101,7 @@ def object_of_mesh(
             triangles that do not run alike.
     """
     if count < 3:
-        raise GeometryError(f"object: {count} points asked for, needed 3 or more")
+        raise GeometryError(f"object: {counted(count, 'point')} asked for, needed 3 or more")
     edges = open_edges(mesh)
     if edges and not open_surface:
         raise GeometryError(

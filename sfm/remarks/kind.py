@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.display import listed
+from sfm.display import listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
@@ -104,7 +104,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     if "|" in spec:
         return spec.split("|")[0 if count == 1 else 1]
     if spec and spec[0].isalpha():
-        return f"{count:,.0f} {spec}{'' if count == 1 else 's'}"
+        return f"{count:,.0f} {plural(spec, count)}"
     if not isinstance(part, Quantity):
         return listed(_nouns(part, spec[1:]) if spec else part)
     return _number(part, spec)

@@ -21,6 +21,7 @@ import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
+from sfm.display import counted
 from sfm.errors import GeometryError, OutputError
 from sfm.files.manifest import refuse_foreign_files
 from sfm.files.plain_text import csv_text
@@ -305,7 +306,10 @@ def main() -> int:
         message, code = ending_of(error)
         print(f"error: {message}", file=sys.stderr)
         return code
-    print(f"{len(staging.names)} photographs of {len(staging.scene.targets)} targets in {given.folder}")
+    print(
+        f"{counted(len(staging.names), 'photograph')} of {len(staging.scene.targets)} "
+        f"targets in {given.folder}"
+    )
     return 0
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.epochs.blocks import BlockMotion
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.findings import verdict_of_epochs
@@ -94,7 +94,7 @@ def words_of_block(block: BlockMotion) -> str:
     parts = [part.name for part in block.parts if part.significant]
     how = " and ".join(parts) if parts else "nothing significant"
     rest = "its points moved as one" if block.fits else "what is left is significant: it changed its shape"
-    return f"{block.name} ({len(block.points)} points, {block.model}): {how}; {rest}"
+    return f"{block.name} ({counted(len(block.points), 'point')}, {block.model}): {how}; {rest}"
 
 
 def epochs_summary(found: EpochSeries) -> dict[str, Any]:

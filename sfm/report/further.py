@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import angles_from_rotation
+from sfm.display import counted
 from sfm.files.plain_text import csv_text
 from sfm.planning.further import Further
 from sfm.report.html.page import render
@@ -79,7 +80,7 @@ def headline(found: Further, result: StoredResult) -> str:
     known = np.isfinite(found.before)
     before, after = (_length(result, float(s[known].max())) for s in (found.before, found.after))
     count = len(found.stations)
-    return f"{count} more photograph{'s' * (count > 1)}: sigma of the worst point from {before} to {after}"
+    return f"{counted(count, 'more photograph')}: sigma of the worst point from {before} to {after}"
 
 
 def _level(found: Further) -> str:

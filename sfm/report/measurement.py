@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted, plural
 from sfm.files.covariance_file import MAX_POINTS, write_covariance
 from sfm.files.folder_lock import locked
 from sfm.files.plain_text import csv_text, or_none
@@ -217,22 +218,22 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
     }
 
 
-def counted(found: Measurement) -> str:
+def words_of_measured(found: Measurement) -> str:
     """Return in one line how much was measured, and how many deviations are decided in which way."""
     if not found.tolerances:
-        parts = [f"{len(found.points.names)} points"]
+        parts = [counted(len(found.points.names), "point")]
         if found.shapes:
-            parts.append(f"{len(found.shapes)} shape{'s' * (len(found.shapes) != 1)}")
+            parts.append(counted(len(found.shapes), "shape"))
         if found.quantities:
             count = len(found.quantities)
             kinds = {one.kind for one in found.quantities}  # length, angle
-            words = f"{kinds.pop()}{'s' * (count != 1)}" if len(kinds) == 1 else "lengths and angles"
+            words = plural(kinds.pop(), count) if len(kinds) == 1 else "lengths and angles"
             parts.append(f"{count} {words}")
         return ", ".join(parts) + "."
     counts = {one: sum(t.count(one) for t in found.tolerances) for one in DECISIONS}
     total = sum(counts.values())
     told = [f"{count} {decision}" for decision, count in counts.items() if count]
-    return f"{total} deviation{'s' * (total != 1)} judged by ISO 14253-1: {', '.join(told)}."
+    return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(told)}."
 
 
 def scene_viewer(found: Measurement, result: StoredResult) -> Viewer | None:

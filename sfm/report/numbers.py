@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import METRES, FloatArray
+from sfm.display import counted
 from sfm.remarks.kind import significant as significant
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
@@ -128,6 +129,7 @@ def is_number(text: str) -> bool:
 FILTERS = {
     one.__name__: one
     for one in (
+        counted,
         fixed,
         probability,
         plus,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.files.plain_text import or_none
 from sfm.orientation.resection.by_method import Resected
@@ -83,7 +84,7 @@ def comparison_table(found: dict[str, Resected | GeometryError], c: float) -> st
 
 def resection_text(found: Resected, c: float) -> str:
     """Return what one method finds as text; c in mm."""
-    lines = [f"{found.method}, {found.points} points"]
+    lines = [f"{found.method}, {counted(found.points, 'point')}"]
     for k, solution in enumerate(found.solutions, start=1):
         one = _plain(solution, c)
         lines.append(f"solution {k}: rms {one['rms_mm']:.6f} mm")

@@ -44,6 +44,15 @@ class Flag(IntFlag):
     DAMAGED = 1 << 23  # a nick, a scratch or a mark in the target was left out of the fit
 
 
+# Reasons for a rejection, those first of which a candidate is most like a target: it has passed the tests of
+# those below, which `candidates` asks first. The last two are no targets lost.
+LIKEST_FIRST = (
+    *(Flag.NOT_ON_PLATE, Flag.POOR_FIT, Flag.THIN_BACKGROUND, Flag.LOBED, Flag.UNEVEN_EDGE, Flag.BLURRED),
+    *(Flag.LOW_CONTRAST, Flag.TOO_OBLIQUE, Flag.TOO_LARGE, Flag.NO_CONVERGENCE, Flag.CUT_BY_BORDER),
+    *(Flag.NOT_ELLIPTIC, Flag.TOO_SMALL, Flag.PART_OF_CODE, Flag.DUPLICATE),
+)
+
+
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:
     """Return (name of flag, number of entries that carry it), most frequent first, without zeros.
 

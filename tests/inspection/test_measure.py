@@ -18,7 +18,7 @@ from sfm.errors import KolinearError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.remarks.remark import kinds_of
-from sfm.report.measurement import counted, write_measurement
+from sfm.report.measurement import words_of_measured, write_measurement
 from sfm.stored_result import StoredResult
 from tests.inspection.benches import (
     DIAMETERS,
@@ -143,7 +143,7 @@ def test_everything_is_measured_within_its_standard_deviations(tmp_path: Path) -
     assert [one.count("in") for one in found.tolerances] == [25, 85, 25]
     assert found.tolerances[1].missing == ("nowhere",) and found.verdict.level == "fair"
     assert kinds_of(found.verdict.remarks) == ("nominal_missing",)
-    assert counted(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
+    assert words_of_measured(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
     groups = dict(found.groups)
     assert len(groups["plate"]) == 25 and found.group_of(int(groups["plate"][0])) == "plate"
 
@@ -228,7 +228,7 @@ def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
 
 def test_a_result_without_features_gives_its_points(tmp_path: Path) -> None:
     found = measure_result(one_bench())
-    assert counted(found) == "85 points." and found.verdict.level == "good"
+    assert words_of_measured(found) == "85 points." and found.verdict.level == "good"
     page = write_measurement(found, one_bench(), tmp_path / "out")
     assert page.is_file()
 

@@ -27,6 +27,7 @@ EVIL = "<img src=https://example.org/x onerror=document.title='broken'>"
 IMAGES, POINTS = 5, 24
 RADIUS_PX = 9
 REJECTED = 3  # a ray
+REASONS = ("measured, not part of the result", "too small")  # what matters most first
 
 SELECT = "([kind, index]) => document.getElementById('explore').viewer.hub.tell('select', {kind, index})"
 PLACE = """(j) => {
@@ -81,7 +82,7 @@ def small_scene() -> ViewerScene:
     stored = StoredResult("viewer", network, truth, own, unit="m", covariance=joint)
     made = scene_of_stored(stored, rejected=rejected)
     ellipse = np.tile([float(RADIUS_PX), float(RADIUS_PX), 0.0], (len(made.rays), 1))
-    marks = Marks(np.array([0, 0]), np.array([[50.0, 60.0], [80.0, 60.0]]), np.array([0, 0]), ("too small",))
+    marks = Marks(np.array([0, 0]), np.array([[50.0, 60.0], [80.0, 60.0]]), np.array([1, 0]), REASONS)
     bar = Bar(1, 2, 0.5, 1e-4, 2e-5)
     return replace(made, rays=replace(made.rays, ellipse=ellipse), marks=marks, bars=(bar,), control=(3,))
 
@@ -327,6 +328,14 @@ def test_rejected_candidates_tell_their_reason(tab: Tab) -> None:
     box = page.locator(".v-photo").bounding_box()
     page.mouse.move(box["x"] + 50.5 / SIZE_PX[0] * box["width"], box["y"] + 60.5 / SIZE_PX[1] * box["height"])
     assert page.locator(".v-told").inner_text() == "x 50.0, y 60.0 px: too small"
+
+
+def test_what_was_seen_and_not_used_opens_with_what_matters(tab: Tab) -> None:
+    page = tab.page
+    page.get_by_role("tab", name=re.compile("seen and not used")).click()
+    rows = page.get_by_role("table", name="seen and not used").locator("tbody tr[data-row]")
+    assert [REASONS[k] in rows.nth(k).inner_text() for k in range(2)] == [True, True]
+    page.get_by_role("tab", name=re.compile("^points")).click()
 
 
 def test_distance_has_its_sigma_from_the_joint_covariance(tab: Tab, scene: ViewerScene) -> None:

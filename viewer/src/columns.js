@@ -72,7 +72,7 @@ export function tablesOf(model, hub, element) {
       text("reason", "reason", (k) => model.reasons[a["mark.reason"][k]]),
       ...[0, 1].map((c) => number("xy"[c], "xy"[c], (k) => model.pair("mark.xy", k)[c], (v) => fixed(v, 1), "px")),
     ],
-    every(a["mark.photo"].length),
+    every(a["mark.photo"].length).sort((k, l) => a["mark.reason"][k] - a["mark.reason"][l] || k - l),
     (k) => ({ kind: "photograph", index: a["mark.photo"][k] }),
     "mark",
   )

@@ -6,7 +6,7 @@ import { MAX_ELLIPSOIDS } from "./ellipsoids.js"
 import { unpack } from "./data.js"
 import { button, choice, Hub, make, tick } from "./page.js"
 import { Panel } from "./panel.js"
-import { roundStep, significant } from "./numbers.js"
+import { counted, roundStep, significant } from "./numbers.js"
 import { Scene } from "./scene.js"
 import { tablesOf } from "./columns.js"
 
@@ -224,10 +224,10 @@ function showHover(model, stage, box, { found, x, y }) {
   if (kind === "point") {
     const s = model.sigma(index)
     const words = Number.isFinite(s) ? `sigma ${significant(s * model.fine.factor)} ${model.fine.unit}, ` : ""
-    box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${model.a["point.rays"][index]} rays, RMS ${significant(model.a["point.rms"][index])} px`)
+    box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${counted(model.a["point.rays"][index], "ray")}, RMS ${significant(model.a["point.rms"][index])} px`)
   } else {
     const address = model.picture("thumbnail", index)
-    const words = ` ${model.a["photo.points"][index]} points, RMS ${significant(model.a["photo.rms"][index])} px`
+    const words = ` ${counted(model.a["photo.points"][index], "point")}, RMS ${significant(model.a["photo.rms"][index])} px`
     box.replaceChildren(make("b", {}, model.photographs[index]), words)
     if (address) box.append(make("img", { src: address, alt: "", width: 160 }))
   }

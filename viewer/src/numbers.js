@@ -22,6 +22,11 @@ export function fixed(value, decimals) {
   return Number.isFinite(value) ? value.toFixed(decimals) : UNKNOWN
 }
 
+/** A number of things: one point, two points. */
+export function counted(count, noun) {
+  return `${count} ${noun}${count === 1 ? "" : "s"}`
+}
+
 export function signed(value, decimals) {
   if (!Number.isFinite(value)) return UNKNOWN
   return (value >= 0 ? "+" : "") + value.toFixed(decimals)

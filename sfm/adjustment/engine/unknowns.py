@@ -17,6 +17,7 @@ from sfm.adjustment.engine.ordering import by_point, whitening_of
 from sfm.adjustment.result import scaled_covariance
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
@@ -311,11 +312,11 @@ def _hold_undetermined(
         if not (lost_points.any() or lost_images.any()):
             break
         held += [
-            f"point {network.points[j]}: {rays[j]} ray{'s' if rays[j] != 1 else ''}, {MIN_RAYS} are needed"
+            f"point {network.points[j]}: {counted(rays[j], 'ray')}, {MIN_RAYS} are needed"
             for j in np.flatnonzero(lost_points)
         ]
         held += [
-            f"photograph {network.images[i]}: {seen[i]} points, {MIN_POINTS} are needed"
+            f"photograph {network.images[i]}: {counted(seen[i], 'point')}, {MIN_POINTS} are needed"
             for i in np.flatnonzero(lost_images)
         ]
         defect += int((3 - 2 * rays[lost_points]).sum() + (6 - 2 * seen[lost_images]).sum())

@@ -18,6 +18,7 @@ from sfm.adjustment.engine.unknowns import angle_jacobian, interior_names
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.kernels.threads import own_threads
 
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
@@ -36,7 +37,7 @@ class OrientationCorrelation:
     @property
     def partners(self) -> str:
         """All that it is strongly correlated with, in words."""
-        return ", ".join(f"{part} of {n} photograph{'s' if n > 1 else ''}" for part, n in self.counts)
+        return ", ".join(f"{part} of {counted(n, 'photograph')}" for part, n in self.counts)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.normals import times_schur
 from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.network import Estimate, Network
 
 MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
@@ -77,7 +78,7 @@ def undetermined_of(
     rays = np.bincount(layout.observations.point[weight > 0], minlength=len(network.points))[open_points]
     words += [
         f"point {network.points[j]}: "
-        + ("its rays are parallel" if r > 1 else f"{r} ray{'s' * (r != 1)} accepted, {MIN_RAYS} are needed")
+        + ("its rays are parallel" if r > 1 else f"{counted(r, 'ray')} accepted, {MIN_RAYS} are needed")
         for j, r in zip(open_points.tolist(), rays.tolist(), strict=True)
     ]
     if optimum.motions.defect > allowed_motions:

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from sfm.cli.commands.starting import FAILED, loading
 from sfm.cli.first_use import compile_first
+from sfm.display import counted
 from sfm.errors import KolinearError, MissingLibraryError
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def _check_adjustment() -> str:
     worst = float((moved / sigma).max())
     if worst > WRONG_SIGMAS:
         raise KolinearError(f"a point is {worst:.1f} standard deviations off")
-    return f"{len(truth.points)} points, worst {worst:.1f} standard deviations off"
+    return f"{counted(len(truth.points), 'point')}, worst {worst:.1f} standard deviations off"
 
 
 def _check_colmap() -> str:

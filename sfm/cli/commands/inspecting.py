@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
+from sfm.display import counted
 from sfm.runtime.faults import working_on
 
 NOT_KEPT = 1  # exit code where a limit is proven not to be kept
@@ -51,7 +52,7 @@ def measure(
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.features_file import read_features_file
         from sfm.inspection.measure import measure_result
-        from sfm.report.measurement import counted, parameter_rows, quantity_rows, write_measurement
+        from sfm.report.measurement import parameter_rows, quantity_rows, words_of_measured, write_measurement
         from sfm.report.numbers import with_sigma
 
     refuse_foreign_folder(out)
@@ -61,7 +62,7 @@ def measure(
         found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
     page = write_measurement(found, result, out, drawings=_drawings(found))
     tell_verdict(found.verdict)
-    print(counted(found))
+    print(words_of_measured(found))
     for fit in found.shapes:
         said = [
             f"{name} {' +- '.join(with_sigma(value, sigma))} {unit}"
@@ -69,7 +70,7 @@ def measure(
             if not axis
         ]
         what = f"{fit.shape.kind.name} {fit.name}: {', '.join((*said, ''))}"
-        print(f"{what}form error {fit.form_error:.3g} {found.unit}, {fit.used.sum()} points")
+        print(f"{what}form error {fit.form_error:.3g} {found.unit}, {counted(fit.used.sum(), 'point')}")
     rows = quantity_rows(found)
     for name, what, value, sigma, unit, remark in rows[:MAX_PRINTED]:
         told = f"{name} ({what}): {' +- '.join(with_sigma(value, sigma))} {unit}"

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]
     except ValueError:
         found = ()
     if not found or not all(map(math.isfinite, found)) or (count is not None and len(found) != count):
-        wanted = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
+        wanted = "numbers" if count is None else counted(count, "number")
         raise SurveyFileError(f"{what} {text:.60}: expected {wanted} separated by commas")
     return found
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
+from sfm.display import counted
 from sfm.runtime.faults import working_on
 
 
@@ -103,6 +104,7 @@ def more_command(
         place = ", ".join(f"{x:.6g}" for x in shot.position)
         print(
             f"  {shot.station}: {place} {stored.unit}, azimuth {shot.azimuth_deg:.0f} deg, elevation "
-            f"{shot.elevation_deg:.0f} deg, roll {shot.roll_deg:.0f} deg, shows {shot.points} points"
+            f"{shot.elevation_deg:.0f} deg, roll {shot.roll_deg:.0f} deg, shows "
+            f"{counted(shot.points, 'point')}"
         )
     print(f"Report: {page}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
+from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
 
@@ -94,7 +95,10 @@ def view(
         write_view(
             scene, page, source=str(source), paths=paths, budget_mb=budget, jobs=cores(), progress=progress
         )
-    print(f"{len(scene.photographs)} photographs, {len(scene.points)} points, {len(scene.rays)} image points")
+    print(
+        f"{counted(len(scene.photographs), 'photograph')}, "
+        f"{counted(len(scene.points), 'point')}, {counted(len(scene.rays), 'image point')}"
+    )
     for note in scene.notes:
         print(note)
     print(f"Page: {page}")

@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
 from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_weighted
@@ -159,11 +160,11 @@ def _fit(
         raise GeometryError('the standard deviations of the points are not known, expected weights = "equal"')
     xyz = points.xyz[rows]
     if len(rows) < kind.min_points:
-        raise GeometryError(f"{len(rows)} points, a {kind.name} needs {kind.min_points}")
+        raise GeometryError(f"{counted(len(rows), 'point')}, a {kind.name} needs {kind.min_points}")
     centroid = xyz.mean(axis=0)
     size = float(np.sqrt(((xyz - centroid) ** 2).sum(axis=1).mean()))
     if not size > 0:
-        raise GeometryError(f"its {len(rows)} points coincide")
+        raise GeometryError(f"its {counted(len(rows), 'point')} coincide")
     x = (xyz - centroid) / size
     Q = None if points.covariance is None else _covariance(points, rows)
     _refuse_flat(kind, x, points.blocks[rows] / size**2, axis_held="direction" in hold)
@@ -281,9 +282,7 @@ def _held(
             of_cone = [one for one in known if not (kind.name == "cone" and one == "radius")]
             raise GeometryError(f"hold '{name}', expected one of {', '.join(of_cone)}")
         if numbers.size != wanted or not np.isfinite(numbers).all():
-            raise GeometryError(
-                f"hold {name}: found {value}, expected {wanted} finite number{'s' * (wanted > 1)}"
-            )
+            raise GeometryError(f"hold {name}: found {value}, expected {counted(wanted, 'finite number')}")
         if name == kind.place:
             origin = (numbers - centroid) / size
             free[:3] = False
@@ -345,22 +344,24 @@ def _refuse_flat(kind: Kind, x: FloatArray, blocks: FloatArray, *, axis_held: bo
     sigma = float(np.sqrt(known.mean())) if np.isfinite(known).all() else 0.0
     limit = max(COLLINEAR * spread[0], min(UNCERTAIN * sigma, 0.1 * spread[0]))
     if kind.name != "line" and not axis_held and (len(spread) < 2 or spread[1] <= limit):
-        raise GeometryError(f"its {len(x)} points lie on a line")
+        raise GeometryError(f"its {counted(len(x), 'point')} lie on a line")
     flat = kind.name in ("sphere", "cylinder", "cone", "torus", "paraboloid")
     if flat and not axis_held and (len(spread) < 3 or spread[2] <= limit):
-        raise GeometryError(f"its {len(x)} points lie on a plane, a {kind.name} needs points in space")
+        raise GeometryError(
+            f"its {counted(len(x), 'point')} lie on a plane, a {kind.name} needs points in space"
+        )
 
 
 def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
     """Refuse points that do not determine all parameters."""
     u = A.shape[1]
     if constraints < u:
-        raise GeometryError(f"{constraints} distances for {u} parameters")
+        raise GeometryError(f"{constraints} distances for {counted(u, 'parameter')}")
     scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
     values = np.linalg.svd(A / scale, compute_uv=False)
     rank = int((values > RANK * values[0]).sum())
     if rank < u:
-        raise GeometryError(f"its points determine {rank} of its {u} parameters")
+        raise GeometryError(f"its points determine {rank} of its {counted(u, 'parameter')}")
 
 
 def _sigma_of_distances(

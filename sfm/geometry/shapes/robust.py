@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.geometry.shapes.kinds import Kind
 from sfm.geometry.shapes.orthogonal import refine_orthogonal
@@ -52,7 +53,7 @@ def robust_shape(
     """
     n, size = len(xyz), kind.min_points + MORE_POINTS
     if n < size + 1:
-        raise GeometryError(f"{n} points, a robust fit of a {kind.name} needs {size + 1} or more")
+        raise GeometryError(f"{counted(n, 'point')}, a robust fit of a {kind.name} needs {size + 1} or more")
     rng = np.random.default_rng(SEED)
     best, least = None, np.inf
     for trial in range(TRIALS + 1):

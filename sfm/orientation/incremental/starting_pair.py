@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.homography import PLANAR_POINTS
@@ -203,11 +203,13 @@ def _words_of_common(network: Network, own: list[IntArray]) -> str:
         if not len(own[i]):
             words.append(f"{network.images[i]}: no points")
         elif not len(pairs):
-            words.append(f"{network.images[i]}: none of its {len(own[i])} points is in another photograph")
+            words.append(
+                f"{network.images[i]}: none of its {counted(len(own[i]), 'point')} is in another photograph"
+            )
         else:
             p = int(pairs[np.argmax(count[pairs])])
             other = network.images[int(second[p] if first[p] == i else first[p])]
-            words.append(f"{network.images[i]}: {count[p]} points in common with {other}")
+            words.append(f"{network.images[i]}: {counted(count[p], 'point')} in common with {other}")
     return listed(words, most=10, separator="; ")
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 
 COINCIDENT = 1e-9  # of the extent of the points
@@ -73,7 +74,9 @@ def choose_by_line(
     least four points. The document names the principle without formulas; this is our reading of it.
     """
     if len(tangents) < MIN_TO_CHOOSE:
-        raise GeometryError(f"line fitting: {len(tangents)} points, at least {MIN_TO_CHOOSE} are needed")
+        raise GeometryError(
+            f"line fitting: {counted(len(tangents), 'point')}, at least {MIN_TO_CHOOSE} are needed"
+        )
     lines = tuple(_fit(tangents.ravel(), (tangents + solution.residuals).ravel()) for solution in solutions)
     departures = [line.departure for line in lines]
     if not np.isfinite(departures).any():
@@ -145,9 +148,12 @@ def checked_points(
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     n = len(xyz)
     if len(uv) != n:
-        raise GeometryError(f"{method}: {len(uv)} image points and {n} object points, one each is needed")
+        raise GeometryError(
+            f"{method}: {counted(len(uv), 'image point')} and {counted(n, 'object point')}, "
+            "one each is needed"
+        )
     if n < needed:
-        raise GeometryError(f"{method}: {n} point{'' if n == 1 else 's'}, at least {needed} are needed")
+        raise GeometryError(f"{method}: {counted(n, 'point')}, at least {needed} are needed")
     if not (np.isfinite(uv).all() and np.isfinite(xyz).all()):
         raise GeometryError(f"{method}: a coordinate is not a finite number")
     first = xyz[:needed]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 
 PARAMETERS = 11
@@ -66,7 +67,8 @@ def resect_dlt(
     needed = (PARAMETERS + d + 1) // 2
     if n < needed or len(xy) != n:
         raise GeometryError(
-            f"dlt: {min(n, len(xy))} points, at least {needed} are needed for {PARAMETERS + d} parameters"
+            f"dlt: {counted(min(n, len(xy)), 'point')}, at least {needed} are needed for "
+            f"{counted(PARAMETERS + d, 'parameter')}"
         )
     if not (np.isfinite(xy).all() and np.isfinite(xyz).all()):
         raise GeometryError("dlt: a coordinate is not a finite number")

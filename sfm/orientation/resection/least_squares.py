@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import solve_scaled, turn
@@ -65,7 +66,7 @@ def resect_least_squares(
     """
     n = len(points)
     if n < 3:
-        raise GeometryError(f"resection: {n} points, least squares needs at least 3")
+        raise GeometryError(f"resection: {counted(n, 'point')}, least squares needs at least 3")
     P = np.broadcast_to(np.eye(2), (n, 2, 2)) if weights is None else weights
     uv = np.ascontiguousarray(tangents, dtype=float)
     xyz = np.ascontiguousarray(points, dtype=float)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import bdtrc
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.kernels.options import compiled
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
@@ -104,7 +105,7 @@ def resect_robust(
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     if n < max(min_inliers, SAMPLE + 1):
-        return _failure(n, needed, f"{n} points, resection needs {needed}")
+        return _failure(n, needed, f"{counted(n, 'point')}, resection needs {needed}")
     weights = np.zeros((n, 2, 2))
     weights[:, 0, 0] = weights[:, 1, 1] = 1.0
     X0, R, used, residuals, N = (
@@ -120,7 +121,9 @@ def resect_robust(
     count = int(used.sum())
     if trials < 0:
         return _failure(
-            n, needed, f"no orientation fits any triple of its {n} points (collinear or coincident)"
+            n,
+            needed,
+            f"no orientation fits any triple of its {counted(n, 'point')} (collinear or coincident)",
         )
     if count < needed:
         return replace(

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.report.findings.geometry import Geometry
-from sfm.result import SurveyResult
+from sfm.result import SurveyResult, likest_first
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Rejected:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All reasons, most frequent first."""
-        return tuple(sorted(self.total.reasons, key=lambda reason: (-self.total.reasons[reason], reason)))
+        """All reasons, those of candidates that are most like targets first."""
+        return tuple(likest_first(self.total.reasons))
 
 
 def rejected_of(result: SurveyResult, geometry: Geometry) -> Rejected:

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.adjustment.quality.consistency import FAMILY, Consistency
 from sfm.adjustment.quality.statistics import ALPHA, component_tests, more_than_chance, robust_test
 from sfm.adjustment.result import Adjustment
-from sfm.display import program_name
+from sfm.display import counted, program_name
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level
 from sfm.report.findings.bundle_statistics import Statistics
@@ -30,7 +30,7 @@ def headlines_of(result: SurveyResult) -> dict[Level, str]:
     a = result.adjustment
     found = (
         f"{len(a.network.images)} of {result.images_total} photographs oriented, "
-        f"{len(a.network.points)} object points"
+        f"{counted(len(a.network.points), 'object point')}"
     )
     return {level: text.format(found=found) for level, text in HEADLINES.items()}
 

@@ -43,7 +43,7 @@ class Marks:
     photo: IntArray  # index of the photograph, in rising order, (c,)
     xy: FloatArray  # px, (c, 2)
     reason: IntArray  # index into `reasons`, (c,)
-    reasons: tuple[str, ...]  # in words
+    reasons: tuple[str, ...]  # in words, what matters most first
 
     @classmethod
     def none(cls) -> Marks:

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.report.viewer.scene import Marks
+from sfm.result import likest_first
 from sfm.stored_result import SeenTargets
 
 SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
@@ -32,7 +33,7 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     kept = np.flatnonzero(left)
     kept = kept[np.argsort(seen.image[kept], kind="stable")]
     words = [seen.reason[k] or UNUSED for k in kept.tolist()]
-    reasons = {word: number for number, word in enumerate(dict.fromkeys(words))}
+    reasons = {word: number for number, word in enumerate(likest_first(set(words)))}
     number = np.array([reasons[word] for word in words], dtype=np.int64)
     return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
 

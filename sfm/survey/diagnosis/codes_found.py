@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.conventions import AnyArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
 from sfm.remarks.remark import Remark, remark
@@ -38,7 +38,8 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     settings = survey.targets
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
-        f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
+        f"{sum(targets)} targets were found in {counted(len(targets), 'photograph')}, "
+        f"{sum(codes)} codes were read in "
         f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
@@ -140,7 +141,7 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
                 differ.append(f"polarity = '{polarity}'")
             if family != settings.codes and isinstance(family, str):
                 differ.append(f"codes = '{family}'")
-            words = f"; in {photographs.names[fullest]} {' and '.join(differ)} reads {count} codes"
+            words = f"; in {photographs.names[fullest]} {' and '.join(differ)} reads {counted(count, 'code')}"
     return words or _tags(photograph, photographs.names[fullest], settings.codes)
 
 

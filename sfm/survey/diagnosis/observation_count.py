@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
@@ -45,6 +46,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
         else "; add photographs or points"
     )
     raise GeometryError(
-        f"{n} common points in {m} photographs: {observations} observations and datum conditions for "
+        f"{counted(n, 'common point')} in {counted(m, 'photograph')}: {observations} "
+        "observations and datum conditions for "
         f"{unknowns} unknowns{free}, more are needed{advice}"
     )

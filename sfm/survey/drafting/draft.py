@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.display import counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
@@ -68,7 +69,7 @@ def draft_survey(
     used = [name for camera in grouping.cameras for name in camera.photographs]
     if len(used) < 2:
         raise GeometryError(
-            f"{folder}: {len(used)} photographs of one camera, at least 2 are needed"
+            f"{folder}: {counted(len(used), 'photograph')} of one camera, at least 2 are needed"
             + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:SHOWN])
         )
     trial = try_targets([folder / name for name in used], store=store, progress=progress)
@@ -151,7 +152,7 @@ def _text(
 def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
     globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
     lines = [
-        f"# {len(camera.photographs)} photographs of {camera.size_px[0]} x {camera.size_px[1]} px",
+        f"# {counted(len(camera.photographs), 'photograph')} of {camera.size_px[0]} x {camera.size_px[1]} px",
         "[[camera]]",
         f"name = {_quoted(camera.name)}",
         f"images = {json.dumps(globs, ensure_ascii=False)}",
@@ -216,7 +217,8 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
     found = [
         (
             f"camera {camera.name}",
-            f"{len(camera.photographs)} photographs, {camera.size_px[0]} x {camera.size_px[1]} px, c "
+            f"{counted(len(camera.photographs), 'photograph')}, {camera.size_px[0]} x "
+            f"{camera.size_px[1]} px, c "
             f"{camera.c_mm:.4g} mm ({camera.c_source}), pixel {1000 * camera.pixel_mm[0]:.4g} um "
             f"({camera.pixel_source})",
         )
@@ -227,7 +229,9 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
         marks = f", {len(plate.marks)} marks" if plate.marks else ""
         found.append(("targets", f"{plate.name} of {plate.rows} x {plate.columns}{marks}"))
     elif trial.codes != "none":
-        repeated = f"{len(trial.repeated)} codes that two of {len(trial.photographs)} photographs have"
+        repeated = (
+            f"{counted(len(trial.repeated), 'code')} that two of {len(trial.photographs)} photographs have"
+        )
         found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
         found.append(("targets", "none with codes: points of natural texture"))

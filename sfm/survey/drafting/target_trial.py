@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.kernels.sampling import as_grey
 from sfm.photographs.reading import read_photograph
@@ -200,7 +200,9 @@ def _readable(
             break
     if len(tried) < MIN_READABLE:
         why = listed((f"{name}: {reason}" for name, reason in refused.values()), separator="; ")
-        raise GeometryError(f"{len(tried)} readable photographs, at least {MIN_READABLE} are needed ({why})")
+        raise GeometryError(
+            f"{counted(len(tried), 'readable photograph')}, at least {MIN_READABLE} are needed ({why})"
+        )
     return [paths[k] for k in sorted(tried)], [tried[k] for k in sorted(tried)], tuple(refused.values())
 
 

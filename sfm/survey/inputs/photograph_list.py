@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import IntArray
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
@@ -107,7 +108,7 @@ def refuse_many(where: str, images: Sequence[str]) -> None:
     """Raise SurveyFileError if there are more photographs than one adjustment has room for."""
     if len(images) > MAX_PHOTOGRAPHS:
         raise SurveyFileError(
-            f"{where}: {len(images)} photographs, at most {MAX_PHOTOGRAPHS} are adjusted together"
+            f"{where}: {counted(len(images), 'photograph')}, at most {MAX_PHOTOGRAPHS} are adjusted together"
         )
 
 

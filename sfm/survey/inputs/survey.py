@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from sfm.adjustment.datum import Datum
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
@@ -175,17 +176,17 @@ class Survey:
 
     def __repr__(self) -> str:
         count = len(self.cameras)
-        what = [f"{count} camera{'s' if count > 1 else ''}"]
+        what = [counted(count, "camera")]
         if self.observations is not None:
-            what.append(f"{len(self.observations.xy)} image points")
+            what.append(counted(len(self.observations.xy), "image point"))
         elif self.tie_points is not None:
             what.append("tie points of natural texture")
         else:
             what.append(f"targets of codes {self.targets.codes}")
         if self.control is not None:
-            what.append(f"{len(self.control.names)} control points")
+            what.append(counted(len(self.control.names), "control point"))
         if self.scale_bars:
-            what.append(f"{len(self.scale_bars)} scale bar{'s' if len(self.scale_bars) > 1 else ''}")
+            what.append(counted(len(self.scale_bars), "scale bar"))
         return f"<Survey {self.name}: {', '.join(what)}, datum {self.datum.kind}>"
 
 

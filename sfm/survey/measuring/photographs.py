@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.remarks.remark import remark
 from sfm.result import FailedImage
@@ -92,7 +92,7 @@ def each_photograph(
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:
         raise GeometryError(
-            f"{len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
+            f"{counted(len(found), 'readable photograph')}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{in_brackets(in_order)}"
         )
     return found, in_order

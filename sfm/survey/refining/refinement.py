@@ -11,6 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import WINDOWS_PX
 from sfm.matching.lsm.projected_points import pictures_of
@@ -321,10 +322,11 @@ def _words_of_targets(result: Refinement) -> str:
     used = int((~a.rejected[len(result.rows) :]).sum())
     elsewhere = result.targets.contradicting
     return (
-        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points"
+        f"targets       {len(result.target_points)} of {len(own.points)}, {counted(used, 'image point')}"
         + (f" ({elsewhere} more are not where their target is)" if elsewhere else "")
         + ", "
-        f"datum {a.datum}, {control} control points, {len(a.network.scale_bars)} scale bars\n"
+        f"datum {a.datum}, {counted(control, 'control point')}, "
+        f"{counted(len(a.network.scale_bars), 'scale bar')}\n"
     )
 
 
