@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm.display import program_name
+from sfm.display import counted, program_name
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
-from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
+from sfm.report.phrases import words_of_check, words_of_precision, words_of_sigma0, words_of_test
 from sfm.result import SurveyResult
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
@@ -76,8 +76,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
-    factor, unit = finer_unit(result.length_unit, largest)
-    told = f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most"
+    told = words_of_precision(typical, largest, result.length_unit)
     if not math.isfinite(typical):
         told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
@@ -118,7 +117,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             (
                 found.name,
                 f"{found.photographs[1]} of {found.total} oriented, RMS {found.rms_px[1]:.3f} px, "
-                f"{significant(factor * found.point_rms)} {unit} from the survey at {found.targets} points, "
+                f"{significant(factor * found.point_rms)} {unit} from the survey at "
+                f"{counted(found.targets, 'point')}, "
                 f"{found.seconds[1]:.0f} s",
             )
         )
@@ -130,8 +130,10 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     result, counts = findings.result, findings.counts
     a = result.adjustment
     rows = [
-        ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
-         f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
+        ("observations", f"{counts.total}: {counted(counts.image, 'image coordinate')}, "
+        f"{counts.control} of control, "
+         f"{counted(counts.scale_bars, 'scale bar')}; {counts.constraints} constraints, "
+         f"{a.unknowns} unknowns"),
         *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity

@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.quality.correlations import OrientationCorrelation, orientation_correlations
+from sfm.adjustment.quality.projection import projection_covariance
 from sfm.adjustment.quality.statistics import Correlation, correlations
-from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.camera import Camera
+from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network
 from sfm.planning.sight.visibility import WORDS, Seeing, Why
 
@@ -23,7 +25,6 @@ FLAT_DEG = 40.0  # largest angle of rays below which depth is much weaker than t
 ROLLED_DEG = 45.0  # from the others, from which a photograph counts as rolled
 MIN_DEPTH = 0.1  # of the object over its distance, below which it is flat to the camera
 MAX_PLACES = 500  # image points at which the calibration is judged
-TURN = 1e-4  # rad, of a numerical derivative
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def weak_points(prediction: Prediction) -> tuple[WeakPoint, ...]:
 def reason_of(prediction: Prediction, j: int) -> str:
     """Return why a point is as weak as it is: "2 rays, 9 degrees"; where no ray is, why."""
     rays, angle = int(prediction.rays[j]), float(prediction.angle_deg[j])
-    words = [f"{rays} ray{'s' if rays != 1 else ''}"]
+    words = [counted(rays, "ray")]
     if np.isfinite(angle):
         words.append(f"{angle:.0f} degrees")
     if rays < FEW_RAYS:
@@ -167,27 +168,9 @@ def _contribution(camera: Camera, covariance: FloatArray, xy: FloatArray) -> flo
     A principal point that is off by little and a camera that is turned by as much cannot be told apart, and
     need not be: a rotation of the camera is taken off.
     """
-    free = np.flatnonzero(camera.free)
-    uv = tangents_from_pixel(camera, xy[:: 1 + len(xy) // MAX_PLACES])
-    points = np.column_stack([uv, np.full(len(uv), -1.0)])
-    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0))
-    columns = []
-    for k, s in zip(free, sigma, strict=True):
-        ahead, behind = camera.parameters.copy(), camera.parameters.copy()
-        ahead[k] += s
-        behind[k] -= s
-        moved = [project(camera.with_parameters(p), np.zeros(3), np.eye(3), points) for p in (ahead, behind)]
-        columns.append((moved[0] - moved[1]).ravel() / 2)
-    turned = [
-        project(camera, np.zeros(3), rotation_from_vector(step), points)
-        - project(camera, np.zeros(3), rotation_from_vector(-step), points)
-        for step in TURN * np.eye(3)
-    ]
-    basis = np.linalg.qr(np.stack([one.ravel() for one in turned], axis=1))[0]
-    J = np.stack(columns, axis=1)
-    J -= basis @ (basis.T @ J)
-    R = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
-    return float(np.sqrt(np.einsum("ka,ab,kb->k", J, R, J).mean()))
+    some = xy[:: 1 + len(xy) // MAX_PLACES]
+    Q = projection_covariance(camera, covariance, some, some)
+    return float(np.sqrt(np.nanmean(np.einsum("kii->ki", Q))))
 
 
 def _median_rays(prediction: Prediction) -> int:

@@ -7,7 +7,8 @@ import numpy as np
 from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
-from sfm.display import listed
+from sfm.display import counted, listed
+from sfm.distributions import normal_ppf
 from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
@@ -16,6 +17,7 @@ from sfm.report.numbers import finer_unit, significant
 from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
+NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that 95 % of its errors are within
 MAX_BINS = 12  # numbers of rays that are told one by one
 
 
@@ -88,7 +90,7 @@ def words_of_check(found: CheckedControl, unit: str) -> str:
     factor, finer = finer_unit(unit, longest)
     rms = ", ".join(significant(value * factor) for value in found.check.rms)
     return (
-        f"RMS {rms} {finer} in X, Y, Z at {len(points)} points; largest "
+        f"RMS {rms} {finer} in X, Y, Z at {counted(len(points), 'point')}; largest "
         f"{significant(longest * factor)} {finer} at {points[found.worst]}"
     )
 
@@ -112,10 +114,26 @@ def words_of_limiting(precision: Precision) -> str:
     )
 
 
+def words_of_precision(typical: float, largest: float, unit: str) -> str:
+    """Return the precision of the points: one standard deviation, and what 95 % of the errors are within.
+
+    Args:
+        typical: RMS standard deviation, object unit.
+        largest: likewise.
+        unit: object unit.
+    """
+    factor, finer = finer_unit(unit, largest)
+    sigmas, within = (
+        f"{significant(times * typical)} {finer} RMS, {significant(times * largest)} {finer} at most"
+        for times in (factor, NORMAL_95 * factor)
+    )
+    return f"1 sigma {sigmas}; 95 % {within}"
+
+
 def words_of_fixed(precision: Precision) -> str:
     """Say that fixed coordinates do not count; empty where there are none."""
     count = precision.fixed_points
-    return f"without the fixed coordinates of {count} point{'s' if count > 1 else ''}" if count else ""
+    return f"without the fixed coordinates of {counted(count, 'point')}" if count else ""
 
 
 def words_of_datum(adjustment: Adjustment) -> str:
@@ -129,7 +147,7 @@ def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:
     network, found = findings.result.adjustment.network, findings.geometry
     weak = found.weak
     names = listed(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak)
-    told = f"{len(weak)} points: {names}" if len(weak) else "none"
+    told = f"{counted(len(weak), 'point')}: {names}" if len(weak) else "none"
     points = tuple(f"point {name}" for name in network.points)
     known = found.angle_deg[np.isfinite(found.angle_deg)]
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""

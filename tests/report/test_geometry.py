@@ -159,7 +159,7 @@ def test_weak_points_are_named_and_all_reports_agree(tmp_path: Path) -> None:
         report_page(findings_of(result), (), ()),
         summary(findings_of(result))["geometry"],
     )
-    words = f"below 10 deg: 1 points: 5 ({found.angle_deg[4]:.1f})"
+    words = f"below 10 deg: 1 point: 5 ({found.angle_deg[4]:.1f})"
     assert words in " ".join(text.split()) and words in page
     assert all(len(line) <= WIDTH for line in text.splitlines())
     assert told["weak_points"] == ["5"]

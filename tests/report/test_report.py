@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -22,6 +23,7 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.conventions import angles_from_rotation
+from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
@@ -39,12 +41,14 @@ from sfm.report.output import WRITTEN, write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
 from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import _environment as text_environment
 from sfm.report.text.text_report import text_report
-from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
+from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
-from sfm.targets.flags import Flag
+from sfm.targets.flags import LIKEST_FIRST, Flag
 from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
+from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
 
 EVIL = "<script>alert('x')</script>&\"é€"
@@ -272,7 +276,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     assert tags.tags.count("script") == 1  # that of the tables; nothing needs it
     assert EVIL in tags.text
     assert EVIL + ".jpg" in tags.text
-    assert tags.tags.count("img") == 4
+    assert tags.tags.count("img") == 6
     for source in tags.sources:
         assert source.startswith(("data:image/png;base64,", "#")) or source.rstrip("/") in WRITTEN, source
     for question in (
@@ -297,6 +301,54 @@ def test_plots_are_legible_on_a_telephone(browser: Any, result: SurveyResult, tm
     assert min(widths) >= 700
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
     tab.close()
+
+
+def test_precision_is_told_as_one_sigma_and_as_what_95_of_100_are_within(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = findings_of(result)
+    factor, _ = finer_unit(result.length_unit, float(found.precision.largest[3]))
+    within = significant(1.959964 * factor * float(found.precision.rms[3]))
+    tell_result(found, Path("page"), seconds=1.0, verbose=False)
+    for told in (capsys.readouterr().out, report_page(found, (), ()), text_report(found)):
+        assert "1 sigma" in told and "95 %" in told and within in told
+
+
+def test_maps_show_the_precision_of_points_and_the_projection_of_each_camera(result: SurveyResult) -> None:
+    shown = plot_data(findings_of(result))
+    sigma = np.sqrt(np.einsum("nii->n", result.adjustment.covariance.points) / 3)
+    factor, unit = finer_unit(result.length_unit, float(findings_of(result).precision.largest[3]))
+    np.testing.assert_allclose(shown.sigma, factor * sigma)
+    assert shown.sigma_unit == unit
+    found = shown.projection[0]
+    assert found is not None and (found.sigma > 0).all()
+    stems = [plot.stem for plot in all_plots(shown)]
+    assert stems[-2:] == ["precision", "projection"]
+
+
+def test_one_of_a_kind_is_no_plural() -> None:
+    assert (counted(0, "point"), counted(1, "point"), counted(2, "point")) == (
+        "0 points",
+        "1 point",
+        "2 points",
+    )
+    for made in (environment(), text_environment()):
+        assert (
+            made.from_string("{{ names|length|counted('photograph') }}").render(names=["a"]) == "1 photograph"
+        )
+    words = re.compile(r"'s' (?:if|\*)|\"s\" (?:if|\*)|else ['\"]s['\"]")
+    by_hand = [str(path) for path in (ROOT / "sfm").rglob("*.py") if words.search(path.read_text("utf-8"))]
+    assert not by_hand, "sfm.display.counted writes numbers of things"
+
+
+def test_reasons_are_told_from_what_is_most_like_a_target(result: SurveyResult) -> None:
+    first = result.photographs[0]
+    flag = np.array([Flag.TOO_SMALL.value, Flag.TOO_SMALL.value, Flag.POOR_FIT.value])
+    found = findings_of(replace(result, photographs=(replace(first, rejected_flag=flag),)))
+    assert found.rejected.reasons == ("poor fit", "too small")  # and not the most frequent first
+    assert set(likest_first(["too small", "measured", "poor fit"])[:1]) == {"measured"}
+    rejections = {flag for flag in Flag if Flag.CUT_BY_BORDER <= flag < Flag.DAMAGED}
+    assert set(LIKEST_FIRST) == rejections
 
 
 def test_fixed_coordinates_have_neither_unknown_precision_nor_residuals() -> None:
@@ -478,7 +530,13 @@ def test_plots_of_small_and_plain_results() -> None:
     plain: Network = replace(network, images=names, scale_bars=bars)
     a = adjust(plain, truth, datum=Datum("free"))
     plots = all_plots(plot_data(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None))))
-    assert [plot.stem for plot in plots] == ["network", "residuals", "distribution", "photographs"]
+    assert [plot.stem for plot in plots] == [
+        "network",
+        "residuals",
+        "distribution",
+        "photographs",
+        "precision",
+    ]
     assert all(plot.png.startswith(b"\x89PNG") for plot in plots)
 
 

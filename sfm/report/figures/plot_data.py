@@ -26,6 +26,15 @@ class PlotCamera:
 
 
 @dataclass(frozen=True)
+class ProjectionMap:
+    """Projection uncertainty of a camera over its photographs."""
+
+    x: FloatArray  # columns of a grid, px, (c,)
+    y: FloatArray  # rows of it, px, (r,)
+    sigma: FloatArray  # root mean square of both coordinates, px; NaN where the model folds over, (r, c)
+
+
+@dataclass(frozen=True)
 class PlotData:
     """Network and residuals of m photographs and k accepted image points."""
 
@@ -44,3 +53,6 @@ class PlotData:
     image_rms_px: FloatArray  # root mean square residual per coordinate of each photograph, px, (m,)
     image_points: IntArray  # number of each photograph, (m,)
     rms_px: float  # of all
+    sigma: FloatArray  # of the points, RMS of sX, sY, sZ; NaN where fixed or not known, (n,)
+    sigma_unit: str  # of these
+    projection: tuple[ProjectionMap | None, ...]  # of each camera; None where nothing of it was adjusted

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from sfm.conventions import FloatArray, IntArray
@@ -23,6 +24,8 @@ LETTER_IN = 0.065  # width of a letter of the names of photographs
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
+LEVELS = 11  # of the projection uncertainty, in equal ratios
+OUTSIDE = 0.02  # of the photograph is under the lowest of them
 CELLS = 12  # of the grid of mean residuals along the longer side
 TITLES = ("Plan", "Elevation")
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
@@ -36,6 +39,10 @@ def all_plots(shown: PlotData) -> tuple[Plot, ...]:
         ("distribution", _DISTRIBUTION, distribution_figure),
         ("photographs", _PHOTOGRAPHS, photograph_figure),
     )
+    if np.isfinite(shown.sigma).any():
+        drawn += (("precision", _PRECISION, precision_figure),)
+    if any(shown.projection):
+        drawn += (("projection", _PROJECTION, projection_figure),)
     return tuple(Plot(stem, caption, png(draw(shown))) for stem, caption, draw in drawn)
 
 
@@ -78,6 +85,15 @@ _DISTRIBUTION = (
     "distance from the centre of the photograph."
 )
 _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points of each photograph."
+_PRECISION = (
+    "Precision of the object points: 1 sigma, root mean square of sX, sY, sZ; the 95 % value is 1.96 times "
+    "it. The ends of the scale are the smallest and the largest."
+)
+_PROJECTION = (
+    "Projection uncertainty of each camera: 1 sigma per image coordinate with which the calibration knows "
+    "where a direction is seen, a rotation of the camera taken out; the 95 % value is 1.96 times it. Dots "
+    "are the image points: beyond them the distortion is extrapolated."
+)
 
 
 def network_figure(shown: PlotData) -> Figure:
@@ -115,6 +131,61 @@ def network_figure(shown: PlotData) -> Figure:
                 color="#444",
             )
     plan.legend(loc="upper right", fontsize=7)
+    return figure
+
+
+def precision_figure(shown: PlotData) -> Figure:
+    """Draw the points in plan and in elevation, coloured by their standard deviation."""
+    axes_from_object, labels = plan_axes(shown.points, shown.position)
+    points = shown.points @ axes_from_object.T
+    known = np.isfinite(shown.sigma)
+    worst_last = np.argsort(np.where(known, shown.sigma, -1.0))
+    worst_last = worst_last[known[worst_last]]
+    figure = panelled(4.6)
+    for panel, title, (across, up) in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
+        panel.plot(points[~known, across], points[~known, up], ".", color=GREY, markersize=3)
+        drawn = panel.scatter(
+            *points[worst_last][:, [across, up]].T,
+            c=shown.sigma[worst_last],
+            s=14,
+            cmap="viridis",
+        )
+        figure.colorbar(drawn, ax=panel, label=f"sigma [{_plain(shown.sigma_unit)}]", shrink=0.85)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.set_xlabel(f"{labels[across]} [{_plain(shown.unit)}]")
+        panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
+        panel.grid(color="#ddd", linewidth=0.5)
+        entitled(panel, title)
+    return figure
+
+
+def projection_figure(shown: PlotData) -> Figure:
+    """Draw the projection uncertainty of each adjusted camera over its format, two in a row."""
+    adjusted = [k for k, one in enumerate(shown.projection) if one is not None]
+    rows = -(-len(adjusted) // 2)
+    figure = panelled(4.4 * rows, rows=rows)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    owner = shown.camera[shown.image]
+    for panel, k in zip(panels, adjusted, strict=False):
+        camera, found = shown.cameras[k], shown.projection[k]
+        assert found is not None
+        width, height = camera.size_px
+        known = found.sigma[found.sigma > 0]
+        levels = np.geomspace(np.quantile(known, OUTSIDE), known.max() * (1 + 1e-9), LEVELS)
+        drawn = panel.contourf(
+            found.x, found.y, found.sigma, levels=levels, norm=LogNorm(), cmap="viridis", extend="min"
+        )
+        xy = shown.xy[owner == k]
+        panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="white", markersize=1, alpha=0.6)
+        figure.colorbar(drawn, ax=panel, label="sigma [px]", shrink=0.85, ticks=levels, format="%.2g")
+        panel.set_xlim(-0.5, width - 0.5)
+        panel.set_ylim(height - 0.5, -0.5)
+        panel.set_aspect("equal")
+        panel.set_xlabel("x [px]")
+        panel.set_ylabel("y [px]")
+        entitled(panel, _plain(camera.name))
+    for panel in panels[len(adjusted) :]:
+        panel.set_axis_off()
     return figure
 
 

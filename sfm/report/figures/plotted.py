@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.adjustment.quality.projection import projection_map
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
-from sfm.report.figures.plot_data import PlotCamera, PlotData
+from sfm.conventions import BoolArray, FloatArray
+from sfm.report.figures.plot_data import PlotCamera, PlotData, ProjectionMap
 from sfm.report.findings.findings import Findings
+from sfm.report.findings.precision import adjusted_sigmas, root_mean_square
+from sfm.report.numbers import finer_unit
 
 
 def plot_data(findings: Findings) -> PlotData:
@@ -15,6 +18,8 @@ def plot_data(findings: Findings) -> PlotData:
     adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
     network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
     seen = network.image_points.select(used)
+    sigma = np.array([root_mean_square(one) for one in adjusted_sigmas(adjustment.covariance.points)])
+    factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
     centre = np.array([camera.frame[:2] for camera in estimate.cameras])
     return PlotData(
         unit=findings.result.length_unit,
@@ -32,7 +37,24 @@ def plot_data(findings: Findings) -> PlotData:
         image_rms_px=geometry.image_rms_px,
         image_points=geometry.image_points,
         rms_px=adjustment.rms_px,
+        sigma=sigma * factor,
+        sigma_unit=unit,
+        projection=tuple(
+            _projection(adjustment, interior.family == f) for f in range(len(interior.families))
+        ),
     )
+
+
+def _projection(adjustment: Adjustment, photographs: BoolArray) -> ProjectionMap | None:
+    """Return the projection uncertainty of the camera of photographs, (m,); None where it was held."""
+    network, seen = adjustment.network, adjustment.network.image_points.select(~adjustment.rejected)
+    if not photographs.any():
+        return None
+    k = int(network.camera[photographs][0])  # of several that share parameters the first
+    camera, covariance = adjustment.estimate.cameras[k], adjustment.covariance.interior[k]
+    if not len(covariance) or not np.isfinite(covariance).all() or not np.diagonal(covariance).any():
+        return None
+    return ProjectionMap(*projection_map(camera, covariance, seen.xy[photographs[seen.image]]))
 
 
 def _standardised_residuals(adjustment: Adjustment) -> FloatArray:

@@ -14,13 +14,12 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from scipy.special import ndtri
 
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.display import program_name
 from sfm.report.html.content_policy import content_policy
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
-from sfm.report.phrases import PHRASES
+from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
 from sfm.report.viewer.embedded import Viewer
 
@@ -66,7 +65,7 @@ def environment() -> Environment:
     made.filters["program"] = program_name
     made.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
     made.globals |= PHRASES | {
-        "NORMAL_95": float(ndtri(0.975)),
+        "NORMAL_95": NORMAL_95,
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "strong": STRONG,

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of
-from sfm.report.phrases import PHRASES
+from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
 from sfm.report.text import filters as lines
 
@@ -58,6 +58,7 @@ def _environment() -> Environment:
     made.filters |= FILTERS
     made.filters |= {one.__name__: one for one in (lines.columns, lines.facts, lines.wrap)}
     made.globals |= PHRASES | {
+        "NORMAL_95": NORMAL_95,
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "heading": lines.heading,
