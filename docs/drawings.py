@@ -18,6 +18,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from sfm.camera import camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, image_from_pixel, pixel_from_image, rotation_from_angles
+from sfm.targets.codes.plates import PlateFamily
 
 ARROW = 9.0  # length of an arrow head, in the unit of the drawing
 
@@ -254,12 +255,72 @@ def axes_of_others() -> Drawing:
     return sheet
 
 
+def plates() -> Drawing:
+    """Draw row 0 and the numbers of points: a plate with marks, also turned, shifted rows, a board."""
+    sheet = Drawing(
+        720,
+        640,
+        "Row 0, columns and numbers of points of a plate with marks, also turned, and of a checkerboard",
+    )
+    marked = PlateFamily("grid", 5, 6, ((1, 1), (1, 4), (3, 2)))
+    shifted = PlateFamily("asymmetric-grid", 5, 5)
+    board = PlateFamily("checkerboard", 4, 5)
+    turn = np.deg2rad(150.0)
+    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    for plate, number, pitch, rotation, caption in (
+        (marked, 0, 38.0, np.eye(2), "grid of 5 x 6 with marks, as printed"),
+        (marked, 1, 38.0, turned, "the same, turned by 150 degrees"),
+        (shifted, 2, 44.0, np.eye(2), "asymmetric grid of 5 x 5"),
+        (board, 3, 36.0, np.eye(2), "checkerboard of 4 x 5 crossings"),
+    ):
+        middle = np.array([190.0 + 355.0 * (number % 2), 150.0 + 310.0 * (number // 2)])
+        xy = plate.plane(pitch)[:, :2]
+        centre = (xy.min(axis=0) + xy.max(axis=0)) / 2
+
+        def at(
+            place: FloatArray,
+            middle: FloatArray = middle,
+            rotation: FloatArray = rotation,
+            centre: FloatArray = centre,
+        ) -> FloatArray:
+            return middle + (rotation @ (np.asarray(place) - centre)) * (1.0, -1.0)
+
+        if plate.name == "checkerboard":
+            for row in range(plate.rows + 1):
+                for column in range(plate.columns + 1):
+                    left, top = pitch * (column - 1), -pitch * (row - 1)
+                    corners = (
+                        (left, top),
+                        (left + pitch, top),
+                        (left + pitch, top - pitch),
+                        (left, top - pitch),
+                    )
+                    dark = (row + column) % 2 == 0
+                    kind = "muted full faint" if dark else "muted open"
+                    sheet.area(np.array([at(np.array(one)) for one in corners]), kind)
+        for k, place in enumerate(xy):
+            row, column = divmod(k, plate.columns)
+            is_mark = (row, column) in plate.marks
+            sheet.dot(
+                at(place), "second" if is_mark else "first" if row == 0 else "ink", 8.0 if is_mark else 4.5
+            )
+            if row == 0 or column == 0 or is_mark:
+                sheet.words(moved(at(place), 0.0, -15.0), str(k), "second" if is_mark else "ink", middle=True)
+        left = -2.1 * pitch if plate.name == "checkerboard" else -1.3 * pitch
+        for row in (0, 1):
+            beside = np.array([left, xy[row * plate.columns, 1]])
+            sheet.words(at(beside), f"row {row}", "ink" if row else "first", middle=True)
+        sheet.words(moved(middle, 0.0, 160.0), caption, "ink", middle=True)
+    return sheet
+
+
 DRAWINGS: dict[str, Callable[[], Drawing]] = {
     "frames": frames,
     "pinhole": pinhole,
     "rotations": rotations,
     "distortions": distortions,
     "axes-of-others": axes_of_others,
+    "plates": plates,
 }
 
 

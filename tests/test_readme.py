@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -15,6 +16,7 @@ from sfm.report.output import WRITTEN
 from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
+from sfm.targets.codes.plates import PlateFamily, refuse_unusable_plate
 from tests.places import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -140,3 +142,31 @@ def test_constraints_pin_every_requirement() -> None:
             continue
         name = re.split(r"[\[<>=~! ]", requirement)[0].lower().replace("_", "-")
         assert name in pins, name
+
+
+def test_the_home_page_has_a_picture_and_three_commands_that_exist() -> None:
+    text = page("index.md")
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", text)
+    assert len(pictures) == 1 and (DOCS / pictures[0]).is_file()
+    block = re.search(r"```sh\n(.*?)```", text, re.S)
+    assert block is not None
+    commands = [line.split()[1] for line in block[1].splitlines()]
+    known = {one.name or getattr(one.callback, "__name__", "") for one in app.registered_commands}
+    assert len(commands) == 3 and set(commands) <= known
+
+
+def test_the_plate_of_the_page_is_numbered_as_the_program_does() -> None:
+    """Marks of the drawing and the sentences below it: usable marks, row 1 further right in shifted rows."""
+    text = page("how-to/calibrate-a-camera.md")
+    drawn = (DOCS / "drawings.py").read_text(encoding="utf-8")
+    told = re.search(r"`marks = (\[\[.*?\]\])`", text)
+    assert told is not None and "```{drawing} plates" in text
+    marks = tuple(tuple(one) for one in json.loads(told[1]))
+    plate = PlateFamily("grid", 5, 6, marks)
+    refuse_unusable_plate(plate)
+    assert f'PlateFamily("grid", 5, 6, {marks})' in drawn
+    x, y = plate.plane(1.0)[:, :2].T
+    assert y[plate.columns] < y[0] and x[1] > x[0]  # rows downwards, columns to the right
+    for name in ("asymmetric-grid", "hexagonal-grid"):
+        x = PlateFamily(name, 4, 5).plane(1.0)[:, 0]
+        assert x[5] - x[0] == 0.5
