@@ -19,6 +19,7 @@ from sfm.planning.wanted import ALPHA, found_displacement
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, or_unlimited, significant
 from sfm.report.page_files import write_files
+from sfm.report.phrases import NORMAL_95
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -114,7 +115,8 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),
         (
             "sigma of points" + (", what is not determined left out" if a.undetermined else ""),
-            f"{_length(plan, p.rms_sigma)} RMS per coordinate, {_length(plan, worst)} at the worst point, "
+            f"1 sigma {_length(plan, p.rms_sigma)} RMS per coordinate (95 % "
+            f"{_length(plan, NORMAL_95 * p.rms_sigma)}), {_length(plan, worst)} at the worst point, "
             f"{_length(plan, along)} in its worst direction",
         ),
         (
