@@ -25,6 +25,7 @@ from sfm.planning.planned_object import PlannedObject
 from sfm.planning.shots import Shot, shots
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations
+from sfm.runtime.progress import report_step
 
 DISTANCES = (0.8, 1.2)  # of those that the survey was photographed from
 ROOM = 0.25  # by which the box around its stations may be left, of its size
@@ -171,6 +172,7 @@ def _chosen(
     while len(chosen) < min(count, room.count):
         best = int(np.argmax(gains(Q, rows, scale, open_)))
         chosen.append(best)
+        report_step("photographs chosen", len(chosen), min(count, room.count))
         open_[[best, (best + room.count) % (2 * room.count)]] = False
         A = rows[best]
         QA = Q @ A.transpose(0, 2, 1)

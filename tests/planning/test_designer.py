@@ -20,6 +20,7 @@ from sfm.planning.shots import choose_coded, roll_deg
 from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import Stations, arrangement, looking, rolled
 from sfm.planning.wanted import MIN_RAYS, Wanted, displacement_per_sigma, found_displacement, short_of
+from sfm.runtime.progress import Silent, StageClock
 from tests.synthetic import seed_of
 
 CAMERA = camera_from_values(
@@ -85,7 +86,12 @@ def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int,
 def test_fewer_photographs_than_a_ring_or_at_random() -> None:
     kind, sizes, allowed, sigma = OBJECTS["box"]
     planned, wanted = shape_object(kind, sizes, 40), Wanted(sigma=4 * sigma)
-    found = design_network(planned, CAMERA, allowed, SEEING, wanted, count=80)
+    steps: list[str] = []
+    watching = Silent()
+    watching.step = lambda name, done=None, total=None: steps.append(name)  # type: ignore[method-assign]
+    with StageClock(watching).stage("plan"):
+        found = design_network(planned, CAMERA, allowed, SEEING, wanted, count=80)
+    assert f"predicting {len(found.prediction.stations)} photographs" in steps
     designed = len(found.prediction.stations)
     assert found.reached and found.shortfall <= 1
     assert needed(planned, wanted, lambda k: arrangement(f"ring:{k}", planned, CAMERA), designed) > designed

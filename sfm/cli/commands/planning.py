@@ -198,6 +198,8 @@ def network_command(
         from sfm.planning.sight.visibility import Seeing
         from sfm.planning.wanted import Wanted
         from sfm.report.planning import figures, write_plan
+        from sfm.runtime.progress import StageClock
+        from sfm.runtime.progress_bar import drawn_progress
 
     refuse_foreign_folder(out)
     if unit not in METRES:
@@ -213,7 +215,7 @@ def network_command(
             "plan: needed --sigma-px or --target-diameter, which say how precise image points are"
         )
     to_mm = METRES[unit] * 1000
-    with working_on(planned):
+    with working_on(planned), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
         object_ = object_of(planned, points, open_mesh=open_mesh)
         one = camera_of(camera, camera_name, c, free)
         depth = _depth(one, f_number, focus, confusion, to_mm)

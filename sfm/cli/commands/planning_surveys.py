@@ -78,9 +78,11 @@ def more_command(
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.further import further_photographs
         from sfm.report.further import headline, weakest, write_further
+        from sfm.runtime.progress import StageClock
+        from sfm.runtime.progress_bar import drawn_progress
 
     refuse_foreign_folder(out)
-    with working_on(str(result)):
+    with working_on(str(result)), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
         stored = read_result(result)
         given = read_given(result, stored.network)
         seen = stored.network.image_points

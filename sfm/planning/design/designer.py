@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.planning.design.candidates import COUNT, Allowed, Candidates, candidates
 from sfm.planning.design.gain import cost_of, gains, image_rows
@@ -25,6 +26,7 @@ from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.wanted import MIN_RAYS, Wanted, short_of
 from sfm.planning.weakness import reason_of
+from sfm.runtime.progress import report_step
 
 FEWEST = 4  # photographs of a network whose gross errors can be found
 MAX_PHOTOGRAPHS = 100
@@ -163,6 +165,7 @@ class _Designer:
     def _full(self, chosen: Sequence[int]) -> tuple[Prediction | None, float]:
         """Return the full prediction and what it falls short by; learn what the limiting one ignores."""
         which = np.array(chosen, dtype=np.int64)
+        report_step(f"predicting {counted(len(chosen), 'photograph')}")
         try:
             prediction = predict_network(
                 self.planned,
