@@ -188,7 +188,7 @@ def test_a_survey_from_photographs_to_report(
     assert text["comparison"]["agree"] is True
     assert text["converged"] is True
     assert (out / "overlays" / "bild é 1.jpg").is_file()
-    assert list((out / "colmap").iterdir()) and len(list((out / "plots").glob("*.png"))) == 4
+    assert list((out / "colmap").iterdir()) and len(list((out / "plots").glob("*.png"))) == 6
 
     place = coded_points(photographs / "truth_points.csv")
     found = coded_points(out / "points.csv")

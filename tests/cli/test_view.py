@@ -92,7 +92,7 @@ def test_a_colmap_model_is_shown_with_its_residuals(tmp_path: Path) -> None:
 def test_what_cannot_be_shown_is_one_clear_line(tmp_path: Path, result_folder: Path) -> None:
     with pytest.raises(SurveyFileError, match="neither a COLMAP model, nor tables"):
         view(tmp_path, browser=False, budget=1.0)
-    with pytest.raises(OutputError, match=r"--images .*none: is no folder"):
+    with pytest.raises(OutputError, match=r"--images .*none: there is no such folder"):
         view(result_folder, images=tmp_path / "none", out=tmp_path / "a.html", browser=False, budget=1.0)
     assert not (tmp_path / "a.html").exists()
 

@@ -138,7 +138,7 @@ def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
     draft = draft_survey(tmp_path)
     assert [name for name, _ in draft.left_out] == ["0.jpg", "3.jpg"]
     (tmp_path / "1.jpg").write_bytes(file.read_bytes())
-    with pytest.raises(GeometryError, match="1 readable photographs, at least 2 are needed"):
+    with pytest.raises(GeometryError, match="1 readable photograph, at least 2 are needed"):
         draft_survey(tmp_path)
 
 
