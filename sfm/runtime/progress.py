@@ -62,7 +62,8 @@ def reported(name: str, items: Iterator[T] | Collection[T], total: int) -> Itera
         items: so many as `total`.
         total: how many they are.
     """
-    report_step(name, 0, total)
+    if total:
+        report_step(name, 0, total)
     for k, item in enumerate(items):
         yield item
         report_step(name, k + 1, total)

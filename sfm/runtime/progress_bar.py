@@ -64,10 +64,12 @@ class Drawn:
         task = self._bar.tasks[-1]
         if name != task.fields["part"] or total != task.total or (done or 0) < task.completed:
             # what is left is estimated from the parts of this work alone; the time of the stage goes on
-            begun = task.start_time
-            self._bar.reset(self._task, total=total)
-            task.start_time, task.total = begun, total
-        self._bar.update(self._task, completed=done or 0, step=name, part=name)
+            begun, task.total = task.start_time, total
+            fields = task.fields | {"step": name, "part": name}
+            self._bar.reset(self._task, total=total, completed=done or 0, **fields)
+            task.start_time = begun
+        else:
+            self._bar.update(self._task, completed=done or 0, step=name)
 
 
 class _Counted(ProgressColumn):

@@ -41,6 +41,7 @@ def test_steps_reach_whoever_watches_the_stage_and_nobody_else() -> None:
     report_step("before")
     with StageClock(watching).stage("one"):
         assert list(reported("letters", "abc", 3)) == ["a", "b", "c"]
+        assert list(reported("nothing", "", 0)) == []
         with StageClock(Silent()).stage("inner"):
             report_step("unheard")
     report_step("after")
