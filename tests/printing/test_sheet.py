@@ -21,7 +21,9 @@ PX_PER_MM = 8
 
 def drawn(svg, size_mm):
     """Rasterise the outlines of an SVG page by flattening its curves, y down."""
-    picture = np.full((round(size_mm[1] * PX_PER_MM), round(size_mm[0] * PX_PER_MM)), 255, dtype=np.uint8)
+    fine = 4 * PX_PER_MM  # OpenCV dents the edges of what it fills, alike where these lie alike on the grid
+    height, width = round(size_mm[1] * PX_PER_MM), round(size_mm[0] * PX_PER_MM)
+    picture = np.full((4 * height, 4 * width), 255, dtype=np.uint8)
     t = np.linspace(0, 1, 17)[1:, None]
     for path in ElementTree.parse(svg).getroot().iter("{http://www.w3.org/2000/svg}path"):
         points = []
@@ -32,9 +34,10 @@ def drawn(svg, size_mm):
                 points.extend((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d)
             else:
                 points.append(xy[0])
-        polygon = np.round((np.array(points) * PX_PER_MM - 0.5) * 16).astype(np.int32)
+        polygon = np.round((np.array(points) * fine - 0.5) * 16).astype(np.int32)
         ink = 255 if path.get("fill") == "#fff" else 0
         cv2.fillPoly(picture, [polygon], ink, lineType=cv2.LINE_AA, shift=4)
+    picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     return cv2.GaussianBlur(picture, (0, 0), 0.8)
 
 

@@ -41,10 +41,10 @@ def photographed(diameter_px: float) -> Targets:
 
 
 def test_small_codes_are_told_with_what_would_do() -> None:
-    small = [photographed(6.5) for _ in range(2)]
+    small = [photographed(5.6) for _ in range(2)]
     (one,) = small_codes(small)
     assert one.kind == "codes_too_small"
-    assert 5 < one.number("dot") < 7 < one.number("needed") < 10
+    assert 4.5 < one.number("dot") < 6 < one.number("needed") < 10
 
 
 @pytest.mark.parametrize("diameter_px", [9.0, 12.0])

@@ -38,6 +38,7 @@ ROWS = (
         "{others:does|do} not fit at its start values.",
         "the start values of the camera are wrong, or the photographs have too little in common",
         "Give a calibrated camera, or add photographs between those that do not fit.",
+        explains=("interior_held_of_pair",),
     ),
     Kind(
         "c_looks_wrong",
@@ -54,6 +55,7 @@ ROWS = (
         "can be oriented, in place of {before}. Two photographs do not determine it.",
         "a wrong start value of c or a wrong size of the pixels",
         "Give a calibrated c, or add photographs.",
+        explains=("interior_held_of_pair",),
     ),
     Kind(
         "c_held_contradicted",
