@@ -13,11 +13,13 @@ from sfm.targets.codes.ring_reading import UNCODED
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.blurred_ellipse import BLUR
-from sfm.targets.fits.undamaged import unlike_targets
+from sfm.targets.fits.undamaged import MIN_RADIUS_PX, unlike_targets
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
 from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 
+# Reasons that are about the shape of a candidate and not about damage.
+SHAPE_REASONS = (Flag.LOBED, Flag.THIN_BACKGROUND, Flag.POOR_FIT)
 # Centres nearer than this share of the smaller radius belong to concentric targets.
 CONCENTRIC = 0.5
 # Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.
@@ -89,12 +91,25 @@ def judge_fits(
     return reason
 
 
-def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolArray:
+def find_legible(fit: EllipseFit, reason: IntArray) -> BoolArray:
+    """Return which candidates are targets if a code is read about them, shape (k,).
+
+    Those are the good ones and those against which only their shape is: a dot with a hole, sharpened or made
+    of the pixels of a screen resembles no blurred ellipse, but no letter has a code about it. A code does not
+    excuse an edge that is missing or that damage changed, nor a blob too small to show a shape.
+    """
+    damaged = (fit.flag & (Flag.UNEVEN_EDGE | Flag.POOR_FIT)) != 0
+    p, q, r = fit.shape.T
+    shown = np.abs(p * r - q * q) * MIN_RADIUS_PX**2 < 1
+    return np.asarray((reason == 0) | (np.isin(reason, SHAPE_REASONS) & ~damaged & shown))
+
+
+def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray, coded: BoolArray) -> BoolArray:
     """Return which of the good candidates are no targets because of what is about or inside of them.
 
-    Of concentric ellipses the smallest is kept: a retro-reflective dot with a dark rim in glare is seen as
-    bright dot and, larger, as the dark rim. What is in another candidate and not shown to be concentric, of
-    the polarity that fewer targets of the photograph have, is a stain.
+    Of concentric ellipses the one with a code is kept, else the smallest: a retro-reflective dot with a dark
+    rim in glare is seen as bright dot and, larger, as the dark rim. What is in another candidate and not
+    shown to be concentric, of the polarity that fewer targets of the photograph have, is a stain.
     """
     duplicate = np.zeros(len(fit.xy), dtype=bool)
     p, q, r = fit.shape.T
@@ -115,6 +130,7 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
         distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
         larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
         smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])
+        smaller &= coded[near] | ~coded[i]
         inner = np.where(larger, i, near)
         tolerance = ECCENTRIC_SIGMAS * (sigma[inner] + typical)
         apart = distance > ECCENTRIC * radius[inner] + tolerance
@@ -123,6 +139,8 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
         if sign[i] != usual:
             duplicate[i] = stained.any()
         duplicate[i] |= (smaller & ~(apart & (sign[near] != usual) & (sign[i] == usual))).any()
+        within = larger & coded[near] & ~coded[i] & (reason[near] == 0)
+        duplicate[i] |= (within & (distance < CONCENTRIC * radius[i])).any()
     return duplicate
 
 

@@ -10,7 +10,13 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.kernels.sampling import as_grey
-from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
+from sfm.targets.candidates import (
+    find_counters,
+    find_duplicates,
+    find_legible,
+    find_parts_of_codes,
+    judge_fits,
+)
 from sfm.targets.codes.boards import find_crossings
 from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
@@ -146,18 +152,28 @@ def find_targets(
         photograph, outlines.xy, outlines.shape, outlines.sign, noise=noise, saturation=scale
     )
     reason = judge_fits(fit, noise=noise, scale=scale, **limits)
-    reason[find_duplicates(fit, outlines.sign, reason)] = Flag.DUPLICATE
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
     levels = np.column_stack([fit.background, fit.contrast])
+    if isinstance(family, CodeFamily):
+        legible = find_legible(fit, reason)
+        code[legible], confidence[legible] = read_codes(
+            grey,
+            fit.xy[legible],
+            fit.shape[legible],
+            levels[legible],
+            family,
+            blur_px=fit.blur[legible],
+            noise=fit.noise[legible],
+        )
+        reason[code >= 0] = 0
+    reason[find_duplicates(fit, outlines.sign, reason, code >= 0)] = Flag.DUPLICATE
     tags = None
     if isinstance(family, TagFamily):
         tags = find_tags(photograph, family, polarity=polarity, scale=scale)
         reason[(reason == 0) & inside_tags(fit.xy, tags, family)] = Flag.PART_OF_CODE
     good = reason == 0
-    if isinstance(family, CodeFamily) and good.any():
-        code[good], confidence[good] = read_codes(
-            grey, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
-        )
+    if isinstance(family, CodeFamily):
+        code[~good] = UNCODED
         reason[good & find_parts_of_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
     if isinstance(family, PlateFamily):
         code[good] = _name_dots(fit, outlines.sign, good, family)

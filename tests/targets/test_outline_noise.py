@@ -237,7 +237,9 @@ def test_a_hole_must_be_shown_to_be_concentric(sigma: float, duplicate: bool) ->
         shape=np.column_stack([1 / radius, 0 * radius, 1 / radius]),
         covariance=sigmas[:, None, None] ** 2 * np.eye(2),
     )
-    found = find_duplicates(cast(EllipseFit, fit), np.array([-1, 1, -1]), np.zeros(3, np.int64))
+    found = find_duplicates(
+        cast(EllipseFit, fit), np.array([-1, 1, -1]), np.zeros(3, np.int64), np.zeros(3, bool)
+    )
     assert found.tolist() == [not duplicate, duplicate, False]
 
 

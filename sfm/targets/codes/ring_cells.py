@@ -23,13 +23,15 @@ INTERPOLATION = 1 / 6
 # are from being two: their sigmas in units of the step to the dot.
 _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
 # Every edge of what is printed lies outwards by the spread of the ink, every edge of a light mark by that of
-# the light; in radii of the dot as it is measured. Ink of 0.3 mm around a dot of 6 mm is 0.09.
-MIN_SPREAD, MAX_SPREAD = -0.08, 0.14
+# the light, and as far inwards where light eats into it; in radii of the dot as it is measured. Ink of 0.4 mm
+# around a dot of 6 mm is 0.12.
+MAX_SPREAD = 0.14
 # What the spread and the blur of the cells' ends over that of the dot are before the ring is looked at: 0 and
 # 1 with these standard deviations, the second of its logarithm.
 _SPREAD_SIGMA, _BLUR_SIGMA = 0.05, 0.25
-# First steps of the search for the place of the first cell (in cells), spread and ln blur; halvings of them.
-_STEP_PLACE, _STEP_SPREAD, _STEP_BLUR, _HALVINGS = 1 / 24, 0.03, 0.15, 4
+# First steps of the search for the place of the first cell (in cells), spread and ln blur; halvings of them,
+# each where no step is an improvement; rounds at most.
+_STEP_PLACE, _STEP_SPREAD, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.15, 4, 16
 # Least jump from clear to set, in steps to the dot, of a ring that is worth the search.
 _WORTH = 0.25
 # Rows of the result after the levels.
@@ -96,13 +98,15 @@ def fit_cells(
         spread, ratio = 0.0, 0.0
         if jump >= _WORTH * step and step >= _WORTH:
             d_place, d_spread, d_ratio = _STEP_PLACE, _STEP_SPREAD, _STEP_BLUR
-            for _ in range(_HALVINGS):
+            halved = 0
+            for _ in range(_ROUNDS):
+                before = least
                 for parameter in range(3):
                     for sign in (-1.0, 1.0):
                         tried_place = place + sign * d_place if parameter == 0 else place
                         tried_spread = spread + sign * d_spread if parameter == 1 else spread
                         tried_ratio = ratio + sign * d_ratio if parameter == 2 else ratio
-                        if not MIN_SPREAD <= tried_spread <= MAX_SPREAD:
+                        if abs(tried_spread) > MAX_SPREAD:
                             continue
                         near, far = _spread_ring(inner, outer, tried_spread)
                         s = blur[k] * math.exp(tried_ratio)
@@ -129,7 +133,11 @@ def fit_cells(
                             least = cost
                             place, spread, ratio = tried_place, tried_spread, tried_ratio
                             break
-                d_place, d_spread, d_ratio = d_place / 2, d_spread / 2, d_ratio / 2
+                if least == before:
+                    halved += 1
+                    if halved == _HALVINGS:
+                        break
+                    d_place, d_spread, d_ratio = d_place / 2, d_spread / 2, d_ratio / 2
         near, far = _spread_ring(inner, outer, spread)
         s = blur[k] * math.exp(ratio)
         if not _sample(image, xy[k], shape[k], levels[k], s, near, far, samples, sigma, ring_part, dot_part):

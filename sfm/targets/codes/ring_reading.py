@@ -50,6 +50,7 @@ def read_codes(
     family: CodeFamily,
     *,
     blur_px: FloatArray | None = None,
+    noise: FloatArray | None = None,
 ) -> tuple[IntArray, FloatArray]:
     """Read the code around each measured dot.
 
@@ -64,6 +65,7 @@ def read_codes(
         family: the family of codes.
         blur_px: standard deviation of the edge of each dot, pixel box included, shape (k,); default is that
             of a sharp photograph.
+        noise: standard deviation of the intensities about the fit of each dot, shape (k,); default is 0.
 
     Returns:
         Code numbers, `UNCODED` where nothing is around the dot and `UNREADABLE` where something is that is
@@ -82,8 +84,9 @@ def read_codes(
     blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
     geometry = xy[ring], shape[ring], levels[ring], blur[ring]
     cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer)
+    misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
     for k, found in zip(ring, cells, strict=True):
-        code[k], confidence[k] = _read_cells(found, family)
+        code[k], confidence[k] = _read_cells(found, family, misfit[k])
     return code, confidence
 
 
@@ -141,13 +144,14 @@ def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
     return count, confidence
 
 
-def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
+def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
     """Return code number and confidence of one ring from the levels of its cells, see `fit_cells`.
 
     Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
     the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
     clear cells, clear ring and what is behind set cells are at the level of the background, set cells at one
-    level but for shading, and each cell is the same on all radii and over its length.
+    level but for shading, and each cell is the same on all radii and over its length. What the model does not
+    explain of the dot (misfit, in steps), as halos of sharpening, it does not explain of the samples.
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0
@@ -176,7 +180,7 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
         uneven <= CLEAR_TOLERANCE * step + noise,
         np.abs(level[~bits]) <= GLARE * step,
         np.abs(gap) <= GAP_TOLERANCE * step + noise,
-        residual <= RESIDUAL_TOLERANCE * step,
+        residual <= np.hypot(RESIDUAL_TOLERANCE * step, misfit),
         clutter.mean() <= OUTSIDE_CLUTTER,
         np.abs(behind[bits]) <= BEHIND_SET * step + noise[bits],
     )
