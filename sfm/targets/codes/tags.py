@@ -15,6 +15,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
+from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.flags import Flag
 from sfm.targets.outlines import as_bytes
 
@@ -28,14 +29,16 @@ DICTIONARIES = {
 # Without those that are the first tags of a larger one.
 LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
-# A black module narrower than this is not told apart from the code behind it.
+# A black module narrower than this is not told apart from the code behind it: the whole tag is fitted.
 MIN_MODULE_PX = 3.0
+# Such tags are looked for in the picture enlarged by this, down to this side.
+ENLARGED, MIN_SIDE_PX = 2, 6.0
 # Share of the bits that the dictionary could correct and that may be wrong: a wrong id costs more than a tag.
 CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
 # A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
 # share of a module, or if its contrast is less than this share of the tag's.
 POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST = 0.1, 0.4, 0.3
-NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE)
+NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE | Flag.POOR_FIT)
 # Radius of the circle that stands for a corner where outlines are drawn, px.
 DRAWN_PX = 4.0
 
@@ -77,7 +80,8 @@ class TagCorners:
     rejected_flag: IntArray
     """their reasons, shape (m,)"""
     quads: FloatArray
-    """outlines of all tags that were read, corners a to d as OpenCV gives them, px, shape (t, 4, 2)"""
+    """outlines of the tags that were read, without small ones that the fit did not confirm, corners a to d as
+    OpenCV gives them, px, shape (t, 4, 2)"""
 
 
 def tag_family(name: str) -> TagFamily:
@@ -117,30 +121,25 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
     """
     grey = as_bytes(photograph, scale)
-    settings = _reading_settings()
-    settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / max(grey.shape)
-    detector = cv2.aruco.ArucoDetector(opencv_dictionary(family.name), settings)
     # OpenCV's own search for inverted tags loses upright ones, so that the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
-    found = [_detect(detector, picture) for picture in pictures]
+    found = [_detect_all(picture, family) for picture in pictures]
     quads = np.concatenate([corners for corners, _ in found])
     number = np.concatenate([ids for _, ids in found])
     order = np.argsort(number, kind="stable")
     quads, number = quads[order], number[order]
-    fits = _fitted(photograph, quads, number, family, float(scale))
+    fits, small = _fitted(photograph, quads, number, family, float(scale))
     flag, noise = fits.flag, fits.noise
     contrast, blur = fits.theta[..., CONTRAST], fits.theta[..., BLUR]
-    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
-    module = np.repeat(side[:, None] / family.modules, 4, axis=1)
+    module = np.repeat(_modules_px(quads, family)[:, None], 4, axis=1)
     typical = np.median(contrast, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         tests = (
             (Flag.CUT_BY_BORDER, (flag & Flag.CUT_BY_BORDER) != 0),
-            (Flag.TOO_SMALL, module < MIN_MODULE_PX),
             (Flag.NO_CONVERGENCE, (flag & Flag.NO_CONVERGENCE) != 0),
             (Flag.LOW_CONTRAST, contrast / typical < MIN_CONTRAST),
-            (Flag.BLURRED, blur > SOFTEST_EDGE * module),
-            (Flag.POOR_FIT, noise / np.abs(contrast) > POOR_FIT),
+            (Flag.BLURRED, (blur > SOFTEST_EDGE * module) & ~small[:, None]),
+            (Flag.POOR_FIT, ((flag & Flag.POOR_FIT) != 0) | (noise / np.abs(contrast) > POOR_FIT)),
         )
     reason = np.zeros(flag.shape, dtype=np.int64)
     for name, against in tests:
@@ -162,23 +161,42 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
         flag[good] | Flag.CORNER.value,
         quads[~good],
         reason[~good],
-        quads,
+        quads[~small | good.any(axis=1)],
     )
+
+
+def _modules_px(quads: FloatArray, family: TagFamily) -> FloatArray:
+    """Return the width of a module along the shortest side of each tag, px, shape (t,)."""
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
+    return np.asarray(side / family.modules)
 
 
 def _fitted(
     photograph: AnyArray, quads: FloatArray, number: IntArray, family: TagFamily, scale: float
-) -> CornerFits:
-    """Fit the corners of tags twice, the second time with their codes where the first corners place them."""
+) -> tuple[CornerFits, BoolArray]:
+    """Fit the corners of tags twice, the second time with their codes where the first corners place them.
+
+    Returns:
+        The fits, and which tags are so small that all their modules were fitted at once, shape (t,).
+    """
     m, grey = family.modules, as_grey(photograph)
     clear = np.array([~tag_modules(family, int(one)) for one in number], dtype=bool).reshape(-1, m, m)
     square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
-    for _ in range(2):
+    small = _modules_px(quads, family) < MIN_MODULE_PX
+
+    def fit(quads: FloatArray) -> CornerFits:
         H = [cv2.getPerspectiveTransform(quad.astype(np.float32), square) for quad in quads]
-        fits = fit_corners(grey, quads, np.array(H, dtype=float).reshape(-1, 3, 3), clear, scale)
-        found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
-        quads = np.where(found[..., None], fits.theta[..., :2], quads)
-    return fits
+        tag_from_pixel = np.array(H, dtype=float).reshape(-1, 3, 3)
+        parts = [
+            method(grey, quads[some], tag_from_pixel[some], clear[some], scale)
+            for method, some in ((fit_corners, ~small), (fit_whole_tags, small))
+        ]
+        back = np.argsort(np.concatenate([np.flatnonzero(~small), np.flatnonzero(small)]))
+        return CornerFits(*(np.concatenate(part)[back] for part in zip(*parts, strict=True)))
+
+    fits = fit(quads)
+    found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
+    return fit(np.where(found[..., None], fits.theta[..., :2], quads)), small
 
 
 def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatArray]]:
@@ -222,8 +240,35 @@ def _reading_settings() -> cv2.aruco.DetectorParameters:
     return settings
 
 
+def _detect_all(picture: AnyArray, family: TagFamily) -> tuple[FloatArray, IntArray]:
+    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that OpenCV finds.
+
+    Tags of narrow modules are read from the enlarged picture, too, at OpenCV's rate of correction: the fit of
+    all their modules confirms the code.
+    """
+    dictionary, settings = opencv_dictionary(family.name), _reading_settings()
+    longest = max(picture.shape)
+    settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / longest
+    quads, number = _detect(cv2.aruco.ArucoDetector(dictionary, settings), picture)
+    for enlarged in (ENLARGED, 1):
+        settings = cv2.aruco.DetectorParameters()
+        settings.minMarkerPerimeterRate = 4 * MIN_SIDE_PX / longest
+        settings.maxMarkerPerimeterRate = 8 * MIN_MODULE_PX * family.modules / longest
+        settings.adaptiveThreshWinSizeStep *= enlarged
+        settings.adaptiveThreshWinSizeMax *= enlarged
+        size = (picture.shape[1] * enlarged, picture.shape[0] * enlarged)
+        large = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+        also, also_number = _detect(cv2.aruco.ArucoDetector(dictionary, settings), large)
+        also = (also + 0.5) / enlarged - 0.5
+        apart = also.mean(axis=1)[:, None] - quads.mean(axis=1)
+        near = np.hypot(*np.moveaxis(apart, 2, 0)) < np.ptp(also, axis=1).max(axis=1, keepdims=True) / 2
+        new = ~near.any(axis=1) & (_modules_px(also, family) < MIN_MODULE_PX)
+        quads, number = np.concatenate([quads, also[new]]), np.concatenate([number, also_number[new]])
+    return quads, number
+
+
 def _detect(detector: cv2.aruco.ArucoDetector, picture: AnyArray) -> tuple[FloatArray, IntArray]:
-    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that OpenCV finds."""
+    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that a detector finds."""
     corners, ids, _ = detector.detectMarkers(picture)
     number = np.zeros(0) if ids is None else np.asarray(ids)
     return np.array(corners, dtype=float).reshape(-1, 4, 2), number.reshape(-1).astype(np.int64)

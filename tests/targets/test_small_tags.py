@@ -1,0 +1,117 @@
+"""Tags of 10 to 23 px: found as OpenCV finds them, no wrong id, corners at their own precision."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.codes.tags import DICTIONARIES, find_tags, tag_family, tag_modules
+from sfm.targets.detect import find_targets
+from sfm.targets.fits.whole_tag import fit_whole_tags
+from sfm.targets.flags import Flag
+
+TILE, ACROSS, FINE, TEXTURE = 64, 6, 12, 16
+BLUR_PX, NOISE = 0.7, 2.0
+
+
+def turned(angle: float) -> FloatArray:
+    """Return the matrix that turns rows by an angle."""
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+def photographed(name: str, seed: int, longest: float = 23.0) -> tuple[AnyArray, IntArray, FloatArray]:
+    """Return a photograph of 36 tags with one clear module about each, their ids and corners (36, 4, 2)."""
+    rng, modules = np.random.default_rng(seed), tag_family(name).modules
+    count = ACROSS**2
+    picture = np.empty((ACROSS * TILE, ACROSS * TILE), np.float32)
+    number, corners = rng.integers(0, 30, count), np.empty((count, 4, 2))
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    for k in range(count):
+        tilt, axis, turn = rng.uniform(0, np.radians(50)), *rng.uniform(0, 2 * np.pi, 2)
+        side, centre = rng.uniform(10, longest), TILE / 2 + rng.uniform(-2, 2, 2)
+
+        def project(places: FloatArray) -> FloatArray:
+            X, Y = (places @ turned(turn)).T  # noqa: B023
+            seen = np.column_stack([X, Y * np.cos(tilt)]) / (1 + Y * np.sin(tilt) / 20)[:, None]  # noqa: B023
+            return side * seen @ turned(axis) + centre  # noqa: B023
+
+        dark, light = rng.uniform(10, 50), rng.uniform(170, 240)
+        printed = np.pad(~tag_modules(tag_family(name), int(number[k])), 1, constant_values=True)
+        texture = np.kron(printed * (light - dark) + dark, np.ones((TEXTURE, TEXTURE))).astype(np.float32)
+        whole = TEXTURE * (modules + 2)
+        H = cv2.getPerspectiveTransform(
+            (whole * (square + 0.5) - 0.5).astype(np.float32),
+            (FINE * (project(square * (modules + 2) / modules) + 0.5) - 0.5).astype(np.float32),
+        )
+        fine = np.full((FINE * TILE, FINE * TILE), rng.uniform(90, 160), np.float32)
+        cv2.warpPerspective(texture, H, fine.shape[::-1], dst=fine, borderMode=cv2.BORDER_TRANSPARENT)
+        soft = cv2.GaussianBlur(fine, (0, 0), FINE * np.sqrt(BLUR_PX**2 - 1 / 12))
+        i, j = divmod(k, ACROSS)
+        tile = cv2.resize(soft, (TILE, TILE), interpolation=cv2.INTER_AREA)
+        picture[i * TILE : (i + 1) * TILE, j * TILE : (j + 1) * TILE] = tile
+        corners[k] = project(square) + np.array([j, i]) * TILE
+    picture += NOISE * rng.standard_normal(picture.shape, dtype=np.float32)
+    return np.rint(picture).clip(0, 255).astype(np.uint8), number, corners
+
+
+@pytest.mark.parametrize("name", ["apriltag36h11", "aruco4x4_50", "aruco5x5_250"])
+def test_as_many_as_opencv_are_found_and_measured_better(name: str) -> None:
+    picture, number, corners = photographed(name, 3)
+    detector = cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[name]))
+    )
+    theirs = detector.detectMarkers(picture)[1]
+    targets = find_targets(picture, polarity="dark", codes=name)
+    of_tag = targets.code >= 0
+    xy, code, covariance = targets.xy[of_tag], targets.code[of_tag], targets.covariance[of_tag]
+    k = (xy[:, 1] // TILE * ACROSS + xy[:, 0] // TILE).astype(int)
+    assert (code // 4 == number[k]).all()
+    error = xy - corners[k, code % 4]
+    ratio = np.sqrt(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error).mean() / 2)
+    print(name, len(np.unique(k)), len(theirs), np.sqrt((error**2).mean()), ratio)
+    assert len(np.unique(k)) >= len(theirs) > 18
+    assert np.sqrt((error**2).mean()) < 0.06  # px; 0.4 by OpenCV's refinement
+    assert 0.85 < ratio < 1.2
+
+
+def test_a_wrong_id_is_not_confirmed() -> None:
+    name = "aruco4x4_50"
+    picture, number, corners = photographed(name, 3)
+    family = tag_family(name)
+    m = family.modules
+    square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
+    H = np.array([cv2.getPerspectiveTransform(one.astype(np.float32), square) for one in corners])
+    grey = picture.astype(np.float32)
+    misfit = []
+    for shift in (0, 1):
+        clear = np.array([~tag_modules(family, int(one) + shift) for one in number])
+        fits = fit_whole_tags(grey, corners, H, clear, 255.0)
+        failed = fits.flag != 0
+        misfit.append(np.where(failed, np.inf, fits.noise / np.maximum(np.abs(fits.theta[..., 5]), 1e-9)))
+    assert misfit[0].max() < 0.05 < 0.1 < misfit[1].min()
+
+
+def test_a_tag_that_the_border_cuts_is_refused() -> None:
+    m = tag_family("aruco4x4_50").modules
+    quad = np.array([[[0.0, 5], [12, 5], [12, 17], [0, 17]]])
+    square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
+    H = cv2.getPerspectiveTransform(quad[0].astype(np.float32), square)[None]
+    clear = ~tag_modules(tag_family("aruco4x4_50"), 3)[None]
+    fits = fit_whole_tags(np.full((30, 30), 90, np.float32), quad, H, clear, 255.0)
+    assert (fits.flag == Flag.CUT_BY_BORDER).all() and np.isnan(fits.noise).all()
+
+
+@pytest.mark.parametrize("seed", [100, 103])
+def test_letters_are_no_small_tags(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    picture = np.full((700, 1000), 210, np.uint8)
+    for y in range(20, 700, 30):
+        size, stroke = float(rng.uniform(0.4, 1.2)), int(rng.integers(1, 4))
+        text = "".join(rng.choice(list("abdegopqO0689BDPQRci#@%&HE"), 80))
+        cv2.putText(picture, text, (5, y), 0, size, 30, stroke, cv2.LINE_AA)
+    tags = find_tags(
+        cv2.GaussianBlur(picture, (0, 0), 0.8), tag_family("aruco4x4_1000"), polarity="auto", scale=255.0
+    )
+    assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) > 0
