@@ -61,7 +61,8 @@ def read_task(
 
 
 def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    table = read_table(path, ("point",), ("X", "Y", "Z", "x_mm", "y_mm"), ignored=None)
+    units = tuple((f"{axis}_m", axis) for axis in "XYZ")
+    table = read_table(path, ("point",), ("X", "Y", "Z", "x_mm", "y_mm"), aliases=units, ignored=None)
     return table.texts[0], table.values[:, :3], table.values[:, 3:]
 
 
