@@ -7,13 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import GivenPoints
 from sfm.adjustment.quality.given_values import GivenModel
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.adjustment.solve import adjust
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import Similarity
+from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.hypotheses.given_groups import remarks_on_unchecked
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
@@ -172,6 +175,20 @@ def test_fixed_control_is_as_exact_as_its_decimals(decimals: int | None, kinds: 
         assert said.number("sigma") == pytest.approx(1e-4 / np.sqrt(12))
     index = [network.point_index(name) for name in result.network.points]
     assert np.abs(result.estimate.points[index] - truth.points[index]).max() < 5e-5
+
+
+def test_a_grid_of_a_plate_is_not_rounded() -> None:
+    """Its coordinates are multiples of the pitch, whatever decimals they have."""
+    network, truth = _scene("decimals")
+    network = observed_anew(network, truth, 0.001, seed_of("little noise"))
+    at = np.arange(8)
+    control = ObjectPoints(at, np.round(truth.points[:8], 3), np.zeros((8, 3, 3)))
+    free = adjust(network, truth, datum=Datum("free"))
+    for decimals, kind in ((True, "given_rounded"), (False, "given_not_exact")):
+        judged = judge_given(
+            replace(network, control=control), free, Datum("control"), unit="m", decimals=decimals
+        )
+        assert kind in kinds_of(judged.remarks)
 
 
 def test_a_wrong_point_among_rounded_control_is_left_out() -> None:

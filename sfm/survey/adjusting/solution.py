@@ -54,7 +54,7 @@ from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
-from sfm.survey.inputs.plate import plate_family
+from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
@@ -274,12 +274,14 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
     report_step("testing the given values")
     # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
     adjustment = None if free is None or free.settled.held else free.settled.adjustment
+    plate = plate_control(task.survey.targets)
     given = judge_given(
         network,
         adjustment,
         task.datum,
         unit=task.survey.unit,
         rescale=task.survey.adjust.weights == "components",
+        decimals=plate is None or not is_plate_control(task.survey.control, plate),
     )
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":

@@ -48,7 +48,13 @@ class JudgedGiven:
 
 
 def judge_given(
-    network: Network, free: Adjustment | None, datum: Datum, *, unit: str, rescale: bool = True
+    network: Network,
+    free: Adjustment | None,
+    datum: Datum,
+    *,
+    unit: str,
+    rescale: bool = True,
+    decimals: bool = True,
 ) -> JudgedGiven:
     """Return which given values may take part in an adjustment, and remarks on the others.
 
@@ -58,6 +64,7 @@ def judge_given(
         datum: that was asked for.
         unit: object unit.
         rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
+        decimals: whether fixed coordinates may be as precise as their decimals only, unlike those of a grid.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
@@ -68,7 +75,7 @@ def judge_given(
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    return _judged(Task(network, places, datum, unit, rescale))
+    return _judged(Task(network, places, datum, unit, rescale, decimals))
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
@@ -197,7 +204,7 @@ def _group(
     if placed is None:
         return None
     group = Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
-    if fixed and in_datum and task.rescale and not placed.judgement.fits:
+    if fixed and in_datum and task.rescale and task.decimals and not placed.judgement.fits:
         group = _rounded(group, start, task.level)
     found = group.found
     if found.factor == 1.0:

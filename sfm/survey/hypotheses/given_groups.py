@@ -44,6 +44,7 @@ class Task:
     datum: Datum  # that was asked for
     unit: str
     rescale: bool
+    decimals: bool  # whether fixed coordinates may be rounded
 
     @property
     def level(self) -> float:
