@@ -23,14 +23,16 @@ from scipy.spatial.transform import Rotation
 from adapters.reading.text_lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
+from sfm.distortion.models import Role
 from sfm.errors import OutputError
 from sfm.files.csv_tables import MAX_ROWS
 from sfm.network import Estimate, ImagePoints, Network
 
 CAMERA_VALUES = 9
+MODELS = ("opencv", "radial")  # that its cameras may be in
 FOCAL = 6  # place of the focal length among them
 OBSERVATION_BYTES, VALUE_BYTES = 7, 1  # of the shortest lines, the last without an end
-FREE = ("fx", "fy", "k1", "k2")  # what BAL adjusts; its fx and fy are one
+FREE = ("f", "k1", "k2")  # what BAL adjusts
 
 
 def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Network, Estimate]:
@@ -103,31 +105,31 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
     Args:
         path: file to write.
         network: what was measured.
-        estimate: complete; cameras in model opencv with one focal length and no decentring.
+        estimate: complete; cameras in model radial, or in opencv with one focal length and no decentring.
 
     Raises:
         OutputError: what BAL cannot hold, or the file cannot be written.
     """
     for camera in estimate.cameras:
-        if camera.model != "opencv" or camera.value("fx") != camera.value("fy"):
+        focal, further = camera.parameters[camera.plays(Role.FOCAL)], camera.plays(Role.DECENTRING)
+        if camera.model not in MODELS or np.ptp(focal) or camera.parameters[further].any():
             raise OutputError(
                 f"camera {camera.name}: BAL knows one focal length with k1, k2 and nothing else"
             )
-        if camera.value("p1") or camera.value("p2"):
-            raise OutputError(f"camera {camera.name}: BAL cannot hold p1 and p2")
     if not (estimate.oriented.all() and estimate.determined.all()):
         raise OutputError("BAL wants start values of all photographs and points, some have none")
     seen = network.image_points
     m, n = len(network.images), len(network.points)
     lines = [f"{m} {n} {len(seen)}"]
-    principal = np.array([c.parameters[2:4] for c in estimate.cameras])[network.camera[seen.image]]
+    principal = np.array([[c.value("cx"), c.value("cy")] for c in estimate.cameras])
+    principal = principal[network.camera[seen.image]]
     xy = (seen.xy - principal) * (1, -1)
     lines += [f"{i} {j}     {x:.9e} {y:.9e}" for i, j, (x, y) in zip(seen.image, seen.point, xy, strict=True)]
     M = estimate.rotation.transpose(0, 2, 1)
     translation = -np.einsum("iab,ib->ia", M, estimate.position)
     for i, vector in enumerate(Rotation.from_matrix(M).as_rotvec()):
         camera = estimate.cameras[network.camera[i]]
-        values = (*vector, *translation[i], *(camera.value(name) for name in ("fx", "k1", "k2")))
+        values = (*vector, *translation[i], camera.c_px, camera.value("k1"), camera.value("k2"))
         lines += [f"{value:.16e}" for value in values]
     lines += [f"{value:.16e}" for value in estimate.points.ravel()]
     write_lines(path, lines)
@@ -140,5 +142,5 @@ def _centre(size_px: tuple[int, int]) -> FloatArray:
 def _camera(name: str, values: FloatArray, size_px: tuple[int, int]) -> Camera:
     f, k1, k2 = (float(value) for value in values)
     return camera_from_values(
-        name, "opencv", size_px, (1.0, 1.0), c_mm=f, free=FREE, values=(("k1", k1), ("k2", k2))
+        name, "radial", size_px, (1.0, 1.0), c_mm=f, free=FREE, values=(("k1", k1), ("k2", k2))
     )

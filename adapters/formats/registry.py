@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
 from sfm.camera import Camera
 from sfm.display import counted
-from sfm.distortion.models import MODELS
+from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import whole_folder
@@ -129,7 +129,9 @@ FORMATS = (
         lacks=("k4", "k5", "k6"),
     ),
     FileFormat("photomodeler", ("brown",), read_photomodeler, write_photomodeler, lacks=("b1", "b2")),
-    FileFormat("bal", ("opencv",), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS),
+    FileFormat(
+        "bal", ("opencv", "radial"), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS
+    ),
     FileFormat(
         *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp),
         straight=_BROWN_DISTORTION,
@@ -205,6 +207,9 @@ def format_of(path: Path) -> FileFormat:
 def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     """Read a network and its solution.
 
+    Where a format only numbers points, their names are those of uncoded points, u and the number, which are
+    never taken for the names of others.
+
     Args:
         path: file or folder.
         name: of the format; found from what is there if not given.
@@ -215,7 +220,16 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     form = format_of(path) if name is None else format_named(name)
     if form.read is None:
         raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
-    return form.read(path)
+    network, estimate = form.read(path)
+    if _names_points(form, path):
+        return network, estimate
+    uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
+    return replace(network, points=uncoded), estimate
+
+
+def _names_points(form: FileFormat, path: Path) -> bool:
+    """Return whether names of points identify them; beside a model that Kolinear has written they lie."""
+    return (path / SIDE_FILE).is_file() if form.name in ("colmap", "colmap-text") else form.names[0]
 
 
 def read_comparable(path: Path, name: str | None = None) -> StoredResult:
@@ -238,10 +252,9 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
             f"{form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
-    points_named, images_named = form.names
-    if form.name in ("colmap", "colmap-text"):  # names lie beside a model that Kolinear has written
-        points_named = (path / SIDE_FILE).is_file()
-    return StoredResult(path.name, network, estimate, points_named=points_named, images_named=images_named)
+    return StoredResult(
+        *(path.name, network, estimate), points_named=_names_points(form, path), images_named=form.names[1]
+    )
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
@@ -288,7 +301,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
         left = [
             name for name in (*form.lacks, *form.straight) if name in camera.names and camera.value(name) != 0
         ]
-        if form.one_focal and camera.value("fx") != camera.value("fy"):
+        if form.one_focal and np.ptp(camera.parameters[camera.plays(Role.FOCAL)]):
             left.append("fx other than fy")
         if left:
             remedy = "; --undistort corrects the image points for it" if form.straight else ""

@@ -13,13 +13,14 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import GENERAL_MODELS, MAX_PARAMETERS, MODELS, Model, Role, observe
+from sfm.distortion.models import CONVERTIBLE, MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
 
 GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
 FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the end of double precision
+_OF_ONE = {"f": "fx", "k": "k1"}  # where a model has one focal length or one coefficient
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def convert_camera(
 
     Args:
         camera: interior orientation to convert.
-        model: a name in sfm.distortion.models.GENERAL_MODELS.
+        model: a name in sfm.distortion.models.CONVERTIBLE.
         region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
             photograph if not given.
         held: parameters of the model that must be 0, others take over what they can; where b1 is one of
@@ -54,9 +55,9 @@ def convert_camera(
     """
     if model == camera.model and not needs_less(camera, held):
         return Conversion(camera, model, 0.0, 0.0)
-    if model not in GENERAL_MODELS:
+    if model not in CONVERTIBLE:
         raise SurveyFileError(
-            f"camera {camera.name}: model '{model}', expected one of {', '.join(GENERAL_MODELS)}"
+            f"camera {camera.name}: model '{model}', expected one of {', '.join(CONVERTIBLE)}"
         )
     xy = _grid(camera, region_px)
     uv = tangents_from_pixel(camera, xy)
@@ -179,14 +180,15 @@ def start_values(camera: Camera, model: str) -> Camera:
         if backward and to_opencv:
             k1, k2, k3 = _reversed(*(camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3)))
             values |= {"k1": k1, "k2": k2, "p1": c * camera.value("P2"), "p2": -c * camera.value("P1")}
-            values |= {"k3": k3} if model == "full_opencv" else {}
+            values |= {"k3": k3}
     else:
         fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
         c = fy * pixel[1]
-        same = camera.model in GENERAL_MODELS  # others have coefficients of another kind
+        same = camera.model in CONVERTIBLE  # others have coefficients of another kind
         if to_opencv:
-            names = camera.names if same else ("cx", "cy")
-            values |= {name: camera.value(name) for name in names if name in MODELS[model].names}
+            values |= (
+                _as_full_opencv(camera) if same else {"cx": camera.value("cx"), "cy": camera.value("cy")}
+            )
             values |= {"fx": fx, "fy": fy}
         else:
             stretch = fx * pixel[0] / c
@@ -194,10 +196,14 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"y0": -(camera.value("cy") - centre[1]) * pixel[1]}
             values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
         if MODELS[model].corrects and same:
-            K = _reversed(*_power_series(camera))
+            own = _as_full_opencv(camera)
+            K = _reversed(*_power_series(own))
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
-            values |= {"P1": -camera.value("p2") / c, "P2": camera.value("p1") / c}
-    return camera_from_values(camera.name, model, camera.size_px, pixel, c_mm=c, values=tuple(values.items()))
+            values |= {"P1": -own["p2"] / c, "P2": own["p1"] / c}
+    if to_opencv:
+        values |= {"f": (values["fx"] + values["fy"]) / 2, "k": values.get("k1", 0.0)}
+    known = tuple((name, values[name]) for name in MODELS[model].names if name in values)
+    return camera_from_values(camera.name, model, camera.size_px, pixel, c_mm=c, values=known)
 
 
 def corresponding_free(camera: Camera, model: str) -> BoolArray:
@@ -229,13 +235,18 @@ def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:
     return -a, 3 * a**2 - b, 8 * a * b - 12 * a**3 - c
 
 
-def _power_series(camera: Camera) -> tuple[float, float, float]:
-    """First three coefficients of the radial term of an opencv model, the fraction divided out."""
-    k = {name: camera.value(name) for name in camera.names if name.startswith("k")}
-    d1, d2, d3 = k.get("k4", 0.0), k.get("k5", 0.0), k.get("k6", 0.0)
-    s1 = k["k1"] - d1
-    s2 = k["k2"] - d2 - d1 * s1
-    return s1, s2, k.get("k3", 0.0) - d3 - d2 * s1 - d1 * s2
+def _as_full_opencv(camera: Camera) -> dict[str, float]:
+    """Parameters of full_opencv, 0 where a camera in a model with a part of them has none."""
+    own = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
+    return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | own
+
+
+def _power_series(own: dict[str, float]) -> tuple[float, float, float]:
+    """First three coefficients of the radial term of full_opencv, the fraction divided out."""
+    k1, k2, k3, d1, d2, d3 = (own[f"k{i}"] for i in range(1, 7))
+    s1 = k1 - d1
+    s2 = k2 - d2 - d1 * s1
+    return s1, s2, k3 - d3 - d2 * s1 - d1 * s2
 
 
 def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:

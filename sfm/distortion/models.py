@@ -142,7 +142,7 @@ _ALPHA_BETA = (*_parameters(Role.RADIAL, "alpha", "1"), *_parameters(Role.DENOMI
 _OPENCV = (*_TWO, *_K1_K2, *_P1_P2)
 _FRACTION = (*_parameters(Role.RADIAL, "k3", "1"), *_parameters(Role.DENOMINATOR, "k4 k5 k6", "1"))
 
-# Those that cameras are converted to
+# Those of any lens that shows equal tangents about equally long
 GENERAL = (
     Model("brown", brown, _BROWN, corrects=True),
     Model("brown_forward", brown_forward, _FORWARD),
@@ -153,7 +153,7 @@ GENERAL = (
     Model("brown_affine_dbat", brown_affine, _BROWN, corrects=True, corrected_plane=True),
     Model("brown_forward_affine", brown_forward, _FORWARD, distorted_affinity=True),
 )
-# COLMAP's others by its names in small letters, for models of its own that are adjusted and written as such
+# COLMAP's others by its names in small letters; here those with a part of the parameters of `opencv`
 PERSPECTIVE = (
     Model("simple_pinhole", radial, _ONE),
     Model("pinhole", radial, _TWO),
@@ -191,6 +191,7 @@ COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
 ALL = (*GENERAL, *COLMAP)
 MODELS = {model.name: model for model in ALL}
 GENERAL_MODELS = tuple(model.name for model in GENERAL)
+CONVERTIBLE = (*GENERAL_MODELS, *(model.name for model in PERSPECTIVE))  # with coefficients of one kind
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
 
 

@@ -529,7 +529,7 @@ def test_formats_refuse_by_name(tmp_path: Path) -> None:
     network, truth = network_in("brown")
     with pytest.raises(SurveyFileError, match="format 'dxf', expected one of colmap"):
         format_named("dxf")
-    with pytest.raises(KolinearError, match="format bal holds models opencv, not brown"):
+    with pytest.raises(KolinearError, match="format bal holds models opencv, radial, not brown"):
         write_any(tmp_path / "x", "bal", network, truth)
     (tmp_path / "note.txt").write_text("hello\n")
     with pytest.raises(SurveyFileError, match=r"note\.txt, line 1: this is no format that is known"):
