@@ -14,15 +14,20 @@ Blocks follow one another, each closed by an empty line:
         [n] covariances of the position        (may be empty)
         n c xp yp xs ys K1 K2 K3 P1 P2         (mm)
         n standard deviations
-    control points:  id X Y Z sX sY sZ
-    object points:   id X Y Z sX sY sZ
+    control points:  id X Y Z sX sY sZ         (a negative s: held fixed)
+    object points:   id X Y Z sX sY sZ         (adjusted)
     image points:    n id x y sx sy            (px)
     features, and which photograph shows them  (not read)
+
+Control points that were adjusted stand in both blocks with their adjusted coordinates and standard
+deviations; what was observed of them is not in the file. Standard deviations of cameras are the defaults of
+the program, whether it adjusted the camera or not: only the title of a calibration project says that it did.
 
 Pixel coordinates count from the corner of the top-left pixel, 0.5 px more than Kolinear's; the principal
 point (xp, yp) from the same corner in mm, right and down; xs, ys is the size of the sensor.
 
-Source: the format as read by loadpm.m of DBAT (Borlin and Grussenmeyer), checked on its camcal data.
+Source: the format as read by loadpm.m of DBAT and the use made of it in prague2016_pm.m (Borlin and
+Grussenmeyer), checked on its camcal and Strasbourg data.
 """
 
 from __future__ import annotations
@@ -31,26 +36,42 @@ from pathlib import Path
 
 import numpy as np
 
+from adapters.formats.content import Content
 from adapters.reading.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.stored_result import StoredResult
 
+MODELS = ("brown", "brown_dbat")  # that its cameras may be in; they differ in what is minimised
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus ours, px
 INNER = 10  # c xp yp xs ys K1 K2 K3 P1 P2
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1")  # what a calibration adjusts
+ROUNDING = 1e-12  # of the ratio of two sides that are the same
+CALIBRATION = "calibration project"  # in the title of a project that adjusts its camera
 
 
 def read_photomodeler(
     path: Path, *, control: Path | None = None, size_px: tuple[int, int] | None = None
 ) -> tuple[Network, Estimate]:
-    """Read a PhotoModeler text export as a network and its start values.
+    """Read a PhotoModeler text export as a network and its start values; see `read_export`."""
+    result = read_export(path, control=control, size_px=size_px).result
+    return result.network, result.estimate
 
-    Photographs with the same interior orientation share a camera, in model `brown` with everything but
-    the shear free. The covariance of an image point is that of the file, 1 px^2 where it gives none. An image
+
+def read_export(
+    path: Path, *, control: Path | None = None, size_px: tuple[int, int] | None = None
+) -> Content:
+    """Read all of a PhotoModeler text export.
+
+    Photographs with the same interior orientation share a camera, in model `brown_dbat` with the affinity of
+    its pixels: calibrated, but with everything except the shear free in a calibration project. Control with a
+    negative standard deviation or 0 is fixed, control that was adjusted is no observation and becomes an
+    object point. The covariance of an image point is that of the file, 1 px^2 where it gives none. An image
     point that is repeated stands once; one with two positions stands with both, for whoever adjusts it.
 
     Args:
@@ -63,7 +84,7 @@ def read_photomodeler(
         SurveyFileError: what is wrong, with file and line number.
     """
     text = Lines.of(path)
-    text.line()  # title
+    calibrates = CALIBRATION in text.line().lower()
     header = text.numbers(2, 4)
     if len(header) == 4:
         words = text.current.split()
@@ -76,6 +97,7 @@ def read_photomodeler(
     text.numbers(INNER, INNER)
     names: list[str] = []
     outer: list[FloatArray] = []
+    outer_sigma: list[FloatArray] = []
     inner: list[FloatArray] = []
     while True:
         line = text.line()
@@ -90,15 +112,16 @@ def read_photomodeler(
         file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]
         names.append(text.name_of(file, "the file of a photograph"))
         outer.append(text.numbers(7, 7, photograph=number)[1:])
-        text.numbers(7, 7, photograph=number)
+        outer_sigma.append(text.numbers(7, 7, photograph=number)[1:4])
         text.numbers(0, 4)
         inner.append(text.numbers(INNER + 1, INNER + 1, photograph=number)[1:])
         text.numbers(INNER + 1, INNER + 1, photograph=number)
     control_rows = text.block(7)
     object_rows = text.block(7)
     mark_rows = text.block(6)
+    adjusted = {(key, *row.tolist()) for _, key, row in object_rows if (row[3:] > 0).all()}
     if control is not None:
-        control_rows = _read_control(control)
+        control_rows, adjusted = _read_control(control), set()
     known: dict[str, FloatArray] = {}
     controls = {key for _, key, _ in control_rows}
     for where, key, row in (*object_rows, *control_rows):
@@ -124,7 +147,10 @@ def read_photomodeler(
         xy.append(row[1:3] - HALF_PIXEL)
         stated.append(bool((row[3:5] > 0).all()))
         covariance.append(np.diag(np.where(row[3:5] > 0, row[3:5], 1.0) ** 2))
-    cameras, camera_index = _cameras(np.array(inner).reshape(-1, INNER), default, size_px)
+    observed = [(key, row) for _, key, row in control_rows if (key, *row.tolist()) not in adjusted]
+    lost = len(control_rows) - len(observed)
+    free = FREE if calibrates else ()
+    cameras, camera_index = _cameras(np.array(inner).reshape(-1, INNER), default, size_px, free)
     exterior = np.array(outer).reshape(-1, 6)
     kappa, phi, omega = np.deg2rad(exterior[:, 3:]).T
     rotation = [rotation_from_angles(o, p, k) for o, p, k in zip(omega, phi, kappa, strict=True)]
@@ -142,16 +168,38 @@ def read_photomodeler(
             np.array(stated, dtype=bool),
         ),
         ObjectPoints(
-            np.array([index[key] for _, key, _ in control_rows], dtype=np.int64),
-            np.array([row[:3] for _, _, row in control_rows]).reshape(-1, 3),
-            np.array([np.diag(row[3:6] ** 2) for _, _, row in control_rows]).reshape(-1, 3, 3),
+            np.array([index[key] for key, _ in observed], dtype=np.int64),
+            np.array([row[:3] for _, row in observed]).reshape(-1, 3),
+            np.array([np.diag(np.maximum(row[3:6], 0.0) ** 2) for _, row in observed]).reshape(-1, 3, 3),
         ),
     )
-    return network, Estimate(cameras, exterior[:, :3].copy(), np.array(rotation).reshape(-1, 3, 3), xyz)
+    point_sigma = np.full((len(points), 3), np.nan)
+    for _, key, row in object_rows:
+        point_sigma[index[key]] = np.where(row[3:] > 0, row[3:], np.nan)
+    held = "adjusted in a calibration project" if calibrates else "held, as its title names no calibration"
+    notes = [f"camera: {held}; free in the survey file says otherwise"]
+    if lost:
+        notes.append(
+            f"{counted(lost, 'control point')} adjusted by PhotoModeler: the export does not say what was "
+            "observed, --control FILE does"
+        )
+    estimate = Estimate(cameras, exterior[:, :3].copy(), np.array(rotation).reshape(-1, 3, 3), xyz)
+    result = StoredResult(
+        *(path.name, network, estimate),
+        point_covariance=_covariance_of(point_sigma),
+        position_covariance=_covariance_of(np.array(outer_sigma).reshape(-1, 3)),
+    )
+    return Content(result, notes=tuple(notes))
+
+
+def _covariance_of(sigma: FloatArray) -> FloatArray | None:
+    """Return diagonal covariances (n, 3, 3) of standard deviations (n, 3), None where none is positive."""
+    sigma = np.where(sigma > 0, sigma, np.nan)
+    return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
 
 
 def _cameras(
-    inner: FloatArray, default: FloatArray, size_px: tuple[int, int]
+    inner: FloatArray, default: FloatArray, size_px: tuple[int, int], free: tuple[str, ...]
 ) -> tuple[tuple[Camera, ...], np.ndarray]:
     """One camera per interior orientation that occurs, and which photograph has which."""
     kinds, index = np.unique(inner, axis=0, return_inverse=True)
@@ -163,21 +211,24 @@ def _cameras(
         c, xp, yp, xs, ys = values[:5]
         if not (c > 0 and xs > 0 and ys > 0):
             raise SurveyFileError(f"camera {k}: c {c:g} mm, sensor {xs:g} x {ys:g} mm, all must be positive")
-        pixel = (float(xs / size_px[0]), float(ys / size_px[1]))
+        side = float(ys / size_px[1])
+        stretch = float(xs / size_px[0]) / side  # as DBAT: square pixels of this height, and an affinity
+        stretch = 1.0 if abs(stretch - 1) < ROUNDING else stretch
         given = [
-            ("x0", xp - xs / 2),
+            ("x0", (xp - xs / 2) / stretch),
             ("y0", ys / 2 - yp),
+            ("b1", stretch - 1),
             *zip(("K1", "K2", "K3", "P1", "P2"), values[5:], strict=True),
         ]
         name = "camera" if len(kinds) == 1 else f"camera{k + 1}"
         cameras.append(
             camera_from_values(
                 name,
-                "brown",
+                "brown_dbat",
                 size_px,
-                pixel,
+                (side, side),
                 c_mm=float(c),
-                free=FREE,
+                free=free,
                 values=tuple((n, float(v)) for n, v in given),
             )
         )
@@ -203,14 +254,15 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
 def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, title: str = "Kolinear") -> None:
     """Write a network and its solution as a PhotoModeler text export, with the digits of double precision.
 
-    PhotoModeler numbers its points: names that are whole numbers are kept, any other is refused.
-    Photographs without orientation are refused, points without coordinates have image points only.
+    It is one of a calibration project where a parameter of a camera is free. PhotoModeler numbers its points:
+    names that are whole numbers are kept, any other is refused. Photographs without orientation are refused,
+    points without coordinates have image points only.
 
     Raises:
         OutputError: what the export cannot hold, or the file cannot be written.
     """
     for camera in estimate.cameras:
-        if camera.model != "brown" or camera.value("b1") or camera.value("b2"):
+        if camera.model not in MODELS or camera.value("b1") or camera.value("b2"):
             raise OutputError(
                 f"camera {camera.name}: PhotoModeler cannot hold model {camera.model} with affinity; "
                 "convert it to brown with b1 in the pixel size"
@@ -224,6 +276,8 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
     for name in network.points:
         if not name.isdecimal() or str(int(name)) != name:
             raise OutputError(f"point '{name}': PhotoModeler numbers its points")
+    if any(camera.free.any() for camera in estimate.cameras):
+        title = f"{title} {CALIBRATION.title()}"
     width, height = sizes.pop()
     inner = [_text(*_inner(camera)) for camera in estimate.cameras]
     none = _text(*[0.0] * INNER)

@@ -28,8 +28,10 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
+from adapters.formats.content import Content
 from adapters.formats.metashape import read_metashape, write_metashape
-from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
+from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
+from adapters.formats.photomodeler import read_export, read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
@@ -64,6 +66,8 @@ class FileFormat:
     one_focal: bool = False  # whether fx and fy must be the same
     titled: bool = False  # whether it holds the name of what is written
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
+    read_all: Callable[..., Content] | None = None  # of a format that holds more than `read` returns
+    control: bool = False  # whether `read_all` takes a file of control, as keyword
 
     @property
     def readable(self) -> bool:
@@ -128,7 +132,12 @@ FORMATS = (
         *("metashape", ("brown_forward_affine", "full_opencv", "opencv"), read_metashape, write_metashape),
         lacks=("k4", "k5", "k6"),
     ),
-    FileFormat("photomodeler", ("brown",), read_photomodeler, write_photomodeler, lacks=("b1", "b2")),
+    FileFormat(
+        *("photomodeler", PHOTOMODELER_MODELS, read_photomodeler, write_photomodeler),
+        lacks=("b1", "b2"),
+        read_all=read_export,
+        control=True,
+    ),
     FileFormat(
         "bal", ("opencv", "radial"), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS
     ),
@@ -205,7 +214,13 @@ def format_of(path: Path) -> FileFormat:
 
 
 def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
-    """Read a network and its solution.
+    """Read a network and its solution; see `read_content`."""
+    result = read_content(path, name).result
+    return result.network, result.estimate
+
+
+def read_content(path: Path, name: str | None = None, *, control: Path | None = None) -> Content:
+    """Read all that a file or folder says.
 
     Where a format only numbers points, their names are those of uncoded points, u and the number, which are
     never taken for the names of others.
@@ -213,6 +228,7 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     Args:
         path: file or folder.
         name: of the format; found from what is there if not given.
+        control: file of the control, in place of that of a PhotoModeler export.
 
     Raises:
         SurveyFileError: what is wrong, with file and line number.
@@ -220,11 +236,18 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     form = format_of(path) if name is None else format_named(name)
     if form.read is None:
         raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
+    if control is not None and not form.control:
+        raise SurveyFileError(f"{path}: format {form.name} takes no file of control, photomodeler does")
+    if form.read_all is not None:
+        return form.read_all(path, control=control) if form.control else form.read_all(path)
     network, estimate = form.read(path)
-    if _names_points(form, path):
-        return network, estimate
-    uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
-    return replace(network, points=uncoded), estimate
+    points_named = _names_points(form, path)
+    if not points_named:
+        uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
+        network = replace(network, points=uncoded)
+    return Content(
+        StoredResult(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1])
+    )
 
 
 def _names_points(form: FileFormat, path: Path) -> bool:
@@ -245,16 +268,15 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
         raise SurveyFileError(
             f"{path}: format {form.name} holds points only, results with photographs are compared"
         )
-    network, estimate = read_any(path, form.name)
+    result = read_content(path, form.name).result
+    network, estimate = result.network, result.estimate
     if not (estimate.oriented.any() or estimate.determined.any()):
         raise SurveyFileError(
             f"{path}: {counted(len(network.image_points), 'image point')} as format "
             f"{form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
-    return StoredResult(
-        *(path.name, network, estimate), points_named=_names_points(form, path), images_named=form.names[1]
-    )
+    return result
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:

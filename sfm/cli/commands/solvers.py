@@ -124,6 +124,10 @@ def convert(
         bool,
         typer.Option("--undistort", help="Correct image points for distortion: for formats that hold none."),
     ] = False,
+    control: Annotated[
+        Path | None,
+        typer.Option("--control", metavar="FILE", help="Control of a PhotoModeler export, id,label,X,Y,Z..."),
+    ] = None,
 ) -> None:
     """Convert a survey from one program's format to another's.
 
@@ -135,7 +139,7 @@ def convert(
             ENDINGS,
             FORMATS,
             format_named,
-            read_any,
+            read_content,
             refuse_taken,
             write_any,
             written,
@@ -152,7 +156,8 @@ def convert(
     form = format_named(to_format or ENDINGS.get(ending, "tables"))
     refuse_taken(target, form)
     with working_on(str(source)):
-        network, estimate = read_any(source, from_format)
+        content = read_content(source, from_format, control=control)
+    network, estimate = content.result.network, content.result.estimate
     cameras = estimate.cameras
     conversions: tuple[Conversion, ...] = ()
     if form.models:
@@ -168,4 +173,6 @@ def convert(
                 f"camera {camera.name}: {one.source_model} to {one.camera.model}, "
                 f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
             )
+    for note in content.notes:
+        print(f"{source}: {note}")
     print(f"{target}: {written(form.name, network, estimate)} as {form.name}")

@@ -197,7 +197,8 @@ def test_round_trip(form: Format, tmp_path: Path) -> None:
         np.testing.assert_allclose(
             estimate.cameras[0].parameters, truth.cameras[0].parameters, rtol=1e-12, atol=1e-15
         )
-        assert estimate.cameras[0].model == truth.cameras[0].model
+        # PhotoModeler's is brown with residuals of the corrected point, as DBAT has them
+        assert estimate.cameras[0].model.removesuffix("_dbat") == truth.cameras[0].model
         assert estimate.cameras[0].size_px == truth.cameras[0].size_px
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from adapters.formats.photomodeler import read_photomodeler
-from sfm.camera import project
+from adapters.formats.photomodeler import read_export, read_photomodeler
+from sfm.adjustment.solve import adjust
+from sfm.camera import project, tangents_from_pixel
+from sfm.cli.commands.solvers import convert
 from sfm.conventions import angles_from_rotation
 from sfm.errors import SurveyFileError
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.survey.inputs.survey import read_survey
 from tests.places import SHARED
+from tests.synthetic import make_network, observed_anew, seed_of
 
 SHARED = SHARED / "data" / "camcal"
 
@@ -68,10 +75,10 @@ def test_every_number_finds_its_place(tmp_path: Path) -> None:
     assert camera.value("x0") == pytest.approx(5.1 - 5.0)
     assert camera.value("y0") == pytest.approx(7.5 / 2 - 3.8)
     assert (camera.value("K1"), camera.value("P1"), camera.value("P2")) == (1e-4, 2e-5, -1e-5)
-    assert dict(zip(camera.names, camera.free, strict=True)) == {
-        **dict.fromkeys(camera.names, True),
-        "b2": False,
-    }
+    assert not camera.free.any()  # no calibration project
+    text = EXPORT.replace("Two photographs", "Bundle Soln PhotoModeler Calibration Project", 1)
+    (camera,) = read_photomodeler(write(tmp_path, text))[1].cameras
+    assert [name for name, free in zip(camera.names, camera.free, strict=True) if not free] == ["b2"]
     np.testing.assert_allclose(estimate.position[1], [-0.4, 0.2, 3.1])
     np.testing.assert_allclose(np.rad2deg(angles_from_rotation(estimate.rotation[1])), [4, -12, 90])
     np.testing.assert_allclose(network.image_points.xy[0], [1000.0, 700.0])
@@ -116,6 +123,124 @@ def test_bad_lines_are_named(old: str, new: str, message: str, tmp_path: Path) -
     assert old in EXPORT
     with pytest.raises(SurveyFileError, match=f"export.txt, {message}"):
         read_photomodeler(write(tmp_path, EXPORT.replace(old, new, 1)))
+
+
+def export_of(network: Network, truth: Estimate, control: str, *, title: str = "Bundle Soln") -> str:
+    """An export as PhotoModeler writes it, with its default standard deviations of the camera."""
+    camera = truth.cameras[0]
+    xs, ys = np.array(camera.size_px) * camera.pixel_mm
+    c, x0, y0 = camera.parameters[:3]
+    inner = f"{c} {xs / 2 + x0} {ys / 2 - y0} {xs} {ys} " + " ".join(map(str, camera.parameters[3:8]))
+    sigma = f"0 {xs / 1000} {ys / 1000} 0.5 0.5 0.001 0.0001 0.0001 0.001 0.001"
+    lines = [title, f"0.0005 20 {camera.size_px[0]} {camera.size_px[1]}", "1 0.1 10 100 100 100 20 20 20"]
+    lines += [inner, sigma]
+    angles = np.rad2deg(angles_from_rotation(truth.rotation))[:, ::-1]
+    for i, name in enumerate(network.images):
+        pose = " ".join(map(str, [*truth.position[i], *angles[i]]))
+        lines += [f"{i} {name}", f"{i} {pose}", f"{i} 0.1 0.2 0.3 0 0 0", "", f"{i} {inner}", f"{i} {sigma}"]
+    points = [f"{j + 1} {x} {y} {z} 0.01 0.02 0.03" for j, (x, y, z) in enumerate(truth.points)]
+    seen = network.image_points
+    marks = [
+        f"{i} {j + 1} {x + 0.5} {y + 0.5} 0.1 0.1"
+        for i, j, (x, y) in zip(seen.image, seen.point, seen.xy, strict=True)
+    ]
+    return "\n".join([*lines, "", *control.splitlines(), "", *points, "", *marks, "", "", ""])
+
+
+def made() -> tuple[Network, Estimate]:
+    network, truth = make_network(seed_of("export"), images=5, points=16, free=())
+    values = dict(zip(truth.cameras[0].names, truth.cameras[0].parameters, strict=True)) | {"b1": 0.0}
+    camera = truth.cameras[0].with_parameters(np.array(list(values.values())))
+    network = observed_anew(network, replace(truth, cameras=(camera,)), 0.1, seed_of("export noise"))
+    return network, replace(truth, cameras=(camera,))
+
+
+def test_negative_sigma_is_a_fixed_point_and_a_camera_is_held_but_in_a_calibration(tmp_path: Path) -> None:
+    """As DBAT has them: the adjustment of the file is that of fixed points and the camera as it is."""
+    network, truth = made()
+    fixed = "\n".join(
+        f"{j + 1} {x + 0.001 * j} {y} {z} -0.787602 -0.787602 -0.787602"
+        for j, (x, y, z) in enumerate(truth.points[:5])
+    )
+    read, start = read_photomodeler(write(tmp_path, export_of(network, truth, fixed)))
+    a = adjust(read, start, datum="control", reject="none")
+    moved = truth.points[:5] + np.outer(np.arange(5) * 0.001, [1, 0, 0])
+    np.testing.assert_array_equal(read.control.covariance, 0)
+    np.testing.assert_allclose(a.estimate.points[:5], moved, atol=1e-12)
+    assert a.redundancy == 2 * len(read.image_points) - 6 * 5 - 3 * 11
+    np.testing.assert_array_equal(a.estimate.cameras[0].parameters, start.cameras[0].parameters)
+    b = adjust(
+        network.with_control([str(j + 1) for j in range(5)], moved),
+        replace(truth, cameras=(replace(truth.cameras[0], model="brown_dbat"),)),
+        datum="control",
+        reject="none",
+    )
+    np.testing.assert_allclose(a.estimate.position, b.estimate.position, atol=1e-8)
+    title = "Bundle Soln PhotoModeler Calibration Project"
+    read, start = read_photomodeler(write(tmp_path, export_of(network, truth, fixed, title=title)))
+    assert start.cameras[0].free.sum() == 9
+    assert adjust(read, start, datum="control", reject="none").redundancy == a.redundancy - 9
+
+
+def test_posterior_sigma_of_adjusted_control_is_no_prior(tmp_path: Path) -> None:
+    network, truth = made()
+    rows = [row for row in export_of(network, truth, "").splitlines() if row.endswith(" 0.01 0.02 0.03")][:4]
+    path = write(tmp_path, export_of(network, truth, "\n".join(rows)))
+    content = read_export(path)
+    assert len(content.result.network.control) == 0 and len(content.notes) == 2
+    assert content.result.point_covariance is not None and content.result.position_covariance is not None
+    np.testing.assert_allclose(content.result.point_covariance[3], np.diag([1e-4, 4e-4, 9e-4]))
+    np.testing.assert_allclose(content.result.position_covariance[0], np.diag([0.01, 0.04, 0.09]))
+    # the same points are control where their coordinates were observed, and by the file beside the export
+    prior = "\n".join(row.replace("0.01 0.02 0.03", "0.001 0.001 0.001") for row in rows)
+    content = read_export(write(tmp_path, export_of(network, truth, prior)))
+    np.testing.assert_allclose(content.result.network.control.covariance, [np.eye(3) * 1e-6] * 4)
+    (tmp_path / "control.txt").write_text("1,a,1,2,3\n2,b,4,5,6,0.1,0.2,0.3\n")
+    convert(write(tmp_path), tmp_path / "out", from_format="photomodeler", control=tmp_path / "control.txt")
+    survey = read_survey(tmp_path / "out" / "survey.toml")
+    assert survey.control is not None and survey.control.names == ("1", "2")
+
+
+def test_pixels_that_are_not_square_become_an_affinity(tmp_path: Path) -> None:
+    """As DBAT has them; the rays of the image points are those of pixels as the file states them."""
+    (camera,) = read_photomodeler(write(tmp_path))[1].cameras
+    (other,) = read_photomodeler(write(tmp_path, EXPORT.replace("10.0000 7.5000", "10.0400 7.5000")))[
+        1
+    ].cameras
+    assert other.pixel_mm.tolist() == camera.pixel_mm.tolist()
+    assert other.value("b1") == pytest.approx(0.004)
+    xy = np.array([[100.0, 200.0], [1800.0, 1400.0]])
+    rectangular = replace(
+        camera,
+        pixel_mm=np.array([10.04 / 2000, 0.005]),
+        parameters=np.array([10.0004, 5.1 - 5.02, 7.5 / 2 - 3.8, *camera.parameters[3:]]),
+    )
+    np.testing.assert_allclose(
+        tangents_from_pixel(other, xy), tangents_from_pixel(rectangular, xy), atol=1e-12
+    )
+
+
+@pytest.mark.slow  # the whole survey, 5 s
+@pytest.mark.skipif(not SHARED.is_dir(), reason="reference data camcal is not beside the repository")
+def test_camcal_export_gives_the_report_of_dbat(tmp_path: Path) -> None:
+    """Convert alone, then adjust: the printed digits of camcal-dbatreport.txt."""
+    convert(
+        *(SHARED / "camcal-pmexport.txt", tmp_path / "t"),
+        from_format="photomodeler",
+        control=SHARED / "camcal-fixed.txt",
+    )
+    a = run_survey(read_survey(tmp_path / "t" / "survey.toml")).adjustment
+    assert (round(a.sigma0, 4), a.redundancy) == (1.6148, 3725)
+    values = dict(zip(a.estimate.cameras[0].names, a.estimate.cameras[0].parameters, strict=True))
+    for name, value in (("K1", "0.00458861"), ("K2", "-4.51351e-05"), ("K3", "-2.05253e-06")):
+        assert f"{values[name]:.6g}" == value
+    for name, value in (
+        ("c", "7.457"),
+        ("P1", "-6.12803e-05"),
+        ("P2", "-4.41172e-05"),
+        ("b1", "0.000389598"),
+    ):
+        assert f"{values[name]:.6g}" == value
 
 
 @pytest.mark.parametrize("lines", range(1, 30))
