@@ -109,9 +109,16 @@ def read_bundle_matlab(
 
 
 def write_bundle_matlab(
-    cameras: Path, points: Path, sigmas: Path, network: Network, estimate: Estimate
+    cameras: Path, points: Path, sigmas: Path | None, network: Network, estimate: Estimate
 ) -> None:
-    """Write a network as the three files of the MATLAB program; names of points are lost.
+    """Write a network as the files of the MATLAB program; names of points are lost.
+
+    Args:
+        cameras: file of the photographs.
+        points: file of the object points and their image points.
+        sigmas: file of the standard deviations; None where none are stated.
+        network: what was measured.
+        estimate: complete.
 
     Raises:
         OutputError: what the files have no place for, or they cannot be written.
@@ -128,7 +135,8 @@ def write_bundle_matlab(
         frames = [f"{seen.image[r]} {_text(*sigma[r])}" for r in rows]
         sigma_lines.append(" ".join([f"{len(rows)}", *frames]))
     write_lines(points, point_lines)
-    write_lines(sigmas, sigma_lines)
+    if sigmas is not None:
+        write_lines(sigmas, sigma_lines)
 
 
 def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
@@ -154,14 +162,16 @@ def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
 
 
 def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimate) -> None:
-    """Write cams.txt, pts.txt, sigmas.txt and interior.txt into a folder.
+    """Write cams.txt, pts.txt, interior.txt and, where standard deviations are stated, sigmas.txt.
 
     Raises:
         OutputError: what the files have no place for, or they cannot be written.
     """
     _millimetres(network, estimate)  # refuses what cannot be held, before a folder is made
     folder.mkdir(parents=True, exist_ok=True)
-    cameras, points, sigmas = folder / "cams.txt", folder / "pts.txt", folder / "sigmas.txt"
+    cameras, points = folder / "cams.txt", folder / "pts.txt"
+    stated = np.isfinite(network.image_points.stated_sigma).any()
+    sigmas = folder / "sigmas.txt" if stated else None
     write_bundle_matlab(cameras, points, sigmas, network, estimate)
     camera = estimate.cameras[0]
     values = _text(*(camera.value(name) for name in ("c", "x0", "y0")))

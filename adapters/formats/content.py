@@ -1,13 +1,24 @@
-"""All that a file of a program says of a survey, for whoever writes it in another format."""
+"""All that a file of a program says of a survey, by kind, for whoever writes it in another format.
+
+A format says which kinds it holds; what else there is of a survey is named when it is written.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+from zlib import crc32
 
 import numpy as np
 
-from sfm.network import ImagePoints, ObjectPoints
-from sfm.stored_result import StoredResult
+from sfm.conventions import FloatArray
+from sfm.files.covariance_file import UNCODED
+from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.reduced_network import reduce_network
+from sfm.stored_result import NO_SCALE, StoredResult
+
+PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ, cYZ
 
 
 def _no_image_points() -> ImagePoints:
@@ -22,4 +33,271 @@ class Content:
     result: StoredResult
     rejected: ImagePoints = field(default_factory=_no_image_points)  # measured, but left out as gross errors
     checks: ObjectPoints = field(default_factory=ObjectPoints)  # known points that only check the result
+    exterior_covariance: FloatArray | None = None  # of X0, Y0, Z0 and the angles, (m, 6, 6)
+    interior_covariance: tuple[FloatArray, ...] = ()  # of the free parameters of each camera, (f, f)
+    sigma0: float | None = None  # of unit weight, by which the covariances are scaled
+    sigma0_px: float | None = None  # a posteriori of an image coordinate
     notes: tuple[str, ...] = ()  # lines about what was read and is not used as it stands
+
+
+class Kind(NamedTuple):
+    """Something that a survey may have and a format may lack."""
+
+    name: str  # as formats say that they hold it
+    words: str  # for people, in the plural
+    rows: Callable[[Content], FloatArray]  # numbers that say all of it, a row for each, (n, d)
+
+
+def _points_of(known: ObjectPoints) -> FloatArray:
+    variance = np.einsum("nii->ni", known.covariance)
+    xyz = np.where(np.isfinite(variance), known.xyz, np.nan)
+    rows = np.concatenate([known.point[:, None], xyz, np.sqrt(variance)], axis=1)
+    return np.asarray(rows[np.argsort(known.point, kind="stable")])
+
+
+def _control(content: Content) -> FloatArray:
+    return _points_of(content.result.network.control.complete)
+
+
+def _partial(content: Content) -> FloatArray:
+    control = content.result.network.control
+    rows = _points_of(control)
+    return np.asarray(rows[~np.isin(rows[:, 0], control.complete.point)])
+
+
+def _correlated(content: Content) -> FloatArray:
+    control = content.result.network.control
+    between = np.stack([control.covariance[:, row, column] for row, column in PAIRS], axis=1)
+    rows = np.concatenate([control.point[:, None], between], axis=1)[between.any(axis=1)]
+    return np.asarray(rows[np.argsort(rows[:, 0], kind="stable")])
+
+
+def _bars(content: Content) -> FloatArray:
+    bars = content.result.network.scale_bars
+    return np.stack([bars.start, bars.end, bars.length, bars.sigma], axis=1)
+
+
+def _exterior(content: Content) -> FloatArray:
+    seen = content.result.network.exterior
+    variance = np.einsum("eii->ei", seen.covariance)
+    value = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
+    return np.concatenate([seen.image[:, None], value, np.sqrt(variance)], axis=1)
+
+
+def _exterior_correlations(content: Content) -> FloatArray:
+    C = content.result.network.exterior.covariance
+    return _correlations(np.where(np.isfinite(C), C, 0.0))
+
+
+def _correlations(C: FloatArray) -> FloatArray:
+    """Return number of matrix, row, column and value of what is not 0 above the diagonals, (n, 4)."""
+    e, r, c = np.nonzero(np.triu(np.nan_to_num(C), 1))
+    return np.stack([e, r, c, C[e, r, c]], axis=1)
+
+
+def _interior(content: Content) -> FloatArray:
+    seen = content.result.network.interior
+    return np.stack([seen.camera, seen.parameter, seen.value, seen.sigma], axis=1)
+
+
+def _interior_correlations(content: Content) -> FloatArray:
+    R = content.result.network.interior.correlation
+    return np.zeros((0, 4)) if R is None else _correlations(R[None])
+
+
+def _rejected(content: Content) -> FloatArray:
+    seen = content.rejected
+    return np.column_stack([seen.image, seen.point, seen.xy])
+
+
+def _by_image(content: Content) -> ImagePoints:
+    seen = content.result.network.image_points
+    return seen.select(np.lexsort((seen.point, seen.image)))
+
+
+def _image_sigmas(content: Content) -> FloatArray:
+    sigma = _by_image(content).stated_sigma
+    return np.asarray(sigma[np.isfinite(sigma).all(axis=1)])
+
+
+def _image_covariances(content: Content) -> FloatArray:
+    between = _by_image(content).stated_covariance
+    return np.asarray(between[between != 0][:, None])
+
+
+def _sigmas(covariance: FloatArray | None) -> FloatArray:
+    if covariance is None:
+        return np.zeros((0, 4))
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    known = np.isfinite(sigma).all(axis=1)
+    return np.column_stack([np.flatnonzero(known), sigma[known]])
+
+
+def _joint(content: Content) -> FloatArray:
+    Q = content.result.covariance
+    return np.zeros((0, 3)) if Q is None else np.asarray(Q)
+
+
+def _interior_sigmas(content: Content) -> FloatArray:
+    sigmas = content.result.interior_sigma or ()
+    rows = [(k, s, v) for k, own in enumerate(sigmas) for s, v in enumerate(own.tolist()) if np.isfinite(v)]
+    return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+def _full(content: Content) -> FloatArray:
+    Q = content.exterior_covariance
+    parts = [] if Q is None else [Q.reshape(len(Q), -1)]
+    parts += [C.reshape(1, -1) for C in content.interior_covariance if len(C) > 1]
+    return np.concatenate([part.ravel() for part in parts])[:, None] if parts else np.zeros((0, 1))
+
+
+def _statistics(content: Content) -> FloatArray:
+    found = (content.result.redundancy, content.sigma0, content.sigma0_px)
+    return np.array([value for value in found if value is not None], dtype=float)[:, None]
+
+
+def _names(names: tuple[str, ...], identify: bool) -> FloatArray:
+    kept = [name for name in names if identify and UNCODED.fullmatch(name) is None]
+    return np.array([crc32(name.encode()) for name in kept], dtype=float)[:, None]
+
+
+def _word(word: str) -> FloatArray:
+    return _names((word,) if word and word != NO_SCALE else (), True)
+
+
+def _free(content: Content) -> FloatArray:
+    cameras = content.result.estimate.cameras
+    rows = [(k, s) for k, camera in enumerate(cameras) for s in np.flatnonzero(camera.free)]
+    return np.array(rows, dtype=float).reshape(-1, 2)
+
+
+def _shared(content: Content) -> FloatArray:
+    """Return camera, parameter and the first camera of the group that shares it."""
+    first: dict[tuple[str, int], int] = {}
+    rows = []
+    for k, camera in enumerate(content.result.estimate.cameras):
+        for s in range(len(camera.shared)):
+            group = first.setdefault((camera.owner_of(s), s), k)
+            rows.append((k, s, group))
+    return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+def _unplaced(content: Content) -> FloatArray:
+    estimate = content.result.estimate
+    images, points = np.flatnonzero(~estimate.oriented), np.flatnonzero(~estimate.determined)
+    return np.array([(0, i) for i in images] + [(1, j) for j in points], dtype=float).reshape(-1, 2)
+
+
+KINDS = (
+    Kind(
+        *("exterior orientations", "exterior orientations"),
+        lambda content: np.flatnonzero(content.result.estimate.oriented)[:, None].astype(float),
+    ),
+    Kind(
+        *("object points", "coordinates of points"),
+        lambda content: np.flatnonzero(content.result.estimate.determined)[:, None].astype(float),
+    ),
+    Kind("control", "control points", _control),
+    Kind("partial control", "control points with coordinates that are not known", _partial),
+    Kind("control correlations", "correlations of control", _correlated),
+    Kind("scale bars", "scale bars", _bars),
+    Kind("exterior", "observed exterior orientations", _exterior),
+    Kind("exterior correlations", "covariances of observed exterior orientations", _exterior_correlations),
+    Kind("interior", "weighted interior parameters", _interior),
+    Kind("interior correlations", "correlations of weighted interior parameters", _interior_correlations),
+    Kind("checks", "check points", lambda content: _points_of(content.checks)),
+    Kind("rejected", "rejected image points", _rejected),
+    Kind("image sigmas", "standard deviations of image points", _image_sigmas),
+    Kind("image covariances", "covariances of x and y of image points", _image_covariances),
+    Kind("point sigmas", "standard deviations of points", lambda c: _sigmas(c.result.point_covariance)),
+    Kind(
+        *("position sigmas", "standard deviations of projection centres"),
+        lambda content: _sigmas(content.result.position_covariance),
+    ),
+    Kind("interior sigmas", "standard deviations of interior parameters", _interior_sigmas),
+    Kind("joint covariance", "rows of the covariance of all coordinates", _joint),
+    Kind("covariances", "covariances of exterior and interior orientation", _full),
+    Kind("statistics", "redundancy and sigma0", _statistics),
+    Kind("datum", "kind of datum", lambda content: _word(content.result.datum)),
+    Kind("unit", "unit of lengths", lambda content: _word(content.result.unit)),
+    Kind("point names", "names of points", lambda c: _names(c.result.network.points, c.result.points_named)),
+    Kind(
+        *("image names", "names of photographs"),
+        lambda content: _names(content.result.network.images, content.result.images_named),
+    ),
+    Kind("free", "settings of interior parameters as free", _free),
+    Kind("shared", "interior parameters shared by cameras", _shared),
+    Kind("unplaced", "photographs and points without coordinates", _unplaced),
+)
+ALL = frozenset(kind.name for kind in KINDS)
+
+
+CONVERTED = frozenset({"interior", "interior correlations", "interior sigmas", "covariances"})
+
+
+def with_cameras(content: Content, network: Network, estimate: Estimate) -> tuple[Content, frozenset[str]]:
+    """Return a survey with cameras in other models or image points corrected for distortion.
+
+    Args:
+        content: of the survey.
+        network: the same, maybe with other image points.
+        estimate: with the other cameras.
+
+    Returns:
+        The survey, and the kinds that went since they are of the former cameras.
+    """
+    result = content.result
+    before, after = result.estimate.cameras, estimate.cameras
+    gone: frozenset[str] = frozenset()
+    if any(one.model != other.model for one, other in zip(before, after, strict=True)):
+        gone |= CONVERTED
+    if network.image_points is not result.network.image_points:
+        gone |= CONVERTED | {"rejected"}
+    if not gone:
+        return replace(content, result=replace(result, network=network, estimate=estimate)), gone
+    network = replace(network, interior=InteriorObservations())
+    result = replace(result, network=network, estimate=estimate, interior_sigma=None)
+    content = replace(content, result=result, exterior_covariance=None, interior_covariance=())
+    return replace(content, rejected=_no_image_points()) if "rejected" in gone else content, gone
+
+
+def placed(content: Content) -> Content:
+    """Return what has coordinates in the object, photographs and points without gone."""
+    result = content.result
+    network, estimate = result.network, result.estimate
+    images, points = estimate.oriented, estimate.determined
+    if images.all() and points.all():
+        return content
+    every = np.ones(len(network.image_points), dtype=bool)
+    rejected, checks = content.rejected, content.checks
+    kept, known = images[rejected.image] & points[rejected.point], points[checks.point]
+    image, point = np.cumsum(images) - 1, np.cumsum(points) - 1
+    C, Q, full = result.point_covariance, result.position_covariance, content.exterior_covariance
+    network, estimate = reduce_network(network, estimate, images, points, every)
+    reduced = replace(
+        result,
+        network=network,
+        estimate=estimate,
+        point_covariance=None if C is None else C[points],
+        position_covariance=None if Q is None else Q[images],
+        covariance=result.covariance if points.all() else None,
+    )
+    rejected = rejected.select(kept)
+    return replace(
+        content,
+        result=reduced,
+        rejected=replace(rejected, image=image[rejected.image], point=point[rejected.point]),
+        checks=ObjectPoints(point[checks.point[known]], checks.xyz[known], checks.covariance[known]),
+        exterior_covariance=None if full is None else full[images],
+    )
+
+
+def losses(content: Content, held: frozenset[str]) -> tuple[tuple[Kind, int], ...]:
+    """Return the kinds that there are and that a format does not hold, and how many of each.
+
+    Args:
+        content: of a survey.
+        held: names of the kinds that the format holds.
+    """
+    counts = ((kind, len(kind.rows(content))) for kind in KINDS if kind.name not in held)
+    return tuple((kind, count) for kind, count in counts if count)

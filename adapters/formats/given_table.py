@@ -7,7 +7,7 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +17,11 @@ from pydantic import Field
 from sfm.conventions import FloatArray
 from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, read_json
-from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.files.plain_text import csv_text
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+
+ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+HEADER = ("kind", "name", "coordinate", "unit", "given", "difference", "sigma", "r", "w")
 
 
 class _Summary(Content):
@@ -34,6 +38,7 @@ class GivenValues:
     bars: ScaleBars
     control: ObjectPoints
     interior: tuple[tuple[str, str, float, float], ...]  # camera, parameter, value, sigma
+    exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
     sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
     sigma0_px: float | None = None  # a posteriori of an image coordinate, the median; None where not known
 
@@ -51,7 +56,10 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     path = folder / "given.csv"
     summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
     if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
-        return GivenValues(ScaleBars(), ObjectPoints(), (), summary.sigma0 or 1.0, summary.sigma0_px)
+        return GivenValues(
+            *(ScaleBars(), ObjectPoints(), (), ExteriorObservations()),
+            *(summary.sigma0 or 1.0, summary.sigma0_px),
+        )
     table = read_table(
         path, ("kind", "name", "coordinate"), ("given", "sigma"), ignored=None, blank=("sigma",)
     )
@@ -60,6 +68,8 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     bars: list[tuple[int, int, float, float]] = []
     control: dict[int, tuple[FloatArray, FloatArray]] = {}
     interior = []
+    image = {name: i for i, name in enumerate(network.images)}
+    exterior: dict[int, tuple[FloatArray, FloatArray]] = {}
     for kind, name, coordinate, (given, sigma) in zip(*table.texts, table.values.tolist(), strict=True):
         if kind == "scale bar":
             ends = _ends(name, index)
@@ -72,6 +82,11 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         elif kind == "interior orientation":
             parameter, _, camera = name.partition(" of camera ")
             interior.append((camera, parameter, given, sigma))
+        elif kind in ("projection centre", "rotation") and name in image and coordinate in ORIENTATION:
+            value, variance = exterior.setdefault(image[name], (np.zeros(6), np.full(6, np.inf)))
+            k = ORIENTATION.index(coordinate)
+            factor = 1.0 if k < 3 else np.radians(1.0)
+            value[k], variance[k] = factor * given, (factor * sigma) ** 2
     rows = np.array(bars, dtype=float).reshape(-1, 4)
     return GivenValues(
         ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
@@ -81,9 +96,48 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             np.array([np.diag(variance) for _, variance in control.values()]).reshape(-1, 3, 3),
         ),
         tuple(interior),
+        ExteriorObservations(
+            np.array(list(exterior), dtype=np.int64),
+            np.array([value[:3] for value, _ in exterior.values()]).reshape(-1, 3),
+            np.array([value[3:] for value, _ in exterior.values()]).reshape(-1, 3),
+            np.array([np.diag(variance) for _, variance in exterior.values()]).reshape(-1, 6, 6),
+        ),
         summary.sigma0 or 1.0,
         summary.sigma0_px,
     )
+
+
+def write_given(path: Path, network: Network, estimate: Estimate) -> None:
+    """Write what a network was given with a standard deviation, without its residuals."""
+    rows: list[tuple[object, ...]] = []
+
+    def add(kind: str, name: str, coordinate: str, given: float, sigma: float) -> None:
+        if np.isfinite(sigma):
+            rows.append((kind, name, coordinate, "", given, np.nan, sigma, np.nan, np.nan))
+
+    control, bars, exterior, interior = (
+        network.control,
+        network.scale_bars,
+        network.exterior,
+        network.interior,
+    )
+    for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
+        for axis, value, sigma in zip("XYZ", xyz, np.sqrt(np.diagonal(C)), strict=True):
+            add("control point", network.points[j], axis, value, sigma)
+    for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
+        add("scale bar", f"{network.points[start]} - {network.points[end]}", "length", length, sigma)
+    for camera, s, value, sigma in zip(
+        interior.camera, interior.parameter, interior.value, interior.sigma, strict=True
+    ):
+        one = estimate.cameras[camera]
+        add("interior orientation", f"{one.names[s]} of camera {one.owner_of(s)}", "value", value, sigma)
+    for e, i in enumerate(exterior.image):
+        values = np.concatenate([exterior.position[e], np.degrees(exterior.angles[e])])
+        sigmas = np.sqrt(np.diagonal(exterior.covariance[e])) * np.repeat([1.0, np.degrees(1.0)], 3)
+        for k, (value, sigma) in enumerate(zip(values, sigmas, strict=True)):
+            kind = "projection centre" if k < 3 else "rotation"
+            add(kind, network.images[i], ORIENTATION[k], value, sigma)
+    path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

@@ -110,14 +110,15 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
             f"        <transform>{' '.join(repr(float(v)) for v in T.ravel())}</transform>",
             "      </camera>",
         ]
-    sigma = {
-        int(j): np.sqrt(np.diagonal(C))
-        for j, C in zip(network.control.point, network.control.covariance, strict=True)
+    control = network.control.complete
+    known = {
+        int(j): (xyz, np.sqrt(np.diagonal(C)))
+        for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True)
     }
     markers, locations = [], []
     rows = rows_of(network.image_points.point, len(network.points))
     for j, name in enumerate(network.points):
-        reference = _reference(estimate.points[j], sigma.get(j))
+        reference = _reference(*known.get(j, (estimate.points[j], None)))
         markers.append(f'      <marker id="{j}" label={quoteattr(name)}>{reference}</marker>')
         locations.append(f'          <marker marker_id="{j}">')
         for row in rows[j]:

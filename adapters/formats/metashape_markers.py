@@ -76,7 +76,8 @@ class Markers:
         if len(np.unique(image * len(self.labels) + point)) < len(point):
             raise SurveyFileError(f"{self.path}: a marker is a duplicate in one camera")
         covariance = np.tile(MARKER_SIGMA_PX**2 * np.eye(2), (len(seen), 1, 1))
-        return ImagePoints(image, point, np.array(self._xy).reshape(-1, 2) - HALF_PIXEL, covariance)
+        xy, stated = np.array(self._xy).reshape(-1, 2) - HALF_PIXEL, np.zeros(len(seen), dtype=bool)
+        return ImagePoints(image, point, xy, covariance, stated)
 
     def _take_marker(self, nodes: list[Node]) -> None:
         if self._below_chunk(nodes) != MARKER:

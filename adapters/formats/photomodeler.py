@@ -252,7 +252,12 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
 
 
 def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, title: str = "Kolinear") -> None:
-    """Write a network and its solution as a PhotoModeler text export, with the digits of double precision.
+    """Write a network and its solution; see `write_export`."""
+    write_export(path, Content(StoredResult(title, network, estimate)))
+
+
+def write_export(path: Path, content: Content) -> None:
+    """Write a survey as a PhotoModeler text export, with the digits of double precision.
 
     It is one of a calibration project where a parameter of a camera is free. PhotoModeler numbers its points:
     names that are whole numbers are kept, any other is refused. Photographs without orientation are refused,
@@ -261,6 +266,8 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
     Raises:
         OutputError: what the export cannot hold, or the file cannot be written.
     """
+    result = content.result
+    network, estimate, title = result.network, result.estimate, result.name
     for camera in estimate.cameras:
         if camera.model not in MODELS or camera.value("b1") or camera.value("b2"):
             raise OutputError(
@@ -283,32 +290,41 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
     none = _text(*[0.0] * INNER)
     lines = [title.replace("\n", " "), f" 0.0005 20 {width} {height}", _text(*[1.0] * 9), inner[0], none]
     angles = np.rad2deg(angles_from_rotation(estimate.rotation))[:, ::-1]
+    position_sigma = _sigma_of(result.position_covariance, len(network.images))
+    point_sigma = _sigma_of(result.point_covariance, len(network.points))
     for i, name in enumerate(network.images):
         lines += [
             f"{i} {name}",
             f"{i} {_text(*estimate.position[i], *angles[i])}",
-            f"{i} {_text(*[0.0] * 6)}",
+            f"{i} {_text(*position_sigma[i], 0.0, 0.0, 0.0)}",
             "",
             f"{i} {inner[network.camera[i]]}",
             f"{i} {none}",
         ]
     lines.append("")
-    control = network.control
+    control = network.control.complete
     for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
         lines.append(f"{network.points[j]} {_text(*xyz, *np.sqrt(np.diagonal(C)))}")
     lines.append("")
     lines += [
-        f"{network.points[j]} {_text(*estimate.points[j], 0.0, 0.0, 0.0)}"
+        f"{network.points[j]} {_text(*estimate.points[j], *point_sigma[j])}"
         for j in np.flatnonzero(estimate.determined)
     ]
     lines.append("")
     seen = network.image_points
-    sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
+    sigma = np.nan_to_num(seen.stated_sigma)
     lines += [
         f"{i} {network.points[j]} {_text(*(xy + HALF_PIXEL), *s)}"
         for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
     ]
     write_lines(path, [*lines, "", ""])
+
+
+def _sigma_of(covariance: FloatArray | None, count: int) -> FloatArray:
+    """Return standard deviations, 0 where none is known, (count, 3)."""
+    if covariance is None:
+        return np.zeros((count, 3))
+    return np.nan_to_num(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
 
 
 def _inner(camera: Camera) -> list[float]:

@@ -28,12 +28,14 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
-from adapters.formats.content import Content
+from adapters.formats.content import ALL, Content, losses, placed
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
-from adapters.formats.photomodeler import read_export, read_photomodeler, write_photomodeler
+from adapters.formats.photomodeler import read_export, write_export
 from adapters.formats.ply import write_ply
-from adapters.formats.result_tables import read_result, write_tables
+from adapters.formats.result_tables import read_content as read_tables
+from adapters.formats.result_tables import read_result
+from adapters.formats.result_tables import write_content as write_content_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
@@ -44,11 +46,10 @@ from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
-from sfm.reduced_network import reduce_network
 from sfm.stored_result import StoredResult
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
-Writer = Callable[..., None]  # path, network, estimate; and title, where a format has a place for it
+Writer = Callable[[Path, Network, Estimate], None]
 
 
 @dataclass(frozen=True)
@@ -57,22 +58,23 @@ class FileFormat:
 
     name: str  # as --from and --to say it
     models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras
-    read: Reader | None  # of a file or folder; None: the format is written only
-    write: Writer  # to a new file, or into an empty folder
+    read: Reader | None  # of a file or folder; None: `read_all`, or the format is written only
+    write: Writer | None  # to a new file, or into an empty folder; None: `write_all`
+    holds: frozenset[str]  # the kinds of `content` that are the same when it is read again
     folder: bool = False  # whether it is a folder of files
     placed: bool = False  # whether it leaves out what has no coordinates in the object
     lacks: tuple[str, ...] = ()  # parameters of these models that it cannot hold, others can stand in
     straight: tuple[str, ...] = ()  # parameters that it cannot hold and nothing can stand in
     one_focal: bool = False  # whether fx and fy must be the same
-    titled: bool = False  # whether it holds the name of what is written
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
     read_all: Callable[..., Content] | None = None  # of a format that holds more than `read` returns
+    write_all: Callable[[Path, Content], None] | None = None  # likewise of `write`
     control: bool = False  # whether `read_all` takes a file of control, as keyword
 
     @property
     def readable(self) -> bool:
         """Whether it holds photographs, and can be read."""
-        return self.read is not None
+        return self.read is not None or self.read_all is not None
 
 
 def _read_database(path: Path) -> tuple[Network, Estimate]:
@@ -84,16 +86,10 @@ def _write_database(path: Path, network: Network, estimate: Estimate) -> None:
     write_database(path, network, estimate.cameras)
 
 
-def _read_tables(path: Path) -> tuple[Network, Estimate]:
-    result = read_result(path)
-    return result.network, result.estimate
-
-
-def _write_tables(folder: Path, network: Network, estimate: Estimate, *, title: str) -> None:
-    every = np.ones(len(network.image_points), dtype=bool)
-    placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
-    write_tables(folder, StoredResult(title, *placed))
-    write_survey_file(folder, *placed, title=title)
+def _write_tables(folder: Path, content: Content) -> None:
+    there = placed(content)
+    write_content_tables(folder, there)
+    write_survey_file(folder, there, title=content.result.name)
 
 
 def _read_sba(path: Path) -> tuple[Network, Estimate]:
@@ -105,60 +101,94 @@ def _write_sba(folder: Path, network: Network, estimate: Estimate) -> None:
     write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)
 
 
-def _write_ply(path: Path, network: Network, estimate: Estimate) -> None:
-    write_ply(path, network.points, estimate.points)
+def _write_ply(path: Path, content: Content) -> None:
+    result = content.result
+    C = result.point_covariance
+    sigma = None if C is None else np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    write_ply(path, result.network.points, result.estimate.points, sigma)
 
 
 _COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_opencv"))
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
 NUMBERS = (False, False)
+_SOLVED = frozenset({"exterior orientations", "object points"})
+_NAMED = _SOLVED | {"point names", "image names"}
+_SIDE = _NAMED | {"free"}  # beside a model of COLMAP
 FORMATS = (
     FileFormat(
-        *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False)),
+        *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False), _SIDE),
         folder=True,
         placed=True,
     ),
     FileFormat(
-        *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True)),
+        *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True), _SIDE),
         folder=True,
         placed=True,
     ),
-    FileFormat("colmap-database", _COLMAP, _read_database, _write_database),
     FileFormat(
-        *("tables", tuple(MODELS), _read_tables, _write_tables), folder=True, placed=True, titled=True
+        "colmap-database",
+        _COLMAP,
+        _read_database,
+        _write_database,
+        frozenset({"image names"}),
+        names=(False, True),
+    ),
+    FileFormat(
+        *("tables", tuple(MODELS), None, None),
+        ALL - {"exterior correlations", "interior correlations", "unplaced"},
+        folder=True,
+        placed=True,
+        read_all=read_tables,
+        write_all=_write_tables,
     ),
     FileFormat(
         *("metashape", ("brown_forward_affine", "full_opencv", "opencv"), read_metashape, write_metashape),
+        _NAMED | {"control", "unplaced"},
         lacks=("k4", "k5", "k6"),
     ),
     FileFormat(
-        *("photomodeler", PHOTOMODELER_MODELS, read_photomodeler, write_photomodeler),
+        *("photomodeler", PHOTOMODELER_MODELS, None, None),
+        _NAMED | {"control", "point sigmas", "position sigmas", "image sigmas"},
         lacks=("b1", "b2"),
         read_all=read_export,
+        write_all=write_export,
         control=True,
     ),
     FileFormat(
-        "bal", ("opencv", "radial"), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS
+        *("bal", ("opencv", "radial"), read_bal, write_bal, _SOLVED),
+        straight=("p1", "p2"),
+        one_focal=True,
+        names=NUMBERS,
     ),
     FileFormat(
         *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp),
+        _NAMED | {"image sigmas"},
         straight=_BROWN_DISTORTION,
-        names=NUMBERS,
     ),
     FileFormat(
         *("bundle-matlab", ("brown",), read_bundle_matlab_folder, write_bundle_matlab_folder),
+        _SOLVED | {"image names", "image sigmas"},
         folder=True,
         straight=_BROWN_DISTORTION,
-        names=NUMBERS,
+        names=(False, True),
     ),
     FileFormat(
         *("sba", ("opencv",), _read_sba, _write_sba),
+        _SOLVED | {"image sigmas", "image covariances"},
         folder=True,
         straight=_OPENCV_DISTORTION,
         names=NUMBERS,
     ),
-    FileFormat("ply", (), None, _write_ply, placed=True),
+    FileFormat(
+        "ply",
+        (),
+        None,
+        None,
+        frozenset({"object points", "point sigmas", "point names"}),
+        placed=True,
+        write_all=_write_ply,
+    ),
 )
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
 
@@ -234,12 +264,13 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         SurveyFileError: what is wrong, with file and line number.
     """
     form = format_of(path) if name is None else format_named(name)
-    if form.read is None:
+    if not form.readable:
         raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
     if control is not None and not form.control:
         raise SurveyFileError(f"{path}: format {form.name} takes no file of control, photomodeler does")
     if form.read_all is not None:
         return form.read_all(path, control=control) if form.control else form.read_all(path)
+    assert form.read is not None
     network, estimate = form.read(path)
     points_named = _names_points(form, path)
     if not points_named:
@@ -280,12 +311,18 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
-    """Write a network and its solution; cameras must be in a model that the format holds.
+    """Write a network and its solution; see `write_content`."""
+    write_content(path, name, Content(StoredResult(path.name, network, estimate)))
+
+
+def write_content(path: Path, name: str, content: Content) -> None:
+    """Write all of a survey that a format holds; cameras must be in a model that it holds.
 
     Raises:
         KolinearError: the format cannot hold it, or it cannot be written.
     """
     form = format_named(name)
+    estimate = content.result.estimate
     refuse_taken(path, form)
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
@@ -295,12 +332,29 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
                 f"{path}: format {name} holds what has a place in the object, but no "
                 f"{'point' if points_only else 'photograph or no point'} has coordinates"
             )
-    title = {"title": path.name} if form.titled else {}
     if form.folder:
         with whole_folder(path) as folder:
-            form.write(folder, network, estimate, **title)
+            _write(form, folder, content)
     else:
-        form.write(path, network, estimate, **title)
+        _write(form, path, content)
+
+
+def _write(form: FileFormat, path: Path, content: Content) -> None:
+    if form.write_all is not None:
+        form.write_all(path, content)
+    elif form.write is not None:
+        form.write(path, content.result.network, content.result.estimate)
+
+
+def told_losses(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:
+    """Return what there is of a survey and a format does not hold, a line for each kind.
+
+    Args:
+        name: of the format.
+        content: of the survey.
+        gone: kinds that went since they are of cameras that were converted.
+    """
+    return tuple(f"{count} {kind.words}" for kind, count in losses(content, format_named(name).holds - gone))
 
 
 def refuse_taken(path: Path, form: FileFormat) -> None:

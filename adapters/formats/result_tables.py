@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,15 +26,21 @@ import numpy as np
 from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
+from adapters.formats.content import Content
+from adapters.formats.covariance_arrays import NAME as COVARIANCES
+from adapters.formats.covariance_arrays import read_covariances, write_covariances
+from adapters.formats.given_table import read_given, write_given
+from adapters.formats.known_points import read_known_points
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
-from sfm.files.json_files import Content, Name, Pixel, Side, Text, read_json
+from sfm.files.json_files import Content as Json
+from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.plain_text import csv_text
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
@@ -138,15 +145,21 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
 
 
 def write_tables(folder: Path, result: StoredResult) -> None:
+    """Write a result as `write_content` does."""
+    write_content(folder, Content(result))
+
+
+def write_content(folder: Path, content: Content) -> None:
     """Write a result as tables with named columns; standard deviations only where any is known.
 
     Args:
         folder: made if it is not there.
-        result: complete; whoever wants the folder whole or not at all gives one of `sfm.files.whole_files`.
+        content: complete; whoever wants the folder whole or not at all gives one of `sfm.files.whole_files`.
 
     Raises:
         OutputError: a photograph or point has no place in the object, or the folder cannot be written.
     """
+    result = content.result
     network, estimate = result.network, result.estimate
     for names, placed, kind in (
         (network.images, estimate.oriented, "photograph"),
@@ -157,7 +170,13 @@ def write_tables(folder: Path, result: StoredResult) -> None:
     angles = np.rad2deg(angles_from_rotation(estimate.rotation))
     point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
     position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
-    seen = network.image_points
+    if content.exterior_covariance is not None and len(sigmas_of_images):
+        variance = np.diagonal(content.exterior_covariance, axis1=1, axis2=2)[:, 3:]
+        position_sigma = np.hstack([position_sigma, np.degrees(np.sqrt(variance))])
+        sigmas_of_images = (*sigmas_of_images, "somega_deg", "sphi_deg", "skappa_deg")
+    seen = joined_image_points(network.image_points, content.rejected)
+    rejected = np.arange(len(seen)) >= len(network.image_points)
+    flagged = ("rejected",) if rejected.any() else ()
     sigma = seen.stated_sigma
     sigmas_of_image_points: tuple[str, ...] = SIGMAS_PX if np.isfinite(sigma).any() else ()
     sigma = sigma[:, : len(sigmas_of_image_points)]
@@ -177,12 +196,15 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         "redundancy": result.redundancy,
         "length_unit": result.unit,
         "datum": {"kind": result.datum},
+        "sigma0": content.sigma0,
+        "sigma0_px": content.sigma0_px,
         "cameras": [
             {
                 "name": camera.name,
                 "model": camera.model,
                 "size_px": list(camera.size_px),
                 "pixel_mm": [float(value) for value in camera.pixel_mm],
+                "free": [name for name, free in zip(camera.names, camera.free, strict=True) if free],
             }
             for camera in estimate.cameras
         ],
@@ -211,36 +233,140 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         _write(folder / "cameras.csv", ("camera", "parameter", "value", "sigma", "unit"), camera_rows)
         _write(
             folder / "image_points.csv",
-            ("image", "point", "x_px", "y_px", *sigmas_of_image_points),
+            ("image", "point", "x_px", "y_px", *sigmas_of_image_points, *flagged),
             (
-                (network.images[i], network.points[j], *xy, *s)
-                for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
+                (network.images[i], network.points[j], *xy, *s, *(int(bad) for _ in flagged))
+                for i, j, xy, s, bad in zip(seen.image, seen.point, seen.xy, sigma, rejected, strict=True)
             ),
         )
         if result.covariance is not None:
             write_covariance(folder, result.covariance, network.points, result.covariance_points)
+        if content.exterior_covariance is not None or any(map(len, content.interior_covariance)):
+            write_covariances(folder / COVARIANCES, content)
+        write_given(folder / "given.csv", network, estimate)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: the tables cannot be written: {error.strerror}") from error
 
 
-class _CameraEntry(Content):
+def joined_image_points(first: ImagePoints, second: ImagePoints) -> ImagePoints:
+    """Return the image points of both, those of the first before the others."""
+    if not len(second):
+        return first
+    stated = [np.ones(len(one), dtype=bool) if one.stated is None else one.stated for one in (first, second)]
+    return ImagePoints(
+        np.concatenate([first.image, second.image]),
+        np.concatenate([first.point, second.point]),
+        np.concatenate([first.xy, second.xy]),
+        np.concatenate([first.covariance, second.covariance]),
+        np.concatenate(stated),
+    )
+
+
+def read_content(folder: Path) -> Content:
+    """Read the tables of a result with all that was given, rejected and estimated.
+
+    Raises:
+        SurveyFileError: what is missing or wrong, with file and line number.
+    """
+    result = read_result(folder)
+    network = result.network
+    seen, rejected, _ = read_image_points(folder, network)
+    given = read_given(folder, network)
+    control, checks = read_known_points(folder, network, given.control)
+    cameras = _with_shared(result)
+    interior = [
+        (k, camera.names.index(parameter), value, sigma)
+        for owner, parameter, value, sigma in given.interior
+        for k, camera in [_first_of(cameras, owner, parameter)]
+    ]
+    rows = np.array(interior, dtype=float).reshape(-1, 4)
+    network = replace(
+        network,
+        control=control,
+        scale_bars=given.bars,
+        exterior=given.exterior,
+        interior=InteriorObservations(
+            rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
+        ),
+    )
+    exterior, of_interior = read_covariances(folder / COVARIANCES, result)
+    summary = read_json(folder / "summary.json", _Statistics, "the summary of a result")
+    return Content(
+        replace(result, network=network, estimate=replace(result.estimate, cameras=cameras)),
+        seen.select(rejected),
+        checks,
+        exterior,
+        of_interior,
+        summary.sigma0,
+        summary.sigma0_px,
+    )
+
+
+def _first_of(cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[int, Camera]:
+    """Return the first camera that a parameter belongs to.
+
+    Raises:
+        SurveyFileError: there is none.
+    """
+    for k, camera in enumerate(cameras):
+        if parameter in camera.names and camera.owner_of(camera.names.index(parameter)) == owner:
+            return k, camera
+    raise SurveyFileError(f"given.csv: {parameter} of camera '{owner}', which is not in cameras.csv")
+
+
+def _with_shared(result: StoredResult) -> tuple[Camera, ...]:
+    """Return the cameras, those of single photographs with what they share with one another.
+
+    They are called as a survey with `per_photograph` calls them, by camera and photograph, and what they
+    share has one value.
+    """
+    network, cameras = result.network, result.estimate.cameras
+    base: dict[str, list[int]] = {}
+    for i, k in enumerate(network.camera):
+        name, ending = cameras[k].name, f" {network.images[i]}"
+        if name.endswith(ending) and (network.camera == k).sum() == 1:
+            base.setdefault(name.removesuffix(ending), []).append(int(k))
+    made = list(cameras)
+    for name, members in base.items():
+        models = {(cameras[k].model, cameras[k].size_px) for k in members}
+        if len(members) < 2 or len(models) > 1:
+            continue
+        values = np.array([cameras[k].parameters for k in members])
+        one = (values == values[0]).all(axis=0)
+        if not one.any() or one.all():
+            continue
+        shared = tuple(name if same else "" for same in one)
+        for k in members:
+            made[k] = replace(cameras[k], shared=shared)
+    return tuple(made)
+
+
+class _Statistics(Json):
+    """What the summary says of the unit of weight."""
+
+    sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
+    sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
+
+
+class _CameraEntry(Json):
     """A camera as the summary names it."""
 
     name: Name
     model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
     size_px: tuple[Side, Side] | None = None
     pixel_mm: tuple[Pixel, Pixel] | None = None
+    free: tuple[Name, ...] | None = None  # else those that have a sigma
 
 
-class _DatumEntry(Content):
+class _DatumEntry(Json):
     """The datum as the summary names it."""
 
     kind: Literal["free", "minimal", "control", ""]
 
 
-class _Summary(Content):
+class _Summary(Json):
     """What is read of summary.json."""
 
     survey: Text | None = None
@@ -294,7 +420,8 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
         chosen = [rows[entry.name, p] for p in names]
         s = sigma[chosen, 0] if sigma.size else np.full(len(chosen), np.nan)
         size, pixel = _size(folder, entry, beside[number : number + 1])
-        cameras.append(Camera(entry.name, entry.model, size, pixel, values[chosen], np.isfinite(s)))
+        free = np.isfinite(s) if entry.free is None else np.array([name in entry.free for name in names])
+        cameras.append(Camera(entry.name, entry.model, size, pixel, values[chosen], free))
         sigmas.append(s)
     return tuple(cameras), tuple(sigmas)
 

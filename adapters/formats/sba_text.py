@@ -106,10 +106,11 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
         fx, fy, cx, cy = estimate.cameras[k].parameters[:4]
         lines.append(_numbers(fx, cx, cy, fy / fx, 0.0, *quaternion[i], *translation[i]))
     seen = network.image_points
-    point_lines = ["# X Y Z n (frame x y covariance)*n"]
+    stated = bool(np.isfinite(seen.stated_sigma).any())
+    point_lines = [f"# X Y Z n (frame x y{' covariance' if stated else ''})*n"]
     for xyz, rows in zip(estimate.points, rows_of(seen.point, len(estimate.points)), strict=True):
         frames = [
-            f"{seen.image[r]} {_numbers(*seen.xy[r], *seen.covariance[r].ravel())}"
+            f"{seen.image[r]} {_numbers(*seen.xy[r], *(seen.covariance[r].ravel() if stated else ()))}"
             for r in rows[np.argsort(seen.image[rows], kind="stable")]
         ]
         point_lines.append(" ".join([_numbers(*xyz), f"{len(rows)}", *frames]))

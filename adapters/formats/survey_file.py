@@ -1,7 +1,8 @@
 """The survey file of a converted network: its tables adjusted again as they are, with its control.
 
-    survey.toml     cameras, image points, control, approximate values, datum
-    control.csv     id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ]; empty where a coordinate is not known
+    survey.toml     unit, cameras, image points, approximate values, scale bars, datum
+    control.csv     control and check points, see `known_points`
+    exterior.csv    image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg
 
 Source: the README, "The survey file".
 """
@@ -10,35 +11,40 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from adapters.formats.content import Content
+from adapters.formats.known_points import CONTROL, write_known_points
 from sfm.camera import Camera
-from sfm.conventions import FloatArray
 from sfm.files.plain_text import csv_text
-from sfm.network import Estimate, Network, ObjectPoints
+from sfm.network import Estimate, Network
 
 MIN_CONTROL = 3  # points that fix position, attitude and scale
-PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ, cYZ
+UNITS = ("km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft")  # that a survey may be in
+EXTERIOR = ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
+EXTERIOR_SIGMAS = ("sX", "sY", "sZ", "somega_deg", "sphi_deg", "skappa_deg")
 
 
-def write_survey_file(folder: Path, network: Network, estimate: Estimate, *, title: str) -> None:
-    """Write the survey file of tables that are in a folder, and the control beside it.
+def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
+    """Write the survey file of tables that are in a folder, and what was given beside it.
 
     Args:
         folder: that the tables are in.
-        network: what was measured; its control holds the network where it is enough for that.
-        estimate: the cameras, free or not, and approximate values.
+        content: of the survey; its control holds the network where it is enough for that and no other datum
+            is known.
         title: name of the survey.
     """
-    control = network.control
+    result = content.result
+    network, estimate, control = result.network, result.estimate, result.network.control
     unit = 'unit = "m"  # other programs do not state it: put here what the coordinates are in'
+    if result.unit in UNITS:
+        unit = f"unit = {_text(result.unit)}"
     lines = ["[survey]", f"name = {_text(title)}", unit, ""]
-    for index, camera in enumerate(estimate.cameras):
-        images = [name for name, own in zip(network.images, network.camera, strict=True) if own == index]
-        if images:
-            lines += [*_camera(camera, images), ""]
+    for camera, images, own in _families(network, estimate):
+        lines += [*_camera(camera, images, _weighted(network, estimate, camera), own), ""]
     lines += ["[observations]", 'file = "image_points.csv"', ""]
     lines += [
         "[approximate]",
@@ -47,49 +53,100 @@ def write_survey_file(folder: Path, network: Network, estimate: Estimate, *, tit
         'cameras = "cameras.csv"',
         "",
     ]
-    if len(control):
-        text = _control(network.points, control)
-        (folder / "control.csv").write_text(text, encoding="utf-8", newline="")
-        lines += ["[control]", 'file = "control.csv"', ""]
-    kind = "control" if len(control.complete) >= MIN_CONTROL else "free"
+    if len(control) or len(content.checks):
+        write_known_points(folder / CONTROL, network.points, control, content.checks)
+        lines += ["[control]", f'file = "{CONTROL}"', ""]
+    if len(network.exterior):
+        (folder / "exterior.csv").write_text(_exterior(network), encoding="utf-8", newline="")
+        lines += ["[exterior]", 'file = "exterior.csv"', ""]
+    bars = network.scale_bars
+    for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
+        ends = [_text(network.points[j]) for j in (start, end)]
+        lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
+        lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}", ""]
+    if len(content.rejected):  # they stand among the image points, and are found again
+        lines += ["[adjust]", 'reject = "tau"', ""]
+    kind = result.datum or ("control" if len(control.complete) >= MIN_CONTROL else "free")
     lines += ["[datum]", f'kind = "{kind}"']
     (folder / "survey.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _camera(camera: Camera, images: list[str]) -> Iterator[str]:
+def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, list[str], tuple[str, ...]]]:
+    """Yield cameras, their photographs and the parameters of which each of these has a value of its own.
+
+    Cameras that share parameters and are of one photograph each are one camera.
+    """
+    images = [
+        [name for name, own in zip(network.images, network.camera, strict=True) if own == k]
+        for k in range(len(estimate.cameras))
+    ]
+    groups: dict[str, list[int]] = {}
+    for k, camera in enumerate(estimate.cameras):
+        group = next((one for one in camera.shared if one), "")
+        alone = group and len(images[k]) == 1 and camera.name == f"{group} {images[k][0]}"
+        groups.setdefault(group if alone else f"{camera.name}\n{k}", []).append(k)
+    for group, members in groups.items():
+        camera = estimate.cameras[members[0]]
+        own: tuple[str, ...] = ()
+        if "\n" not in group:
+            pairs = zip(camera.names, camera.shared, camera.free, strict=True)
+            own = tuple(name for name, one, free in pairs if free and not one)
+            camera = replace(camera, name=group)
+        names = [name for k in members for name in images[k]]
+        if names:
+            yield camera, names, own
+
+
+def _weighted(network: Network, estimate: Estimate, camera: Camera) -> dict[str, tuple[float, float]]:
+    """Return value and standard deviation of the weighted parameters of a camera."""
+    seen, found = network.interior, {}
+    for k, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
+        one = estimate.cameras[k]
+        if camera.name in (one.name, one.owner_of(s)) and camera.model == one.model:
+            found[one.names[s]] = (float(value), float(sigma))
+    return found
+
+
+def _exterior(network: Network) -> str:
+    """Return the table of observed exterior orientations, empty cells where nothing was observed."""
+    seen, rows = network.exterior, []
+    factor = np.repeat([1.0, np.degrees(1.0)], 3)
+    for i, position, angles, C in zip(seen.image, seen.position, seen.angles, seen.covariance, strict=True):
+        variance = np.diagonal(C)
+        known = np.isfinite(variance)
+        value = np.where(known, factor * np.concatenate([position, angles]), np.nan)
+        sigma = np.where(known, factor * np.sqrt(np.where(known, variance, 0.0)), np.nan)
+        cells = ("" if np.isnan(v) else v for v in (*value.tolist(), *sigma.tolist()))
+        rows.append((network.images[i], *cells))
+    return csv_text((*EXTERIOR, *EXTERIOR_SIGMAS), rows)
+
+
+def _camera(
+    camera: Camera, images: list[str], weighted: dict[str, tuple[float, float]], own: tuple[str, ...]
+) -> Iterator[str]:
     """Yield the section of a camera; values of free parameters come from cameras.csv."""
     yield "[[camera]]"
     yield f"name = {_text(camera.name)}"
     yield f"images = [{', '.join(_text(name.replace('[', '[[]').replace('*', '[*]')) for name in images)}]"
     yield f"size_px = [{camera.size_px[0]}, {camera.size_px[1]}]"
     yield f"pixel_mm = [{camera.pixel_mm[0]!s}, {camera.pixel_mm[1]!s}]"
-    yield f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!s}"
+    if "c" not in weighted:
+        yield f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!s}"
     yield f'model = "{camera.model}"'
-    free = [name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free]
+    adjusted = [name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free]
+    free = [name for name in adjusted if name not in weighted]
     yield f"free = [{', '.join(_text(name) for name in free)}]"
+    if own:
+        yield f"per_photograph = [{', '.join(_text(name) for name in own)}]"
+    free = [*free, *weighted]
     held = [(n, v) for n, v in zip(camera.names, camera.parameters.tolist(), strict=True) if n not in free]
     held = [(name, value) for name, value in held if value and name != "c"]
     if held:
         yield "[camera.fixed]"
         yield from (f"{name} = {value!r}" for name, value in held)
-
-
-def _control(points: tuple[str, ...], control: ObjectPoints) -> str:
-    """Return the table of control, empty cells where a coordinate is not known."""
-    variance = np.einsum("nii->ni", control.covariance)
-    known = np.isfinite(variance)
-    xyz = np.where(known, control.xyz, np.nan)
-    sigma = np.where(known, np.sqrt(np.where(known, variance, 0.0)), np.nan)
-    between = np.stack([control.covariance[:, row, column] for row, column in PAIRS], axis=1)
-    header: tuple[str, ...] = ("id", "X", "Y", "Z", "sX", "sY", "sZ")
-    values: FloatArray = np.concatenate([xyz, sigma], axis=1)
-    if between.any():
-        header, values = (*header, "cXY", "cXZ", "cYZ"), np.concatenate([values, between], axis=1)
-    rows = [
-        (points[j], *("" if np.isnan(value) else value for value in row))
-        for j, row in zip(control.point, values.tolist(), strict=True)
-    ]
-    return csv_text(header, rows)
+    if weighted:
+        yield "[camera.weighted]"
+        yield from (f"{name} = [{value!r}, {sigma!r}]" for name, (value, sigma) in weighted.items())
 
 
 def _text(value: str) -> str:

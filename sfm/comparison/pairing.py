@@ -62,10 +62,6 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
     images, xy = _images_by_image_points(a, b, images)
     ours, theirs = identified(a), identified(b)
     points = _by_name(a.network.points, ours, b.network.points, theirs)
-    if _contradicted(a, b, xy, images, points):
-        points, numbers = points[:0], (_numbers(a), _numbers(b))
-        ours, theirs = ours & ~numbers[0], theirs & ~numbers[1]
-        points = _by_name(a.network.points, ours, b.network.points, theirs)
     named = len(points)
     found = _points_by_image_points(a, b, xy, images, points)
     points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
@@ -99,43 +95,6 @@ def identified(result: StoredResult) -> BoolArray:
         return np.zeros(len(result.network.points), dtype=bool)
     named = np.array([UNCODED.fullmatch(name) is None for name in result.network.points], dtype=bool)
     return named & result.estimate.determined
-
-
-def _numbers(result: StoredResult) -> BoolArray:
-    """Return whether the name of each point is a mere number, (n,)."""
-    return np.array([name.isdecimal() for name in result.network.points], dtype=bool)
-
-
-def _contradicted(
-    a: StoredResult, b: StoredResult, xy: tuple[FloatArray, FloatArray], images: IntArray, named: IntArray
-) -> bool:
-    """Return whether the numbers of points mean something else in the other result.
-
-    They do where they do not make one figure of the points of both, and most points that lie on the same
-    image points, or else at the same places in the object as they are, have other numbers.
-    """
-    numbers = named[_numbers(a)[named[:, 0]]]
-    if len(numbers) < 3:
-        return False
-    partner = np.full(len(a.network.points), -1)
-    partner[numbers[:, 0]] = numbers[:, 1]
-
-    def share(pairs: IntArray) -> tuple[float, float]:
-        """Parts of the numbers that pairs confirm, and that they contradict."""
-        known = partner[pairs[:, 0]]
-        confirmed = int((known == pairs[:, 1]).sum())
-        return confirmed / len(numbers), (int((known >= 0).sum()) - confirmed) / len(numbers)
-
-    ours, theirs = (a.estimate.points, a.estimate.determined), (b.estimate.points, b.estimate.determined)
-    try:
-        a_from_b = fit_robustly(theirs[0][numbers[:, 1]], ours[0][numbers[:, 0]])
-    except GeometryError:
-        pass  # on a line, any numbers may fit
-    else:
-        if share(nearest_places(ours, (a_from_b.apply(theirs[0]), theirs[1]), named[:0]))[0] > MAJORITY:
-            return False
-    found = _points_by_image_points(a, b, xy, images, named[:0])
-    return share(found if len(found) else nearest_places(ours, theirs, named[:0]))[1] > MAJORITY
 
 
 def _by_name(a: tuple[str, ...], a_known: BoolArray, b: tuple[str, ...], b_known: BoolArray) -> IntArray:

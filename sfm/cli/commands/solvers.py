@@ -135,13 +135,15 @@ def convert(
     tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp and ply.
     """
     with loading():
+        from adapters.formats.content import with_cameras
         from adapters.formats.registry import (
             ENDINGS,
             FORMATS,
             format_named,
             read_content,
             refuse_taken,
-            write_any,
+            told_losses,
+            write_content,
             written,
         )
         from sfm.comparison.camera_conversion import Conversion, convert_cameras
@@ -164,7 +166,9 @@ def convert(
         if straighten:
             network, estimate = undistort(network, estimate, form.models)
         estimate, conversions = convert_cameras(estimate, form.models, held=form.lacks)
-    write_any(target, form.name, network, estimate)
+    changed, gone = with_cameras(content, network, estimate)
+    changed = replace(changed, result=replace(changed.result, name=target.name))
+    write_content(target, form.name, changed)
     for camera, one in zip(cameras, conversions, strict=False):
         if straighten:
             print(f"camera {camera.name}: image points corrected for {camera.model}, ideal camera written")
@@ -176,3 +180,5 @@ def convert(
     for note in content.notes:
         print(f"{source}: {note}")
     print(f"{target}: {written(form.name, network, estimate)} as {form.name}")
+    for loss in told_losses(form.name, content, gone):
+        print(f"{target}: {loss} left out, format {form.name} has no place for them")

@@ -14,7 +14,6 @@ from adapters.formats.registry import read_any, read_comparable, write_any
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_camera
-from sfm.comparison.pairing import pair_results
 from sfm.comparison.significance import compare_results
 from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
@@ -80,35 +79,6 @@ def test_numbers_are_no_names_and_what_coincides_is_paired_by_place(tmp_path: Pa
     found = compare_results(StoredResult("own", named, truth), read_comparable(tmp_path / "tables"))
     assert len(found.points) == 30 and found.pairing.points_by_name == 0
     assert np.abs(found.point_difference).max() < 1e-9
-
-
-def test_numbers_in_another_order_are_recognised_by_place() -> None:
-    """Two results whose numbers both mean something to their program, and not the same."""
-    network, truth = make_network(seed_of("numbers"), images=5, points=30, model="opencv")
-    other = replace(
-        network,
-        images=tuple(f"b{i}" for i in range(5)),
-        points=tuple(str(int(name) - 1) for name in network.points),
-    )
-    first = StoredResult("first", network, truth)
-    pairing = pair_results(first, StoredResult("second", other, truth))
-    np.testing.assert_array_equal(pairing.points[:, 0], pairing.points[:, 1])
-    assert len(pairing.points) == 30 and pairing.points_by_name == 0
-    # points that moved keep their numbers where nothing contradicts them
-    moved = replace(truth, points=truth.points + np.array([0.3, 0, 0]))
-    assert pair_results(first, StoredResult("third", network, moved)).points_by_name == 30
-    same = pair_results(first, StoredResult("fourth", replace(network, images=other.images), truth))
-    assert same.points_by_name == 30
-
-
-def test_a_row_of_targets_moved_by_its_spacing_keeps_its_numbers() -> None:
-    """All places are those of the neighbours, but the numbers make one figure of both."""
-    grid = np.stack(np.meshgrid(np.arange(6.0), np.arange(5.0), [0.0]), axis=-1).reshape(-1, 3) / 8
-    network, truth = make_network(seed_of("moved row"), images=5, points=30, figure=grid, model="opencv")
-    other = replace(network, images=tuple(f"b{i}" for i in range(5)))
-    moved = replace(truth, points=truth.points + np.array([1 / 8, 0, 0]))
-    pairing = pair_results(StoredResult("a", network, truth), StoredResult("b", other, moved))
-    assert pairing.points_by_name == 30
 
 
 @pytest.mark.parametrize("model", ["simple_pinhole", "pinhole", "simple_radial", "radial"])

@@ -622,7 +622,7 @@ def test_convert_tells_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture
     convert(tmp_path / "in", tmp_path / "out", to_format="sba", straighten=True)
     convert(tmp_path / "in", tmp_path / "x.xml")
     convert(tmp_path / "in", tmp_path / "x.ply")
-    told = capsys.readouterr().out.splitlines()
+    told = [line for line in capsys.readouterr().out.splitlines() if "left out" not in line]
     name = truth.cameras[0].name
     assert told[0] == f"camera {name}: image points corrected for brown, ideal camera written"
     assert told[1] == f"{tmp_path / 'out'}: 6 photographs, 20 points, 120 image points as sba"

@@ -1,0 +1,269 @@
+"""Round trips of random surveys through every format: what is lost is what is named, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapters.formats.content import KINDS, Content, losses
+from adapters.formats.registry import FORMATS, format_named, read_content, write_content
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.cli.commands.solvers import convert
+from sfm.network import (
+    ExteriorObservations,
+    ImagePoints,
+    InteriorObservations,
+    ObjectPoints,
+    ScaleBars,
+)
+from sfm.pipeline import run_survey
+from sfm.stored_result import StoredResult
+from sfm.survey.inputs.survey import read_survey
+from tests.synthetic import make_network, seed_of
+
+READABLE = tuple(form.name for form in FORMATS if form.readable)
+MODEL_OF = {"bal": "radial", "photomodeler": "brown_dbat", "metashape": "opencv", "sba": "opencv"}
+IMAGES, POINTS = 5, 12
+
+
+def chance(rng: np.random.Generator) -> bool:
+    return bool(rng.random() < 0.6)
+
+
+def covariances(rng: np.random.Generator, count: int, size: int, *, diagonal: bool = False) -> np.ndarray:
+    A = 0.01 * rng.standard_normal((count, size, size))
+    C = A @ A.transpose(0, 2, 1) + 1e-6 * np.eye(size)
+    return C * np.eye(size) if diagonal else C
+
+
+def survey(form: str, rng: np.random.Generator) -> Content:
+    """A random survey whose camera and image points a format can hold, and of all else a random part."""
+    model = MODEL_OF.get(form, "brown" if form.startswith("bundle") else "full_opencv")
+    network, truth = make_network(rng, images=IMAGES, points=POINTS, model=model, cameras=1)
+    camera = truth.cameras[0]
+    keep = camera.plays(
+        *[role for role in {p.role for p in _parameters(camera.model)} if "FOCAL" in role.name]
+    )
+    centre = {"cx": 999.5, "cy": 749.5}
+    if form in ("sba", "bundle-matlab", "bundle-csharp"):
+        camera = camera.with_parameters(
+            np.array(
+                [
+                    v if k else centre.get(n, 0.0)
+                    for n, v, k in zip(camera.names, camera.parameters, keep, strict=True)
+                ]
+            )
+        )
+    if form == "photomodeler":
+        camera = camera.with_parameters(
+            np.where([n in ("b1", "b2") for n in camera.names], 0.0, camera.parameters)
+        )
+    camera = replace(camera, free=camera.free & (rng.random() < 0.5))
+    truth = replace(truth, cameras=(camera,))
+    images = tuple(f"image{i + 1}.jpg" for i in range(IMAGES))
+    seen = network.image_points
+    if chance(rng) or form == "bundle-csharp":  # its file wants them
+        C = covariances(rng, len(seen), 2, diagonal=chance(rng))
+        seen = replace(seen, covariance=C, stated=np.ones(len(seen), dtype=bool))
+    else:
+        seen = replace(
+            seen, covariance=np.tile(np.eye(2), (len(seen), 1, 1)), stated=np.zeros(len(seen), dtype=bool)
+        )
+    chosen = rng.permutation(POINTS)
+    network = replace(network, images=images, image_points=seen)
+    if chance(rng):
+        C = covariances(rng, 4, 3, diagonal=chance(rng))
+        if chance(rng):
+            C[0] = np.diag([1e-4, np.inf, 1e-4])
+        C[1] *= rng.integers(0, 2)  # fixed
+        network = replace(network, control=ObjectPoints(chosen[:4], truth.points[chosen[:4]] + 0.01, C))
+    if chance(rng):
+        length, sigma = rng.uniform(0.5, 2, 2), rng.uniform(1e-4, 1e-3, 2)
+        network = replace(network, scale_bars=ScaleBars(chosen[4:6], chosen[6:8], length, sigma))
+    if chance(rng):
+        C = covariances(rng, 2, 6, diagonal=chance(rng))
+        if chance(rng):
+            C[:, 3:, 3:] = np.diag([np.inf] * 3)
+            C[:, :3, 3:] = C[:, 3:, :3] = 0.0
+        angles = rng.uniform(-1, 1, (2, 3))
+        exterior = ExteriorObservations(np.array([1, 3]), truth.position[[1, 3]], angles, C)
+        network = replace(network, exterior=exterior)
+    if camera.free.any() and chance(rng):
+        own = np.flatnonzero(camera.free)[:2]
+        R = np.array([[1, 0.3], [0.3, 1]]) if chance(rng) and len(own) == 2 else None
+        found = InteriorObservations(
+            np.zeros(len(own), dtype=np.int64), own, camera.parameters[own] + 1e-3, np.full(len(own), 1e-2), R
+        )
+        network = replace(network, interior=found)
+    joint = covariances(rng, 1, 3 * POINTS)[0] if chance(rng) else None
+    marginal = covariances(rng, POINTS, 3, diagonal=True) if chance(rng) else None
+    if joint is not None:
+        blocks = joint.reshape(POINTS, 3, POINTS, 3)[np.arange(POINTS), :, np.arange(POINTS)]
+        marginal = blocks * np.eye(3)
+    exterior_covariance = covariances(rng, IMAGES, 6) if chance(rng) else None
+    position = None if exterior_covariance is None else exterior_covariance[:, :3, :3] * np.eye(3)
+    sigma = np.where(camera.free, 0.01, np.nan)
+    count = int(camera.free.sum())
+    known = bool(count) and chance(rng)
+    result = StoredResult(
+        *("survey", network, truth, marginal, position),
+        interior_sigma=(sigma,) if known else None,
+        redundancy=int(rng.integers(10, 99)) if chance(rng) else None,
+        unit=str(rng.choice(["", "mm", "m"])),
+        covariance=joint,
+        datum=str(rng.choice(["", "free", "control"])),
+    )
+    checks = ObjectPoints(chosen[8:10], truth.points[chosen[8:10]], covariances(rng, 2, 3, diagonal=True))
+    bad = ImagePoints(
+        *(np.array([0, 1]), chosen[10:12], rng.uniform(0, 1000, (2, 2))),
+        *(np.tile(np.eye(2), (2, 1, 1)), np.zeros(2, dtype=bool)),
+    )
+    drop = (seen.image[:, None] * POINTS + seen.point[:, None] == bad.image * POINTS + bad.point).any(axis=1)
+    with_bad = chance(rng) and form != "bundle-csharp"
+    if with_bad:
+        network = replace(network, image_points=seen.select(~drop))
+    return Content(
+        replace(result, network=network),
+        **({"rejected": bad} if with_bad else {}),
+        **({"checks": checks} if chance(rng) else {}),
+        exterior_covariance=exterior_covariance,
+        interior_covariance=tuple(covariances(rng, 1, count)) if known else (),
+        sigma0=float(rng.uniform(0.5, 2)) if chance(rng) else None,
+    )
+
+
+def run_of(content: Content, folder: Path) -> Adjustment:
+    write_content(folder, "tables", content)
+    return run_survey(read_survey(folder / "survey.toml")).adjustment
+
+
+def test_tables_are_a_survey_with_all_that_was_given(tmp_path: Path) -> None:
+    """Written, adjusted as they are, and in the unit that was known: nothing that took part is missing."""
+    network, truth = make_network(seed_of("whole survey"), images=6, points=20, free=("c", "x0", "y0", "K1"))
+    sigma = np.tile(np.eye(3) * 1e-8, (4, 1, 1))
+    exterior = np.diag([1e-6] * 3 + [np.inf] * 3)
+    network = replace(
+        network,
+        control=ObjectPoints(np.arange(4), truth.points[:4], sigma),
+        scale_bars=ScaleBars(
+            np.array([5]),
+            np.array([6]),
+            np.linalg.norm(truth.points[[5]] - truth.points[[6]], axis=1),
+            np.array([1e-4]),
+        ),
+        exterior=ExteriorObservations(np.array([0]), truth.position[[0]], np.zeros((1, 3)), exterior[None]),
+        interior=InteriorObservations(
+            np.array([0]), np.array([0]), truth.cameras[0].parameters[:1], np.array([1e-3])
+        ),
+    )
+    checks = ObjectPoints(np.array([8, 9]), truth.points[8:10], sigma[:2])
+    content = Content(StoredResult("whole", network, truth, unit="mm", datum="control"), checks=checks)
+    a = run_of(content, tmp_path / "out")
+    survey = read_survey(tmp_path / "out" / "survey.toml")
+    assert (survey.unit, survey.datum.kind) == ("mm", "control")
+    assert survey.control is not None and survey.control.check is not None and survey.control.check.sum() == 6
+    b = adjust(network, truth, datum="control", reject="none")
+    assert (len(a.network.scale_bars), len(a.network.exterior), len(a.network.interior)) == (1, 1, 1)
+    assert a.redundancy == b.redundancy
+    np.testing.assert_allclose(a.estimate.points, b.estimate.points, atol=1e-5)  # other weights
+
+
+def test_cameras_of_single_photographs_share_what_they_shared(tmp_path: Path) -> None:
+    """One with c of every photograph: not as many free cameras as there are photographs."""
+    network, truth = make_network(seed_of("own c"), images=6, points=25, cameras=6, free=("c", "K1"))
+    names = truth.cameras[0].names
+    shared = tuple("" if name == "c" else "lens" for name in names)
+    cameras = tuple(
+        replace(camera, name=f"lens {image}", shared=shared)
+        for camera, image in zip(truth.cameras, network.images, strict=True)
+    )
+    truth = replace(truth, cameras=cameras)
+    a = run_of(Content(StoredResult("own", network, truth, datum="free")), tmp_path / "out")
+    b = adjust(network, truth, reject="none")
+    assert a.redundancy == b.redundancy == 2 * len(network.image_points) - 6 * 6 - 3 * 25 - 6 - 1 + 7
+    assert [camera.name for camera in a.estimate.cameras] == [camera.name for camera in cameras]
+    again = read_content(tmp_path / "out")
+    assert [camera.shared for camera in again.result.estimate.cameras] == [shared] * 6
+
+
+def test_rejected_points_come_back_as_rejected_and_are_found_again(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("rejected"), images=6, points=20, free=())
+    xy = network.image_points.xy.copy()
+    xy[7] += 30.0
+    a = adjust(replace(network, image_points=replace(network.image_points, xy=xy)), truth, reject="tau")
+    assert np.flatnonzero(a.rejected).tolist() == [7]
+    seen = a.network.image_points
+    content = Content(
+        StoredResult("r", replace(network, image_points=seen.select(~a.rejected)), a.estimate),
+        rejected=seen.select(a.rejected),
+    )
+    again = run_of(content, tmp_path / "out")
+    assert again.rejected.sum() == 1 and again.redundancy == a.redundancy
+    assert len(read_content(tmp_path / "out").rejected) == 1
+
+
+def test_what_has_no_coordinates_is_named_where_it_goes(tmp_path: Path) -> None:
+    content = survey("tables", seed_of("unplaced"))
+    result = content.result
+    position, points = result.estimate.position.copy(), result.estimate.points.copy()
+    position[2], points[4] = np.nan, np.nan
+    estimate = replace(result.estimate, position=position, points=points)
+    content = replace(content, result=replace(result, estimate=estimate))
+    for form in ("tables", "colmap-text"):
+        named = {kind.name: count for kind, count in losses(content, format_named(form).holds)}
+        assert named["unplaced"] == 2
+        write_content(tmp_path / form, form, content)
+        again = read_content(tmp_path / form).result
+        assert (len(again.network.images), len(again.network.points)) == (IMAGES - 1, POINTS - 1)
+    C = read_content(tmp_path / "tables").exterior_covariance
+    assert (C is None) == (content.exterior_covariance is None)
+
+
+def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network, truth = make_network(seed_of("named"), images=5, points=12, model="opencv")
+    bar = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-4]))
+    network = replace(network.with_control(["1", "2"], truth.points[:2]), scale_bars=bar)
+    content = Content(StoredResult("x", network, truth, unit="mm", datum="free", redundancy=7))
+    write_content(tmp_path / "in", "tables", content)
+    convert(tmp_path / "in", tmp_path / "out.xml")
+    told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
+    assert len(told) == len(losses(content, format_named("metashape").holds)) and len(told) >= 5
+    convert(tmp_path / "in", tmp_path / "same", to_format="tables")
+    assert "left out" not in capsys.readouterr().out
+    assert (tmp_path / "same" / "given.csv").read_text() == (tmp_path / "in" / "given.csv").read_text()
+    # another model of the camera: what was estimated of the former one goes, and is named
+    seen = replace(content.result, interior_sigma=(np.where(truth.cameras[0].free, 0.1, np.nan),))
+    write_content(tmp_path / "sigma", "tables", replace(content, result=seen))
+    convert(tmp_path / "sigma", tmp_path / "pm", to_format="photomodeler")
+    assert "standard deviations of interior parameters left out" in capsys.readouterr().out
+
+
+def _parameters(model: str):  # type: ignore[no-untyped-def]
+    from sfm.distortion.models import MODELS
+
+    return MODELS[model].parameters
+
+
+@pytest.mark.parametrize("form", READABLE)
+def test_what_is_lost_is_what_is_named(form: str, tmp_path: Path) -> None:
+    held = format_named(form).holds
+    for trial in range(12):
+        content = survey(form, seed_of(f"content {form} {trial}"))
+        path = tmp_path / f"{trial}"
+        write_content(path, form, content)
+        again = read_content(path, form)
+        named = {kind.name for kind, _ in losses(content, held)}
+        for kind in KINDS:
+            if kind.name == "unplaced" and "object points" in named:
+                continue
+            before, after = kind.rows(content), kind.rows(again)
+            if kind.name in named:
+                same = before.shape == after.shape and np.allclose(before, after, equal_nan=True)
+                assert not same or kind.name == "free", kind.name
+            elif kind.name != "free" or len(before):
+                assert before.shape == after.shape, (kind.name, trial)
+                np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12, err_msg=kind.name)
