@@ -8,6 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+TIMED := adjustment matching resection textured viewer_page wide_matching
 
 .PHONY: demo test docs study bench mutate setup clean
 
@@ -31,7 +32,7 @@ study: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 bench: $(READY)
-	@for file in benchmarks/[a-z]*.py; do echo "== $$file"; $(BIN)/python "$$file" || exit 1; done
+	@for name in $(TIMED); do echo "== $$name"; $(BIN)/python -m "benchmarks.$$name" || exit 1; done
 
 mutate: $(READY)
 	$(BIN)/python -m tests.mutate

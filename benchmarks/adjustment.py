@@ -1,7 +1,7 @@
 """Adjustment timed against COLMAP's Ceres adjuster on the same networks: problem set-up plus solve, warm.
 
-    python benchmarks/adjustment.py [--networks small|all|block] [--no-covariance] [--repeat N] [--cpu]
-    python benchmarks/adjustment.py --growth [--photographs N] [--ceres] [--ceres-limit S] [--cpu]
+    python -m benchmarks.adjustment [--networks small|all|block] [--no-covariance] [--repeat N] [--cpu]
+    python -m benchmarks.adjustment --growth [--photographs N] [--ceres] [--ceres-limit S] [--cpu]
 
 Both start from the same values and adjust the same 8 shared parameters of an `opencv` camera. "default" is
 what a user of pycolmap gets; "best" is pycolmap tuned: DENSE_SCHUR or SPARSE_SCHUR, whichever wins,
@@ -30,9 +30,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from networks import SIZE_PX, block, convergent
 from threadpoolctl import threadpool_limits
 
+from benchmarks.networks import SIZE_PX, block, convergent
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, Network
@@ -302,7 +302,17 @@ def grown(
     what: str, size: str, repeat: int, cpu: bool, limit: float | None = None
 ) -> tuple[float, float, float]:
     """Return image points, s and peak memory, MB, of a network that is adjusted in a process of its own."""
-    command = [sys.executable, __file__, "--grown", what, "--size", size, "--repeat", str(repeat)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.adjustment",
+        "--grown",
+        what,
+        "--size",
+        size,
+        "--repeat",
+        str(repeat),
+    ]
     command += ["--cpu"] if cpu else []
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=limit)
     points, seconds, mb = (float(word) for word in done.stdout.split()[-3:])
@@ -361,7 +371,7 @@ def peak_mb() -> float:
 
 def peak_in_own_process(what: str) -> float:
     """Return what `peak_of` finds in a process of its own, MB."""
-    command = [sys.executable, __file__, "--peak", what]
+    command = [sys.executable, "-m", "benchmarks.adjustment", "--peak", what]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 

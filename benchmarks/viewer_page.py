@@ -1,6 +1,6 @@
 """A page of 1,000 photographs, 20,000 points and 300,000 rays timed in chromium with software rendering.
 
-    python benchmarks/viewer_page.py [--photographs M] [--points N] [--rays R] [--keep FILE.html]
+    python -m benchmarks.viewer_page [--photographs M] [--points N] [--rays R] [--keep FILE.html]
 
 Printed: time to write the page, its size, time until the scene is there (wall clock, and CPU time of all
 processes of the browser, which other programs disturb less), frames per second while it turns, and how many

@@ -105,6 +105,18 @@ def test_metadata_are_complete_and_name_no_place_that_does_not_exist() -> None:
     assert "urls" not in PROJECT, "then CITATION.cff and SECURITY.md can name them, too"
 
 
+def test_every_timing_runs_with_make_bench() -> None:
+    """Each as a module of this tree, which finds `tests`, `datasets` and its siblings."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    timed = re.search(r"^TIMED := (.*)$", makefile, re.M)
+    assert timed and '-m "benchmarks.$$name"' in makefile
+    files = {path.stem: path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py")}
+    assert set(timed[1].split()) == {name for name, text in files.items() if "\ndef main()" in text}
+    for name, text in files.items():
+        own = re.findall(r"^(?:from|import) (\w+)", text, re.M)
+        assert not set(own) & set(files), f"{name}: a sibling is benchmarks.NAME"
+
+
 def test_the_source_distribution_names_files_that_are_there() -> None:
     lines = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()
     named = [word for line in lines if line.startswith(("include ", "graft ")) for word in line.split()[1:]]
