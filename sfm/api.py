@@ -24,12 +24,14 @@ from sfm.pipeline import run_survey as run_stages
 from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult
 from sfm.runtime.cores import cores
+from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.other_programs import OtherPrograms
 
+load_adapters()
 BACKENDS = ("colmap", "none")
 
 

@@ -332,6 +332,32 @@ def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None
     assert line.returncode == 2 and line.stderr.count("\n") == 1 and "of its own" in line.stderr
 
 
+READ = "import sfm; print(sfm.read_result(sys.argv[1]).points.xyz.shape[0])"
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_a_folder_called_adapters_beside_a_script_is_not_taken_for_ours(
+    tmp_path: Path, result_folder: Path, result: SurveyResult, regular: bool
+) -> None:
+    (tmp_path / "adapters").mkdir()
+    (tmp_path / "adapters" / "mine.py").write_text("VALUE = 1", encoding="utf-8")
+    if regular:
+        (tmp_path / "adapters" / "__init__.py").write_text("", encoding="utf-8")
+    script = tmp_path / "script.py"
+
+    def run(text: str) -> subprocess.CompletedProcess[str]:
+        script.write_text(f"import sys; {text}", encoding="utf-8")
+        command = [sys.executable, str(script), str(result_folder)]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    found = run(READ)
+    assert found.stdout.split() == [str(len(result.points))], found.stderr
+    if regular:  # which is the user's own, whatever the place of ours in the search path
+        refused = run(f"import adapters.mine; {READ}")
+        last = refused.stderr.strip().splitlines()[-1]
+        assert "InstallationError" in last and str(tmp_path / "adapters") in last
+
+
 def test_photographs_and_targets_are_arrays(tmp_path: Path) -> None:
     folder = write_photograph_survey(tmp_path / "s", "s", photographs=1).parent
     photograph = sfm.read_photograph(folder / "photo 1.png")

@@ -13,7 +13,7 @@ from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, st
 from sfm.cli.outlets import guard_outlets
 from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import closed_current_folder, refuse_folder_settings
-from sfm.runtime.installation import refuse_mixed_installation
+from sfm.runtime.installation import load_adapters, refuse_mixed_installation
 
 YOUNG_OBJECTS = 100_000  # that Python waits for before it looks for cycles, far more than usual
 BAD_INPUT = 2  # exit code where a person must put something right
@@ -55,6 +55,7 @@ def _begin() -> None:
     atexit.register(gc.freeze)
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     refuse_folder_settings()
+    load_adapters()
 
 
 def _run() -> None:

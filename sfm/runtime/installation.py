@@ -1,5 +1,6 @@
-"""Whether files of other projects lie among Kolinear's: two on the registry have packages of the same names.
+"""Kolinear's two packages found by their place, and whether files of other projects lie among them.
 
+Two projects on the registry have packages of the same names, and a user may have a folder of such a name.
 Python packages of one name are merged into one folder without a word, and the `__init__.py` of whichever came
 last is left.
 """
@@ -8,9 +9,11 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
 """a file that each of the others has, PyPI's sfm and adapters, and Kolinear has not"""
+ROOT = os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
 COMMANDS = ("kolinear", "kolinear.exe", "-m")  # who starts these reads one line and no traceback
 BAD_INPUT = 2
 
@@ -21,7 +24,7 @@ def refuse_mixed_installation(root: str | None = None) -> None:
     Args:
         root: folder of the packages; that of this one if not given.
     """
-    root = root or os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
+    root = root or ROOT
     for file in FOREIGN:
         path = os.path.join(root, file)
         if os.path.exists(path):
@@ -36,3 +39,30 @@ def refuse_mixed_installation(root: str | None = None) -> None:
                 print(f"kolinear: {line}", file=sys.stderr)
                 raise SystemExit(BAD_INPUT)
             raise InstallationError(line)
+
+
+def load_adapters() -> None:
+    """Import the package `adapters` beside sfm, also where the search path finds another of that name first.
+
+    Raises:
+        InstallationError: another package of that name is imported already.
+    """
+    own = os.path.join(ROOT, "adapters")
+    loaded = sys.modules.get("adapters")
+    if loaded is not None:
+        folders = list(getattr(loaded, "__path__", ()))
+        if [os.path.realpath(folder) for folder in folders] == [os.path.realpath(own)]:
+            return
+        from sfm.errors import InstallationError
+
+        where = folders[0] if folders else getattr(loaded, "__file__", None)
+        raise InstallationError(
+            f"{where}: a package called adapters is imported, and Kolinear has one of that name; rename yours"
+        )
+    spec = spec_from_file_location(
+        "adapters", os.path.join(own, "__init__.py"), submodule_search_locations=[own]
+    )
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{own}: not a package", name="adapters")
+    sys.modules["adapters"] = package = module_from_spec(spec)
+    spec.loader.exec_module(package)
