@@ -9,7 +9,7 @@
     |-- OutputError             a result cannot be written
     |   `-- FolderInUseError    another run is writing there
     `-- BackendError            an external program or library is of another version, fails or refuses
-        `-- MissingLibraryError it is not installed: it belongs to an extra of Kolinear
+        `-- MissingLibraryError it is not installed
 
 Rank, convergence and rejected observations are results, not exceptions.
 """
@@ -52,7 +52,7 @@ class BackendError(KolinearError):
 
 
 class MissingLibraryError(BackendError):
-    """A library that belongs to an extra of Kolinear is not installed; the message says how to install it."""
+    """A library is not installed that only some commands need; the message says how to install it."""
 
 
 def one_line(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""The core without its extras: surveys run without pycolmap and Dask, and each command says what it lacks."""
+"""Without pycolmap and Dask: surveys run, and each command says what it lacks."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sfm.runtime.executor import Call, Done, Event, Lost, Tell, Told, Work
 from sfm.runtime.in_process import in_process_engine
 from tests.surveys import write_observed_survey
 
-INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*', the extra kolinear[colmap]"
+INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*'"
 INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
 
 @pytest.fixture(autouse=True)
 def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide the libraries of the extras, and spare the drawing, which is not what is tested."""
+    """Hide the two libraries, and spare the drawing, which is not what is tested."""
     for name in ("pycolmap", "pycolmap.pyceres", "dask", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "adapters.dask_cluster", raising=False)

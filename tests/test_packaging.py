@@ -70,12 +70,13 @@ def test_licences_of_all_that_is_shipped_are_named() -> None:
     assert built_with and f"- {built_with[1]} (" in texts[1], "the licences are those of another three.js"
 
 
-def test_the_core_needs_no_library_of_an_extra() -> None:
+def test_the_package_brings_colmap_and_no_library_of_an_extra() -> None:
     extras = PROJECT["optional-dependencies"]
-    assert {"colmap", "cluster", "all", "dev"} <= set(extras)
-    assert extras["all"] == ["kolinear[colmap,cluster]"] and "kolinear[all]" in extras["dev"]
+    assert set(extras) == {"cluster", "all", "docs", "dev"}
+    assert extras["all"] == ["kolinear[cluster]"] and "kolinear[all]" in extras["dev"]
     core = " ".join(PROJECT["dependencies"])
-    assert not re.search(r"pycolmap|dask|distributed|cryptography|pytest|mypy", core)
+    assert "pycolmap>=4.2,<4.3" in PROJECT["dependencies"]
+    assert not re.search(r"dask|distributed|cryptography|pytest|mypy", core)
 
 
 def test_the_version_stands_in_one_place() -> None:

@@ -105,7 +105,7 @@ def test_the_wheel_has_all_files_of_the_packages(released: tuple[Path, Path]) ->
     assert files == tree
     for line in ("License-File: LICENSE", "License-File: sfm/report/viewer/LICENSES.txt"):
         assert line in text
-    assert "Provides-Extra: colmap" in text and "Requires-Dist: pycolmap<4.3,>=4.2; extra" in text
+    assert "Requires-Dist: pycolmap<4.3,>=4.2\n" in text
 
 
 def test_a_survey_of_rendered_photographs_runs_from_the_wheel(
@@ -116,17 +116,16 @@ def test_a_survey_of_rendered_photographs_runs_from_the_wheel(
     home.mkdir()
     shutil.copytree(DATASETS / "demo", tmp_path / "demo")
     told = run(kolinear, "doctor", folder=tmp_path, home=home)
-    assert "This installation works." in told and "pycolmap is not installed" in told
+    assert "This installation works." in told and "is not installed" not in told.split("dask")[0]
     scene = ("demo/scene.toml", "photographs")
     run(programs / "python", "-P", "-m", "sfm.rendering.render", *scene, folder=tmp_path, home=home)
     survey = ("demo/survey.toml", "--images", "photographs", "--out", "result")
-    told = run(kolinear, "run", *survey, folder=tmp_path, home=home)
-    assert "Not compared with another adjuster" in " ".join(told.split())
+    run(kolinear, "run", *survey, folder=tmp_path, home=home)
     summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
     assert summary["images"]["used"] == summary["images"]["total"] > 5
     assert summary["sigma0_px"] < 0.1
     page = (tmp_path / "result" / "report.html").read_text(encoding="utf-8")
-    assert "three.js" in page and "Not compared with another adjuster: pycolmap" in page
+    assert "three.js" in page and "Not compared with another adjuster" not in page
     for photograph in (tmp_path / "photographs").glob("part_*.jpg"):
         shutil.copy(photograph, tmp_path / "demo")
     told = run(kolinear, "batch", "demo/survey.toml", "--out", "batch", folder=tmp_path, home=home)

@@ -169,7 +169,7 @@ def load_pycolmap() -> ModuleType:
     except ImportError as error:
         if isinstance(error, ModuleNotFoundError) and error.name == "pycolmap":
             raise MissingLibraryError(
-                f"pycolmap is not installed: pip install 'pycolmap=={needed}.*', the extra kolinear[colmap]"
+                f"pycolmap is not installed: pip install 'pycolmap=={needed}.*'"
             ) from error
         raise BackendError(
             f"pycolmap cannot be imported ({one_line(error)}): pip install 'pycolmap=={needed}.*'"
