@@ -77,17 +77,22 @@ class Acceptance:
 
     @property
     def verdict(self) -> Verdict:
-        """Return good (proven to be kept, nothing lacking), fair or bad (proven not to be kept)."""
-        counts = {
-            kind: {name: self.count(decision), "total": len(self.error)}
-            for kind, name, decision in (
-                ("lengths_outside", "outside", OUT),
-                ("lengths_undecided", "undecided", UNDECIDED),
-                ("lengths_without_sigma", "unknown", UNKNOWN),
+        """Return good (proven to be kept, nothing lacking), fair or bad.
+
+        Bad are errors proven to be outside of the limit, and larger ones than it with nothing to excuse them.
+        """
+        unknown = np.array([decision == UNKNOWN for decision in self.decision])
+        exceeding = int((unknown & (np.abs(self.error) > self.limit)).sum())
+        decided = [
+            remark(kind, **{name: number, "total": len(self.error)})
+            for kind, name, number in (
+                ("lengths_outside", "outside", self.count(OUT)),
+                ("lengths_exceed_limit", "exceeding", exceeding),
+                ("lengths_undecided", "undecided", self.count(UNDECIDED)),
+                ("lengths_without_sigma", "unknown", int(unknown.sum()) - exceeding),
             )
-            if self.count(decision)
-        }
-        decided = [remark(kind, **numbers) for kind, numbers in counts.items()]
+            if number
+        ]
         return judge((*decided, *self.lacking, remark("temperature_unknown")), HEADLINES)
 
 

@@ -89,6 +89,12 @@ def test_errors_are_proven_or_undecided() -> None:
     assert found.count("not known") == 35
     assert found.lacking == ()
     assert found.verdict.remarks[0].kind == "lengths_without_sigma" and found.verdict.level == "fair"
+    result, lengths = volume(error=616e3)
+    found = accepted(result, replace(lengths, sigma=np.full(35, np.nan)))
+    first, second = found.verdict.remarks[:2]
+    assert found.verdict.level == "bad" and first.kind == "lengths_exceed_limit"
+    assert first.number("exceeding") == 1
+    assert second.kind == "lengths_without_sigma" and second.number("unknown") == 34
 
 
 def test_what_part_1_asks_for_and_the_data_lack_is_said() -> None:
@@ -162,7 +168,11 @@ def test_the_command_knows_where_the_scale_comes_from(tmp_path: Path) -> None:
     assert "nothing says what its scale comes from" in str(refused.exception)
     head = "kind,name,coordinate,unit,given,difference,sigma,r,w\n"
     (tmp_path / "result" / "given.csv").write_text(head + "scale bar,p1 - p25,length,m,1.7,0,1e-5,0.5,\n")
+    bare = tmp_path / "bare.csv"
+    bare.write_text(f"line,from,to,length\n1,p1,p5,{length + 1e-3!r}\n", encoding="utf-8")
     for limit, code in (("2e-3", 0), ("1e-4", 1)):
+        told = CliRunner().invoke(app, [*words[:2], str(bare), *words[3:], "--limit-a", limit])
+        assert told.exit_code == code, told.output
         told = CliRunner().invoke(app, [*words, "--limit-a", limit])
         assert told.exit_code == code, told.output
     summary = json.loads((tmp_path / "out" / "acceptance.json").read_text(encoding="utf-8"))

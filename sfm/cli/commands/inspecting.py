@@ -107,7 +107,8 @@ def accept(
 ) -> None:
     """Test a result against calibrated lengths (VDI/VDE 2634 part 1).
 
-    The scale must come from other bars than those tested. Exit code 1 if the limit is proven not to be kept.
+    The scale must come from other bars than those tested. Exit code 1 if the limit is proven not to be kept,
+    or an error without a standard deviation of the calibration exceeds it.
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources

@@ -107,6 +107,14 @@ ROWS = (
         "See the table of lengths.",
     ),
     Kind(
+        "lengths_exceed_limit",
+        "error",
+        "The errors of {exceeding} of {total} lengths exceed the limit; no standard deviation of the "
+        "calibration is given that could explain {exceeding:it|them}.",
+        "the error of length measurement is larger than the limit, and the column sigma is empty",
+        "See the table of lengths; enter the standard deviations of the calibration.",
+    ),
+    Kind(
         "lengths_undecided",
         "warning",
         "{undecided} of {total} lengths {undecided:is|are} proven neither inside nor outside of the limit.",
