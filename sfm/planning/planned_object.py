@@ -11,12 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from heapq import heapify, heappop, heappushpop
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
+from sfm.files.csv_tables import MAX_NUMBER
 from sfm.geometry.mesh import Mesh
 from sfm.planning.sight.occlusion import BoxTree, box_tree
 
@@ -24,6 +27,7 @@ SEGMENTS = 48  # of a round shape: its facets lie 0.2 % of the radius inside
 PER_POINT = 20  # random points of a surface for each that is kept
 SAME_VERTEX = 1e-9  # of the size of a mesh: corners nearer than this are one
 ON_LINE = 1e-9  # of the extent of points: they are on one line if they leave it by less
+REACH = 1 + 1e-9  # of a search for points, so that rounding loses none
 SHAPES = {
     "box": ("LX", "LY", "LZ"),
     "cylinder": ("DIAMETER", "HEIGHT"),
@@ -68,11 +72,12 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
         normals: directions that they face, of any length, (n, 3); None where not known.
 
     Raises:
-        GeometryError: fewer than 3 points, all on one line, or a normal of length 0.
+        GeometryError: fewer than 3 points, all on one line, too large, or a normal of length 0.
     """
     count = counted(len(xyz), "point")
     if len(xyz) < 3:
         raise GeometryError(f"object: {count}, needed 3 or more")
+    _refuse_too_large(xyz)
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if extent[1] <= ON_LINE * extent[0]:
         raise GeometryError(f"object: {count} on one line, needed 3 or more that are not")
@@ -97,11 +102,12 @@ def object_of_mesh(
         bare: triangles without points, such as the bottom that something stands on, (t,).
 
     Raises:
-        GeometryError: no area, fewer than 3 points asked for, a mesh with holes not said to be open, or
-            triangles that do not run alike.
+        GeometryError: no area, too large, fewer than 3 points asked for, a mesh with holes not said to be
+            open, or triangles that do not run alike.
     """
     if count < 3:
         raise GeometryError(f"object: {counted(count, 'point')} asked for, needed 3 or more")
+    _refuse_too_large(mesh.vertices)
     edges = open_edges(mesh)
     if edges and not open_surface:
         raise GeometryError(
@@ -173,6 +179,13 @@ def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObje
     return object_of_mesh(mesh, count, open_surface=not closed, bare=bare)
 
 
+def _refuse_too_large(xyz: FloatArray) -> None:
+    """Raise GeometryError for coordinates that no table may hold, whose squares and products overflow."""
+    largest = float(np.abs(xyz).max(initial=0.0))
+    if not largest <= MAX_NUMBER:
+        raise GeometryError(f"object: a coordinate of {largest:g}, needed at most {MAX_NUMBER:g}; see --unit")
+
+
 def open_edges(mesh: Mesh) -> int:
     """Return how many edges belong to one triangle only; vertices in one place are one."""
     _, count = np.unique(np.sort(_edges(mesh), axis=1), axis=0, return_counts=True)
@@ -199,15 +212,23 @@ def _edges(mesh: Mesh) -> IntArray:
 def farthest_points(xyz: FloatArray, count: int) -> IntArray:
     """Return points of which each next one is farthest from those before, (count,); all of fewer.
 
-    The first is the one nearest to the middle.
+    The first is the one nearest to the middle. A new one changes only distances of points that are nearer
+    to it than it is to those before. Distances only shrink: what the queue has of a point is never too short.
     """
     count = min(count, len(xyz))
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = np.argmin(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1))
-    nearest = np.full(len(xyz), np.inf)
+    nearest = ((xyz - xyz[chosen[0]]) ** 2).sum(axis=1)
+    tree = cKDTree(xyz)
+    queue = [(-d, j) for j, d in enumerate(nearest.tolist()) if j != chosen[0]]
+    heapify(queue)
     for k in range(1, count):
-        nearest = np.minimum(nearest, ((xyz - xyz[chosen[k - 1]]) ** 2).sum(axis=1))
-        chosen[k] = np.argmax(nearest)
+        d, j = heappop(queue)
+        while -d > nearest[j]:
+            d, j = heappushpop(queue, (-float(nearest[j]), j))
+        chosen[k] = j
+        near = np.array(tree.query_ball_point(xyz[j], np.sqrt(nearest[j]) * REACH), dtype=np.int64)
+        nearest[near] = np.minimum(nearest[near], ((xyz[near] - xyz[j]) ** 2).sum(axis=1))
     return chosen
 
 

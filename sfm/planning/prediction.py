@@ -156,7 +156,8 @@ def predict_network(
         sight: of these stations, where it is known already.
 
     Raises:
-        GeometryError: no photograph or no point that can be determined, or an unknown point of a bar.
+        GeometryError: no photograph or no point that can be determined, as from one place, or an unknown
+            point of a bar.
 
     Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
     """
@@ -186,7 +187,13 @@ def predict_network(
     )
     photograph = np.full(len(stations), -1, dtype=np.int64)
     photograph[photographs] = np.arange(len(photographs))
-    return Prediction(planned, camera, stations, sight, predict(network, estimate), place, photograph)
+    found = Prediction(planned, camera, stations, sight, predict(network, estimate), place, photograph)
+    if not found.determined.any():
+        raise GeometryError(
+            f"plan: {len(photographs)} photographs determine none of the points, needed stations in different"
+            f" places, there are {stations.of(photographs).places}"
+        )
+    return found
 
 
 def usable(seen: BoolArray) -> tuple[IntArray, IntArray]:

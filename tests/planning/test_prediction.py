@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from sfm.camera import camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, UnknownNameError
 from sfm.geometry.mesh import Mesh
-from sfm.planning.planned_object import PlannedObject, object_of_points, shape_object
+from sfm.planning.planned_object import PlannedObject, farthest_points, object_of_points, shape_object
 from sfm.planning.prediction import Prediction, ScaleBarPlan, largest_length_sigma, predict_network, usable
 from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import ARRANGEMENTS, Stations, around, arrangement, looking
@@ -197,6 +198,37 @@ def test_what_cannot_be_an_arrangement_is_refused() -> None:
     ):
         with pytest.raises(GeometryError, match=message):
             arrangement(text, planned, CAMERA)
+
+
+def test_stations_all_at_one_place_are_refused() -> None:
+    plate = shape_object("plate", (1000, 600), 40)
+    ring = arrangement("ring:4", plate, CAMERA)
+    one = looking(np.array([0.0, 0.0, -1.0]))
+    same = Stations(ring.names, np.tile([0.0, 0.0, 3000.0], (4, 1)), np.stack([one] * 4))
+    for free in (CAMERA, replace(CAMERA, free=np.zeros_like(CAMERA.free))):
+        with pytest.raises(GeometryError, match="different places, there are 1"):
+            predict_network(plate, free, same, SEEING)
+
+
+@pytest.mark.parametrize("size", [1e300, 1e150, 1e13])
+def test_objects_too_large_for_numbers_are_refused(size: float) -> None:
+    with pytest.raises(GeometryError, match="needed at most"):
+        shape_object("box", (size, 1.0, 1.0), 10)
+    with pytest.raises(GeometryError, match="needed at most"):
+        object_of_points(("1", "2", "3"), size * np.eye(3), None)
+    assert np.isfinite(shape_object("box", (1e12, 1e12, 1e12), 10).xyz).all()
+
+
+def test_points_are_spread_in_nearly_linear_time() -> None:
+    xyz = seed_of("spread").random((30_000, 3)) * [1.0, 1.0, 0.0]
+    begun = time.process_time()
+    kept = farthest_points(xyz, 1500)
+    assert time.process_time() - begun < 1.5  # every distance anew took 4 s and more
+    nearest = ((xyz - xyz[kept[0]]) ** 2).sum(axis=1)
+    for j in kept[1:60]:
+        assert nearest[j] == nearest.max()
+        nearest = np.minimum(nearest, ((xyz - xyz[j]) ** 2).sum(axis=1))
+    assert len(set(farthest_points(np.zeros((5, 3)), 5))) == 5
 
 
 def test_calibration_needs_convergence_and_rolled_photographs() -> None:
