@@ -23,6 +23,7 @@ from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_f
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import refuse_full
 from sfm.network import Estimate, ImagePoints, Network
@@ -133,6 +134,7 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
     pycolmap = load_pycolmap()
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
+    refuse_links_out(folder)
     if text and not (folder / "cameras.txt").is_file():
         raise SurveyFileError(f"{folder}: no COLMAP model of text files (cameras.txt), only binary ones")
     if text is False and not (folder / "cameras.bin").is_file():

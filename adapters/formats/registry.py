@@ -43,7 +43,7 @@ from sfm.camera import Camera
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.files.open_folders import refuse_links
+from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.stored_result import StoredResult
@@ -268,6 +268,7 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
     if control is not None and not form.control:
         raise SurveyFileError(f"{path}: format {form.name} takes no file of control, photomodeler does")
+    refuse_links_out(path)
     if form.read_all is not None:
         return form.read_all(path, control=control) if form.control else form.read_all(path)
     assert form.read is not None

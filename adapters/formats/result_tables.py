@@ -39,6 +39,7 @@ from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.json_files import Content as Json
 from sfm.files.json_files import Name, Pixel, Side, Text, read_json
+from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.stored_result import StoredResult
@@ -58,6 +59,8 @@ def read_result(folder: Path) -> StoredResult:
     Raises:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
+    for place in (folder, (folder / COLMAP_SIDE_FILE).parent):
+        refuse_links_out(place)
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sfm.errors import OutputError
+from sfm.errors import OutputError, SurveyFileError
 
 HAS_HANDLES = {os.open, os.mkdir, os.rename, os.stat} <= os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")
 # Linux opens folders that one may pass but not list by O_PATH.
@@ -153,3 +153,18 @@ def refuse_links(path: Path) -> None:
                 f"{path}: '{part.name}' is a link to '{leads}', and nothing is written through links; "
                 "name the folder itself"
             )
+
+
+def refuse_links_out(folder: Path) -> None:
+    """Raise SurveyFileError if something in a folder of somebody else is a link that leaves the folder.
+
+    A folder that is not there is for its reader to refuse.
+    """
+    try:
+        there = os.scandir(folder) if folder.is_dir() else ()
+        links = [Path(entry.path) for entry in there if entry.is_symlink()]
+        leaving = [link for link in links if not link.resolve().is_relative_to(folder.resolve())]
+    except (OSError, RuntimeError) as error:  # a circle of links
+        raise SurveyFileError(f"{folder}: the folder cannot be read ({error.__class__.__name__})") from error
+    for link in sorted(leaving):
+        raise SurveyFileError(f"{link}: a link that leaves its folder; the file itself is needed there")

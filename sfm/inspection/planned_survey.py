@@ -16,6 +16,7 @@ from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, Name, Text, read_json
+from sfm.files.open_folders import refuse_links_out
 from sfm.planning.stations import Stations
 from sfm.rendering.planned_targets import INK, PAPER, write_planned_photographs
 from sfm.rendering.scene import UNCODED, Optics
@@ -94,6 +95,7 @@ def read_plan(folder: Path) -> PlannedSurvey:
     Raises:
         SurveyFileError: what is missing or wrong, with file and line.
     """
+    refuse_links_out(folder)
     plan = read_json(folder / "plan.json", _Plan, "a plan")
     if plan.scale_bars:
         raise SurveyFileError(

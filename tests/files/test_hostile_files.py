@@ -17,17 +17,20 @@ from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.ply import read_ply
-from adapters.formats.registry import read_any
+from adapters.formats.registry import read_any, read_comparable
+from adapters.formats.result_tables import read_result, write_tables
 from sfm.batch.run import find_surveys
 from sfm.errors import KolinearError, SurveyFileError
 from sfm.files import globs
 from sfm.files.csv_tables import read_header, read_table
+from sfm.inspection.planned_survey import read_plan
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refining.refinement import refine_model
+from tests.inspection.benches import one_bench
 from tests.synthetic import make_network, seed_of
 
 SECONDS = 8.0
@@ -416,3 +419,33 @@ def test_what_is_refused_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(KolinearError) as refused:
         find_photographs(read_survey(tmp_path / "survey.toml"))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["points.csv", "covariance.npz", "colmap"])
+def test_a_result_with_a_link_that_leaves_it_is_not_read(name: str, tmp_path: Path) -> None:
+    result, other = tmp_path / "result", tmp_path / "other"
+    write_tables(result, one_bench())
+    (result / name).unlink(missing_ok=True)
+    other.mkdir()
+    (other / "points.csv").write_text("id,X,Y,Z\n1,0,0,0\n", encoding="utf-8")
+    (result / name).symlink_to(other / "points.csv" if "." in name else other)
+    for read in (read_result, read_any, read_comparable):
+        with pytest.raises(SurveyFileError, match="link that leaves its folder"):
+            read(result)
+    (result / name).unlink()
+    (result / "again.csv").symlink_to(result / "images.csv")  # which stays inside
+    if name != "points.csv":
+        assert len(read_result(result).points) > 0
+
+
+def test_a_model_or_plan_with_a_link_that_leaves_it_is_not_read(tmp_path: Path) -> None:
+    network, estimate = make_network(seed_of("links"), images=3, points=8, model="opencv")
+    write_model(tmp_path / "model", network, estimate)
+    (tmp_path / "model" / "cameras.bin").rename(tmp_path / "cameras.bin")
+    (tmp_path / "model" / "cameras.bin").symlink_to(tmp_path / "cameras.bin")
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "plan.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "plan" / "plan.json").symlink_to(tmp_path / "plan.json")
+    for read, place in ((read_model, "model"), (read_plan, "plan")):
+        with pytest.raises(SurveyFileError, match="link that leaves its folder"):
+            read(tmp_path / place)
