@@ -18,7 +18,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass
 from itertools import count
 from multiprocessing import resource_tracker
-from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
@@ -40,6 +39,7 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
+from sfm.files.scratch import scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
 from sfm.runtime.folder_settings import closed_current_folder
 
@@ -110,7 +110,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that starts again for long given up
     }
     with dask.config.set(settings), closed_current_folder(), ExitStack() as stack:
-        scratch = stack.enter_context(TemporaryDirectory(prefix="kolinear-", ignore_cleanup_errors=True))
+        scratch = stack.enter_context(scratch_folder())
         with _interrupt_held_back():  # a Ctrl-C meanwhile comes when all of this is up, and can be ended
             try:
                 cluster = LocalCluster(
@@ -123,7 +123,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
                     scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL,
                     security=Security.temporary(),
-                    local_directory=scratch,
+                    local_directory=str(scratch),
                 )
             except (ImportError, OSError, RuntimeError, TimeoutError) as error:
                 raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error

@@ -8,8 +8,6 @@ Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; th
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import read_model
 from sfm.camera import project
 from sfm.errors import BackendError, one_line
+from sfm.files.scratch import scratch_folder
 from sfm.network import Estimate, Network, rows_of
 
 MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does
@@ -53,9 +52,8 @@ def map_photographs(
     """
     pycolmap = load_pycolmap()
     begun = time.perf_counter()
-    work = Path(tempfile.mkdtemp(prefix="kolinear-mapper-"))
     try:
-        with quiet(pycolmap):
+        with scratch_folder() as work, quiet(pycolmap):
             pycolmap.set_random_seed(RANDOM_SEED)
             database = work / "scene.db"
             extraction = pycolmap.FeatureExtractionOptions()
@@ -81,11 +79,9 @@ def map_photographs(
             best = max(found.values(), key=lambda scene: scene.num_reg_images())
             (work / "best").mkdir()
             best.write_binary(str(work / "best"))
-        network, estimate = read_model(work / "best")
+            network, estimate = read_model(work / "best")
     except (RuntimeError, ValueError, OSError) as error:
         raise BackendError(f"COLMAP's mapper failed: {one_line(error)}") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return MapperBaseline(
         network,
         estimate,

@@ -6,13 +6,11 @@ with the make, the model and a known focal length.
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
+from sfm.files.scratch import scratch_folder
 
 SIDE_PX = (1000, 750)
 FOCAL_MM = 10
@@ -32,8 +30,8 @@ def sensor_width_mm(make: str, model: str) -> float | None:
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: IFDRational(FOCAL_MM, 1)}
-    with tempfile.TemporaryDirectory(prefix="kolinear-") as folder:
-        path = Path(folder) / "camera.jpg"
+    with scratch_folder() as folder:
+        path = folder / "camera.jpg"
         Image.new("L", SIDE_PX).save(path, exif=exif)
         with quiet(pycolmap):
             camera = pycolmap.infer_camera_from_image(str(path))

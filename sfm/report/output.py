@@ -11,10 +11,11 @@ from pathlib import Path
 from sfm.files.covariance_file import write_covariance
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
 from sfm.files.whole_files import whole_folder
+from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.figures.plotted import plot_data
-from sfm.report.findings.findings import Findings
+from sfm.report.findings.findings import Findings, with_remark
 from sfm.report.html.report_page import report_page
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.protocol_files import write_protocol
@@ -109,6 +110,11 @@ def write_result(
         pictures = cut_pictures(
             scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
         )
+        drawn = {overlay.image for overlay in overlays}
+        lost = [one.image for one in result.photographs if one.image not in drawn]
+        if lost:
+            findings = with_remark(findings, remark("photographs_not_drawn", photographs=lost))
+            result = findings.result
         write_tables(findings, folder)
         write_protocol(findings, folder)
         if overlays:

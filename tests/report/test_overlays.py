@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 
+from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
+from sfm.report.findings.findings import findings_of
+from sfm.report.output import write_result
+from sfm.survey.inputs.survey import read_survey
 from sfm.targets.flags import Flag
+from tests.surveys import write_photograph_survey
 
 
 def test_crosses_are_those_drawn_one_by_one() -> None:
@@ -36,3 +44,15 @@ def test_no_candidates_draw_nothing() -> None:
     _crosses(picture, np.zeros((0, 2)), np.zeros(0, np.int64), 1.0)
     _crosses(picture, np.array([[-500.0, 9e9]]), np.array([Flag.LOBED.value]), 1.0)
     assert (picture == 90).all()
+
+
+def test_photographs_that_vanish_during_a_run_are_named(tmp_path: Path) -> None:
+    folder = write_photograph_survey(tmp_path / "s", "vanished").parent
+    result = run_survey(read_survey(folder / "survey.toml"))
+    (folder / "photo 2.png").unlink()
+    write_result(findings_of(result), tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    (said,) = [one for one in summary["verdict"]["remarks"] if one["kind"] == "photographs_not_drawn"]
+    assert said["severity"] == "note" and "photo 2.png" in said["text"] and "photo 1.png" not in said["text"]
+    assert said["text"] in " ".join((tmp_path / "out" / "report.txt").read_text(encoding="utf-8").split())
+    assert len(list((tmp_path / "out" / "overlays").iterdir())) == len(result.photographs) - 1

@@ -127,6 +127,14 @@ ROWS = (
         "Copy it anew, or convert it to JPEG or TIFF.",
     ),
     Kind(
+        "photographs_not_drawn",
+        "note",
+        "{photographs} {photographs:has|have} no overlay: the file could not be read again when the report "
+        "was written.",
+        "the photograph was moved, removed or changed during the run",
+        "Put it back and run the survey again.",
+    ),
+    Kind(
         "photograph_of_other_size",
         "warning",
         "It has {size}, the others of camera {camera} have {usual} ({what}); {needed} such photographs would "

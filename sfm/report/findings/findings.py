@@ -6,9 +6,10 @@ Whatever prints a result takes its numbers from here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
+from sfm.remarks.remark import Remark
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.camera_remarks import camera_remarks
@@ -71,6 +72,13 @@ class Findings:
     object_size: float  # diagonal of the box around the points, object unit
     consistency: Consistency  # tests of points and photographs
     protocol: Protocol  # entries of a bundle protocol
+
+
+def with_remark(findings: Findings, new: Remark) -> Findings:
+    """Return findings with one remark more, and the verdict that follows."""
+    result = findings.result
+    verdict = judge((*findings.verdict.remarks, new), headlines_of(result))
+    return replace(findings, result=replace(result, remarks=(*result.remarks, new)), verdict=verdict)
 
 
 def findings_of(result: SurveyResult) -> Findings:
