@@ -10,6 +10,7 @@ import gc
 import math
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 
 import numpy as np
@@ -20,6 +21,7 @@ from sfm.camera import camera_from_values, project
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.common_problem import common_problem
 from sfm.conventions import AnyArray, rotation_from_angles
+from sfm.errors import KolinearError
 from sfm.geometry.mesh import Mesh
 from sfm.kernels.sampling import resample
 from sfm.kernels.warmed import set_warm
@@ -142,6 +144,9 @@ def main(progress: Progress = SILENT) -> None:
 
     Args:
         progress: told of every part that is done.
+
+    Raises:
+        KolinearError: a process was ended from outside.
     """
     progress.stage("compiling", len(PARTS))
     with (
@@ -149,7 +154,13 @@ def main(progress: Progress = SILENT) -> None:
         ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool,
     ):
         for done in as_completed([pool.submit(_compile, part) for part in PARTS]):
-            done.result()
+            try:
+                done.result()
+            except BrokenProcessPool as error:
+                raise KolinearError(
+                    "a process that compiles kernels was ended, as where memory is limited (ulimit -v); "
+                    "needed more memory until `python -m sfm.warm_up` has run"
+                ) from error
             progress.advance()
     set_warm()
 

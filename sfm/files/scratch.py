@@ -21,7 +21,7 @@ LOCK = ".lock"
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make an empty folder of this user alone, which is gone afterwards; of a killed run, when the next begins.
+    """Make an empty folder of this user alone, which is gone afterwards; after a kill, when the next begins.
 
     Yields:
         Path of the folder.

@@ -20,6 +20,8 @@ from sfm.errors import KolinearError, one_line
 BAD_INPUT = 2  # exit code where a person must put something right
 FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h
 OPENCV_NO_MEMORY = -4  # cv::Error::StsNoMem
+# The C library on a shared library that finds no room (dlopen), and Python on a thread without a stack.
+NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
 MAX_LETTERS = 200  # of an error's own message
 
 
@@ -78,5 +80,11 @@ def keep_traceback(error: Exception) -> Path | None:
     return Path(name)
 
 
-def _is_out_of_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY
+def _is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error says so, or one that it was raised in the handling of."""
+    while error is not None:
+        said = isinstance(error, ImportError | RuntimeError) and any(one in str(error) for one in NO_MEMORY)
+        if said or isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
+            return True
+        error = error.__cause__ or error.__context__
+    return False

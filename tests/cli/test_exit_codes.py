@@ -18,7 +18,7 @@ from sfm.cli.app import app
 from sfm.cli.commands import starting
 from sfm.errors import KolinearError
 from sfm.report.log import read_log
-from sfm.runtime.faults import told_of_error, working_on
+from sfm.runtime.faults import is_fault, told_of_error, working_on
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -149,6 +149,32 @@ def test_memory_that_opencv_does_not_get_is_no_fault() -> None:
     with pytest.raises(cv2.error) as caught, working_on("photograph a"):
         raise refused
     assert told_of_error(caught.value).startswith("not enough memory for photograph a (OpenCV")
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        ImportError("libavcodec.so: failed to map segment from shared object"),
+        ImportError("libopenblas.so: cannot allocate memory in static TLS block"),
+        RuntimeError("can't start new thread"),
+    ],
+)
+def test_libraries_and_threads_without_memory_are_no_fault(refused: Exception) -> None:
+    assert told_of_error(refused) == f"not enough memory ({refused})" and not is_fault(refused)
+    with pytest.raises(RuntimeError) as caught:
+        try:
+            raise refused
+        finally:
+            raise RuntimeError("cannot join thread before it is started")
+    assert not is_fault(caught.value)
+    assert is_fault(ImportError("no module named x")) and is_fault(RuntimeError("x"))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of address space")
+def test_a_limit_of_memory_ends_in_one_line() -> None:
+    limited = f"ulimit -v 600000; exec {sys.executable} -m sfm.cli adjust nowhere.toml"
+    done = subprocess.run(["sh", "-c", limited], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith("kolinear: not enough memory")
 
 
 def test_errors_of_kolinear_are_told_as_they_are() -> None:
