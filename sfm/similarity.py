@@ -13,6 +13,7 @@ from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
 from sfm.network import Estimate
 
+THIN = 0.05  # extent over the longest one below which points have no depth
 COLLINEAR = 1e-9  # second singular value over the first below which points lie on a line
 
 
@@ -133,3 +134,11 @@ def without_motions(xyz: FloatArray, away: FloatArray) -> FloatArray:
 def mean_distance(xyz: FloatArray) -> float:
     """Return the root mean square distance of points (n, 3) from their centroid."""
     return float(np.sqrt(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the axes along which an object extends (k, 3), and its coordinates along them (n, k)."""
+    centred = xyz - xyz.mean(axis=0)
+    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
+    axes = axes[THIN * extent[0] < extent]
+    return axes, centred @ axes.T

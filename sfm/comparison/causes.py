@@ -31,7 +31,6 @@ from sfm.comparison.congruency import (
     MOTIONS,
     STABLE_FRACTION,
     bending,
-    extended_axes,
     motions,
     strain,
 )
@@ -47,7 +46,7 @@ from sfm.comparison.stable_points import (
 )
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, mean_distance
+from sfm.similarity import Similarity, extended_axes, mean_distance
 from sfm.units import SWELLING, UnitFactor, find_unit
 
 ALPHA = 0.001  # probability of a cause where there is none, of all rows together

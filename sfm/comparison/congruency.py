@@ -34,13 +34,12 @@ from sfm.comparison.stable_points import (
 )
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.similarity import mean_distance, similarity_motions
+from sfm.similarity import extended_axes, mean_distance, similarity_motions
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
 MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
 STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
 RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
-THIN = 0.05  # extent over the longest one below which an object has no depth to bend along
 
 
 @dataclass(frozen=True)
@@ -189,14 +188,6 @@ def strain(xyz: FloatArray) -> FloatArray:
         xyz: coordinates, (n, 3).
     """
     return _in_every_direction(extended_axes(xyz)[1] / mean_distance(xyz))
-
-
-def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the axes along which an object extends (k, 3), and its coordinates along them (n, k)."""
-    centred = xyz - xyz.mean(axis=0)
-    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
-    axes = axes[THIN * extent[0] < extent]
-    return axes, centred @ axes.T
 
 
 def _in_every_direction(terms: FloatArray) -> FloatArray:

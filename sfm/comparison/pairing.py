@@ -15,12 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.camera import tangents_from_pixel
-from sfm.comparison.congruency import extended_axes
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.files.covariance_file import UNCODED
 from sfm.network import rows_of
-from sfm.similarity import Similarity, fit_similarity
+from sfm.similarity import Similarity, extended_axes, fit_similarity
 from sfm.stored_result import StoredResult
 
 SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it

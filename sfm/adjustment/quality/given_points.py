@@ -27,7 +27,7 @@ from sfm.adjustment.quality.given_values import (
 )
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, fit_similarity, similarity_motions
+from sfm.similarity import Similarity, extended_axes, fit_similarity, similarity_motions
 
 MAX_TRIPLES = (
     300  # similarities by three points that are tried: with half of them right, 37 are by three such
@@ -332,17 +332,22 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
     Nothing shows which axes are right, and whether the scale is.
     """
     fitting: list[tuple[PlacedPoints, Strain]] = []
-    for derivatives in STRAINS:
+    for derivatives in _determined_strains(points.given[points.complete]):
         strain, placing = Strain(derivatives, np.eye(3)), found.placing
+        model: GivenModel | None = None
         for _ in range(MAX_STEPS):
-            placing, model = _converged(replace(points, strain=strain), placing, (), estimated)
+            try:
+                placing, model = _converged(replace(points, strain=strain), placing, (), estimated)
+            except np.linalg.LinAlgError:  # a strain that flattens the points explains nothing
+                model = None
+                break
             size = _centre_and_size(placing.apply(points.free))[1]
             step = parameters_of(model, np.ones(len(model.v), dtype=bool))[7:] @ model.v / size
             F = strain.F + np.einsum("u,uab->ab", step, derivatives)
             if not np.linalg.det(F) > 0 or np.abs(step).max() <= RANK:
                 break
             strain = replace(strain, F=F)
-        if model.fits(level) and model.confirms_rest(()):
+        if model is not None and model.fits(level) and model.confirms_rest(()):
             judgement = judge_values(model, level)
             q, fall = found.judgement.dof - judgement.dof, found.judgement.statistic - judgement.statistic
             cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
@@ -353,6 +358,26 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
     like = [other for one, other in fitting if one.cost < best.cost + MARGIN and len(other.derivatives) == 1]
     axis = "XYZ"[int(strain.derivatives[0].diagonal().argmax())] if like == [strain] else None
     return replace(best, strain=replace(strain, axis=axis, chi2=best.judgement.statistic))
+
+
+def _determined_strains(xyz: FloatArray) -> list[FloatArray]:
+    """Return the strains that show in points: not those along the normal of a plane, or beside a line."""
+    axes = extended_axes(xyz)[0]
+    if len(axes) < 2:  # along a line it is the scale
+        return []
+    onto = axes.T @ axes
+    shown = []
+    for derivatives in STRAINS:
+        inside = onto @ derivatives @ onto
+        if len(inside) > 1:  # beside the scale
+            inside = inside - np.trace(inside, axis1=1, axis2=2)[:, None, None] / len(axes) * onto
+        shares, directions = np.linalg.svd(inside.reshape(len(inside), 9), full_matrices=False)[1:]
+        rank = int((shares > RANK).sum()) if len(axes) < 3 else len(derivatives)
+        if rank == len(derivatives):
+            shown.append(inside)
+        elif rank and len(derivatives) > 1:
+            shown.append(directions[:rank].reshape(rank, 3, 3))
+    return shown
 
 
 def _placed(

@@ -10,11 +10,11 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints, excludes_mirror
 from sfm.adjustment.quality.given_values import LEVEL, GivenModel, GivenTest, Judgement
-from sfm.comparison.congruency import extended_axes
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Network
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
+from sfm.similarity import extended_axes
 
 MIN_IN_SPACE = 4  # points that do not lie in a plane, whose mirror image is another figure
 
