@@ -22,6 +22,7 @@ from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
 from sfm.conventions import BoolArray
+from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import MAX_NAME, is_name, shown
@@ -153,6 +154,26 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
     for number, name in names_with_blanks(folder).items() if text else ():
         scene.image(number).name = name
     return scene
+
+
+def rig_notes(folder: Path, *, text: bool) -> tuple[str, ...]:
+    """Return a line about the rigs of several cameras in a model, none where each photograph is alone.
+
+    `read_model` takes every photograph by itself, where the rig has it, and forgets what held them together.
+
+    Args:
+        folder: of the model.
+        text: whether its text files are read or the binary ones.
+    """
+    scene = read_scene(folder, text=text)
+    sizes = [rig.num_sensors() for rig in scene.rigs.values() if rig.num_sensors() > 1]
+    if not sizes:
+        return ()
+    images = sum(image.frame.rig.num_sensors() > 1 for image in scene.images.values())
+    return (
+        f"{counted(images, 'photograph')} of {counted(len(sizes), 'rig')} of up to {max(sizes)} cameras: "
+        "each is taken by itself where the rig has it, nothing holds them together",
+    )
 
 
 def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:

@@ -40,11 +40,12 @@ from sfm.conventions import (
     pixel_from_image,
     rotation_from_angles,
 )
-from sfm.errors import OutputError
+from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
+OF_SIGMAS = "re"  # ending of their file in the thesis
 PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
 BORDER = 1.1  # sensor over the extent of the image points
 
@@ -140,25 +141,44 @@ def write_bundle_matlab(
 
 
 def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
-    """Read cams.txt, pts.txt, sigmas.txt (if it is there) and interior.txt of a folder.
+    """Read the files of the MATLAB program in a folder; see `matlab_files`.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: what is missing or wrong, with file and line number.
     """
-    text = Lines.of(folder / INTERIOR)
+    cameras, points, sigmas, interior = matlab_files(folder)
+    text = Lines.of(interior)
     c, x0, y0 = (text.number_of(word) for word in text.due_words(3, "c x0 y0 (mm)"))
     if not c > 0:
         raise text.error(f"c is {c:g} mm, it must be positive")
     text.end()
-    sigmas = folder / "sigmas.txt"
-    return read_bundle_matlab(
-        folder / "cams.txt",
-        folder / "pts.txt",
-        sigmas if sigmas.is_file() else None,
-        c_mm=c,
-        x0_mm=x0,
-        y0_mm=y0,
-    )
+    return read_bundle_matlab(cameras, points, sigmas, c_mm=c, x0_mm=x0, y0_mm=y0)
+
+
+def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
+    """Return the files of cameras, points, standard deviations (None without) and interior orientation.
+
+    They are cams.txt, pts.txt, sigmas.txt and interior.txt, or the first three have the names of the thesis,
+    by the numbers of photographs and points: utara1_2.txt, utara1_8.txt and utara1_8re.txt.
+
+    Raises:
+        SurveyFileError: one is missing.
+    """
+    cameras, points, sigmas = (folder / name for name in ("cams.txt", "pts.txt", "sigmas.txt"))
+    found = sorted(folder.glob(f"*_*{OF_SIGMAS}.txt"))
+    if not cameras.is_file() and len(found) == 1:
+        (sigmas,) = found
+        points = sigmas.with_name(f"{sigmas.stem.removesuffix(OF_SIGMAS)}.txt")
+        others = sorted(set(folder.glob(f"{points.stem.rpartition('_')[0]}_*.txt")) - {points, sigmas})
+        cameras = others[0] if len(others) == 1 else cameras
+    due = (cameras, points, folder / INTERIOR)
+    missing = [file.name for file in due if not file.is_file()]
+    if missing:
+        raise SurveyFileError(
+            f"{folder}: {' and '.join(missing)} not there; the MATLAB program has cams.txt, pts.txt, "
+            f"{INTERIOR} (c x0 y0, mm) and may have sigmas.txt, or as in the thesis NAME_2.txt, NAME_8.txt, NAME_8re.txt"
+        )
+    return cameras, points, sigmas if sigmas.is_file() else None, folder / INTERIOR
 
 
 def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimate) -> None:

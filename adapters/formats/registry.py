@@ -16,13 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap.camera_models import read_model, write_model
+from adapters.colmap.camera_models import read_model, rig_notes, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.colmap.names import SIDE_FILE
 from adapters.colmap.reconstruction import COLMAP_NAMES
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
     INTERIOR,
+    OF_SIGMAS,
     read_bundle_csharp,
     read_bundle_matlab_folder,
     write_bundle_csharp,
@@ -69,6 +70,7 @@ class FileFormat:
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
     read_all: Callable[..., Content] | None = None  # of a format that holds more than `read` returns
     write_all: Callable[[Path, Content], None] | None = None  # likewise of `write`
+    notes: Callable[[Path], tuple[str, ...]] | None = None  # on what `read` does not return
     control: bool = False  # whether `read_all` takes a file of control, as keyword
 
     @property
@@ -120,11 +122,13 @@ FORMATS = (
         *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False), _SIDE),
         folder=True,
         placed=True,
+        notes=partial(rig_notes, text=False),
     ),
     FileFormat(
         *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True), _SIDE),
         folder=True,
         placed=True,
+        notes=partial(rig_notes, text=True),
     ),
     FileFormat(
         "colmap-database",
@@ -220,6 +224,8 @@ def format_of(path: Path) -> FileFormat:
         ):
             if (path / file).is_file():
                 return format_named(name)
+        if any(path.glob(f"*_*{OF_SIGMAS}.txt")):
+            return format_named("bundle-matlab")
         if any(path.glob("*cams*.txt")):
             return format_named("sba")
         raise SurveyFileError(
@@ -273,12 +279,14 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         return form.read_all(path, control=control) if form.control else form.read_all(path)
     assert form.read is not None
     network, estimate = form.read(path)
+    notes = () if form.notes is None else form.notes(path)
     points_named = _names_points(form, path)
     if not points_named:
         uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
         network = replace(network, points=uncoded)
     return Content(
-        StoredResult(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1])
+        StoredResult(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1]),
+        notes=notes,
     )
 
 

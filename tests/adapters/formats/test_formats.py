@@ -24,7 +24,15 @@ from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import read_ply, write_ply
 from adapters.formats.registry import FORMATS as FILE_FORMATS
-from adapters.formats.registry import format_named, format_of, read_any, read_comparable, write_any, written
+from adapters.formats.registry import (
+    format_named,
+    format_of,
+    read_any,
+    read_comparable,
+    read_content,
+    write_any,
+    written,
+)
 from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
 from sfm.cli.commands.solvers import convert
@@ -628,3 +636,64 @@ def test_convert_tells_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture
     assert told[1] == f"{tmp_path / 'out'}: 6 photographs, 20 points, 120 image points as sba"
     assert told[2].startswith(f"camera {name}: brown to brown_forward_affine, misfit 0.0")
     assert told[4:] == [f"{tmp_path / 'x.ply'}: 20 points as ply"]
+
+
+def test_matlab_files_have_the_names_of_the_thesis_or_are_named(tmp_path: Path) -> None:
+    network, truth = network_in("brown", values=(("x0", 0.03), ("y0", -0.02)))
+    write_any(tmp_path / "m", "bundle-matlab", spaceless(network), truth)
+    ours = read_any(tmp_path / "m")
+    for name, other in (("cams", "utara1_6"), ("pts", "utara1_20"), ("sigmas", "utara1_20re")):
+        (tmp_path / "m" / f"{name}.txt").rename(tmp_path / "m" / f"{other}.txt")
+    again, estimate = read_any(tmp_path / "m")
+    np.testing.assert_array_equal(again.image_points.covariance, ours[0].image_points.covariance)
+    np.testing.assert_array_equal(estimate.points, ours[1].points)
+    (tmp_path / "m" / "interior.txt").unlink()
+    assert format_of(tmp_path / "m").name == "bundle-matlab"
+    for _ in range(2):  # without the interior orientation, then without the photographs too
+        with pytest.raises(SurveyFileError) as told:
+            read_any(tmp_path / "m", "bundle-matlab")
+        for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt"):
+            assert name in str(told.value)
+        (tmp_path / "m" / "utara1_6.txt").unlink(missing_ok=True)
+
+
+def test_a_model_with_rigs_says_that_nothing_holds_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    network, truth = make_network(seed_of("rigs"), images=4, points=20, model="opencv", cameras=2)
+    write_any(tmp_path / "plain", "colmap", network, truth)
+    assert read_content(tmp_path / "plain").notes == ()
+    plain = pycolmap.Reconstruction(str(tmp_path / "plain"))
+    scene = pycolmap.Reconstruction()
+    for camera in plain.cameras.values():
+        scene.add_camera(camera)
+    poses = [plain.image(i + 1).cam_from_world() for i in range(4)]
+    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=k) for k in (1, 2)]
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], poses[1] * poses[0].inverse())
+    scene.add_rig(rig)
+    for f in range(2):
+        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
+        for sensor, i in zip(sensors, (2 * f, 2 * f + 1), strict=True):
+            frame.add_data_id(pycolmap.data_t(sensor_id=sensor, id=i + 1))
+        frame.rig_from_world = poses[2 * f]
+        scene.add_frame(frame)
+    for i in range(4):
+        image = plain.image(i + 1)
+        points = [(p.x(), p.y()) for p in image.points2D]
+        one = pycolmap.Image(
+            name=image.name, keypoints=np.array(points), camera_id=image.camera_id, image_id=i + 1
+        )
+        one.frame_id = i // 2 + 1
+        scene.add_image(one)
+    for number in (1, 2):
+        scene.register_frame(number)
+    (tmp_path / "rigs").mkdir()
+    scene.write(str(tmp_path / "rigs"))
+    content = read_content(tmp_path / "rigs")
+    (note,) = content.notes
+    assert [int(word) for word in note.split() if word.isdecimal()] == [4, 1, 2]
+    expected = -poses[1].rotation.matrix().T @ poses[1].translation
+    np.testing.assert_allclose(content.result.estimate.position[1], expected)
