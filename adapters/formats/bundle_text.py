@@ -176,7 +176,8 @@ def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
     if missing:
         raise SurveyFileError(
             f"{folder}: {' and '.join(missing)} not there; the MATLAB program has cams.txt, pts.txt, "
-            f"{INTERIOR} (c x0 y0, mm) and may have sigmas.txt, or as in the thesis NAME_2.txt, NAME_8.txt, NAME_8re.txt"
+            f"{INTERIOR} (c x0 y0, mm), maybe sigmas.txt; or as in the thesis NAME_2.txt, NAME_8.txt and "
+            "NAME_8re.txt"
         )
     return cameras, points, sigmas if sigmas.is_file() else None, folder / INTERIOR
 

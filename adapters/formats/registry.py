@@ -31,6 +31,7 @@ from adapters.formats.bundle_text import (
 )
 from adapters.formats.content import ALL, Content, losses, placed
 from adapters.formats.metashape import read_metashape, write_metashape
+from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
 from adapters.formats.photomodeler import read_export, write_export
 from adapters.formats.ply import write_ply
@@ -65,6 +66,7 @@ class FileFormat:
     folder: bool = False  # whether it is a folder of files
     placed: bool = False  # whether it leaves out what has no coordinates in the object
     lacks: tuple[str, ...] = ()  # parameters of these models that it cannot hold, others can stand in
+    frees: tuple[str, ...] = ()  # parameters that are free when it is read, where it does not say which are
     straight: tuple[str, ...] = ()  # parameters that it cannot hold and nothing can stand in
     one_focal: bool = False  # whether fx and fy must be the same
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
@@ -73,10 +75,20 @@ class FileFormat:
     notes: Callable[[Path], tuple[str, ...]] | None = None  # on what `read` does not return
     control: bool = False  # whether `read_all` takes a file of control, as keyword
 
+    def held(self, content: Content) -> frozenset[str]:
+        """Return the kinds that are the same when a survey is read again."""
+        cameras = content.result.estimate.cameras
+        frees = all(set(_free(one)) in (set(), set(one.names) & set(self.frees)) for one in cameras)
+        return self.holds | {"free"} if frees else self.holds
+
     @property
     def readable(self) -> bool:
         """Whether it holds photographs, and can be read."""
         return self.read is not None or self.read_all is not None
+
+
+def _free(camera: Camera) -> tuple[str, ...]:
+    return tuple(name for name, free in zip(camera.names, camera.free, strict=True) if free)
 
 
 def _read_database(path: Path) -> tuple[Network, Estimate]:
@@ -155,12 +167,14 @@ FORMATS = (
         *("photomodeler", PHOTOMODELER_MODELS, None, None),
         _NAMED | {"control", "point sigmas", "position sigmas", "image sigmas"},
         lacks=("b1", "b2"),
+        frees=PHOTOMODELER_FREE,
         read_all=read_export,
         write_all=write_export,
         control=True,
     ),
     FileFormat(
         *("bal", ("opencv", "radial"), read_bal, write_bal, _SOLVED),
+        frees=("f", "fx", "fy", "k1", "k2"),
         straight=("p1", "p2"),
         one_focal=True,
         names=NUMBERS,
@@ -363,7 +377,8 @@ def told_losses(name: str, content: Content, gone: frozenset[str] = frozenset())
         content: of the survey.
         gone: kinds that went since they are of cameras that were converted.
     """
-    return tuple(f"{count} {kind.words}" for kind, count in losses(content, format_named(name).holds - gone))
+    form = format_named(name)
+    return tuple(f"{count} {kind.words}" for kind, count in losses(content, form.held(content) - gone))
 
 
 def refuse_taken(path: Path, form: FileFormat) -> None:
