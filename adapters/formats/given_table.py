@@ -108,7 +108,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
 
 
 def write_given(path: Path, network: Network, estimate: Estimate) -> None:
-    """Write what a network was given with a standard deviation, without its residuals."""
+    """Write what a network was given with a standard deviation, without its residuals; no file of nothing."""
     rows: list[tuple[object, ...]] = []
 
     def add(kind: str, name: str, coordinate: str, given: float, sigma: float) -> None:
@@ -137,7 +137,8 @@ def write_given(path: Path, network: Network, estimate: Estimate) -> None:
         for k, (value, sigma) in enumerate(zip(values, sigmas, strict=True)):
             kind = "projection centre" if k < 3 else "rotation"
             add(kind, network.images[i], ORIENTATION[k], value, sigma)
-    path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
+    if rows:
+        path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:
