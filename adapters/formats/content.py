@@ -161,6 +161,12 @@ def _names(names: tuple[str, ...], identify: bool) -> FloatArray:
     return np.array([crc32(name.encode()) for name in kept], dtype=float)[:, None]
 
 
+def _uncoded(content: Content) -> FloatArray:
+    result = content.result
+    rows = [j for j, name in enumerate(result.network.points) if UNCODED.fullmatch(name)]
+    return np.array(rows if result.points_named else [], dtype=float)[:, None]
+
+
 def _word(word: str) -> FloatArray:
     return _names((word,) if word and word != NO_SCALE else (), True)
 
@@ -221,6 +227,7 @@ KINDS = (
     Kind("datum", "kind of datum", lambda content: _word(content.result.datum)),
     Kind("unit", "unit of lengths", lambda content: _word(content.result.unit)),
     Kind("point names", "names of points", lambda c: _names(c.result.network.points, c.result.points_named)),
+    Kind("uncoded", "marks of points as uncoded, which get numbers,", _uncoded),
     Kind(
         *("image names", "names of photographs"),
         lambda content: _names(content.result.network.images, content.result.images_named),

@@ -42,6 +42,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.covariance_file import UNCODED
 from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
@@ -260,8 +261,8 @@ def write_export(path: Path, content: Content) -> None:
     """Write a survey as a PhotoModeler text export, with the digits of double precision.
 
     It is one of a calibration project where a parameter of a camera is free. PhotoModeler numbers its points:
-    names that are whole numbers are kept, any other is refused. Photographs without orientation are refused,
-    points without coordinates have image points only.
+    names that are whole numbers are kept, uncoded points get others, any other name is refused. Photographs
+    without orientation are refused, points without coordinates have image points only.
 
     Raises:
         OutputError: what the export cannot hold, or the file cannot be written.
@@ -280,9 +281,7 @@ def write_export(path: Path, content: Content) -> None:
     if not estimate.oriented.all():
         i = int(np.argmin(estimate.oriented))
         raise OutputError(f"photograph {network.images[i]} has no orientation, the export wants one")
-    for name in network.points:
-        if not name.isdecimal() or str(int(name)) != name:
-            raise OutputError(f"point '{name}': PhotoModeler numbers its points")
+    names = _numbered(network.points)
     if any(camera.free.any() for camera in estimate.cameras):
         title = f"{title} {CALIBRATION.title()}"
     width, height = sizes.pop()
@@ -304,20 +303,30 @@ def write_export(path: Path, content: Content) -> None:
     lines.append("")
     control = network.control.complete
     for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
-        lines.append(f"{network.points[j]} {_text(*xyz, *np.sqrt(np.diagonal(C)))}")
+        lines.append(f"{names[j]} {_text(*xyz, *np.sqrt(np.diagonal(C)))}")
     lines.append("")
     lines += [
-        f"{network.points[j]} {_text(*estimate.points[j], *point_sigma[j])}"
+        f"{names[j]} {_text(*estimate.points[j], *point_sigma[j])}"
         for j in np.flatnonzero(estimate.determined)
     ]
     lines.append("")
     seen = network.image_points
     sigma = np.nan_to_num(seen.stated_sigma)
     lines += [
-        f"{i} {network.points[j]} {_text(*(xy + HALF_PIXEL), *s)}"
+        f"{i} {names[j]} {_text(*(xy + HALF_PIXEL), *s)}"
         for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
     ]
     write_lines(path, [*lines, "", ""])
+
+
+def _numbered(points: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the numbers that are names of points, and numbers above them of uncoded points."""
+    for name in points:
+        if not UNCODED.fullmatch(name) and (not name.isdecimal() or str(int(name)) != name):
+            raise OutputError(f"point '{name}': PhotoModeler numbers its points")
+    first = max((int(name) for name in points if name.isdecimal()), default=0) + 1
+    numbers = iter(range(first, first + len(points)))
+    return tuple(name if name.isdecimal() else str(next(numbers)) for name in points)
 
 
 def _sigma_of(covariance: FloatArray | None, count: int) -> FloatArray:

@@ -126,7 +126,7 @@ _COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_openc
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
 NUMBERS = (False, False)
-_SOLVED = frozenset({"exterior orientations", "object points"})
+_SOLVED = frozenset({"exterior orientations", "object points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
 _SIDE = _NAMED | {"free"}  # beside a model of COLMAP
 FORMATS = (
@@ -147,7 +147,7 @@ FORMATS = (
         _COLMAP,
         _read_database,
         _write_database,
-        frozenset({"image names"}),
+        frozenset({"image names", "uncoded"}),
         names=(False, True),
     ),
     FileFormat(
@@ -165,7 +165,7 @@ FORMATS = (
     ),
     FileFormat(
         *("photomodeler", PHOTOMODELER_MODELS, None, None),
-        _NAMED | {"control", "point sigmas", "position sigmas", "image sigmas"},
+        (_NAMED - {"uncoded"}) | {"control", "point sigmas", "position sigmas", "image sigmas"},
         lacks=("b1", "b2"),
         frees=PHOTOMODELER_FREE,
         read_all=read_export,
@@ -203,7 +203,7 @@ FORMATS = (
         (),
         None,
         None,
-        frozenset({"object points", "point sigmas", "point names"}),
+        frozenset({"object points", "point sigmas", "point names", "uncoded"}),
         placed=True,
         write_all=_write_ply,
     ),

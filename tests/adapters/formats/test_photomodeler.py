@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.formats.photomodeler import read_export, read_photomodeler
+from adapters.formats.content import Content, losses
+from adapters.formats.photomodeler import read_export, read_photomodeler, write_export
+from adapters.formats.registry import format_named
 from sfm.adjustment.solve import adjust
 from sfm.camera import project, tangents_from_pixel
 from sfm.cli.commands.solvers import convert
 from sfm.conventions import angles_from_rotation
-from sfm.errors import SurveyFileError
+from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import read_survey
 from tests.places import SHARED
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -199,6 +202,23 @@ def test_posterior_sigma_of_adjusted_control_is_no_prior(tmp_path: Path) -> None
     convert(write(tmp_path), tmp_path / "out", from_format="photomodeler", control=tmp_path / "control.txt")
     survey = read_survey(tmp_path / "out" / "survey.toml")
     assert survey.control is not None and survey.control.names == ("1", "2")
+
+
+def test_uncoded_points_get_numbers_that_no_other_has(tmp_path: Path) -> None:
+    network, truth = made()
+    names = (*(f"u{j + 1:03d}" for j in range(12)), "3", "7", "200", "1")
+    content = Content(StoredResult("x", replace(network, points=names), truth))
+    write_export(tmp_path / "pm", content)
+    again = read_export(tmp_path / "pm").result.network
+    numbers = np.array([int(name) for name in again.points])
+    assert len(set(numbers)) == 16 and numbers[:12].min() == 201 and numbers[12:].tolist() == [3, 7, 200, 1]
+    named = {kind.name: count for kind, count in losses(content, format_named("photomodeler").held(content))}
+    assert named["uncoded"] == 12
+    lost = replace(
+        content, result=replace(content.result, network=replace(network, points=("A", *names[1:])))
+    )
+    with pytest.raises(OutputError):
+        write_export(tmp_path / "no", lost)
 
 
 def test_pixels_that_are_not_square_become_an_affinity(tmp_path: Path) -> None:
