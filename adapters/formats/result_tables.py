@@ -282,7 +282,7 @@ def read_content(folder: Path) -> Content:
     interior = [
         (k, camera.names.index(parameter), value, sigma)
         for owner, parameter, value, sigma in given.interior
-        for k, camera in [_first_of(cameras, owner, parameter)]
+        for k, camera in [_first_of(folder, cameras, owner, parameter)]
     ]
     rows = np.array(interior, dtype=float).reshape(-1, 4)
     network = replace(
@@ -307,7 +307,7 @@ def read_content(folder: Path) -> Content:
     )
 
 
-def _first_of(cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[int, Camera]:
+def _first_of(folder: Path, cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[int, Camera]:
     """Return the first camera that a parameter belongs to.
 
     Raises:
@@ -316,7 +316,7 @@ def _first_of(cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[
     for k, camera in enumerate(cameras):
         if parameter in camera.names and camera.owner_of(camera.names.index(parameter)) == owner:
             return k, camera
-    raise SurveyFileError(f"given.csv: {parameter} of camera '{owner}', which is not in cameras.csv")
+    raise SurveyFileError(f"{folder}/given.csv: {parameter} of camera '{owner}', which is not in cameras.csv")
 
 
 def _with_shared(result: StoredResult) -> tuple[Camera, ...]:

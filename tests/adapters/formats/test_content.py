@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from adapters.formats.registry import FORMATS, format_named, read_content, write
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.solvers import convert
+from sfm.errors import SurveyFileError
 from sfm.network import (
     ExteriorObservations,
     ImagePoints,
@@ -269,3 +271,23 @@ def test_what_is_lost_is_what_is_named(form: str, tmp_path: Path) -> None:
             elif kind.name != "free" or len(before):
                 assert before.shape == after.shape, (kind.name, trial)
                 np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12, err_msg=kind.name)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(path.read_bytes()[:50]),
+        lambda path: path.write_text("no arrays"),
+        lambda path: np.savez(path, image_names=np.array(["other"]), exterior=np.zeros((1, 6, 6))),
+        lambda path: np.savez(path, exterior=np.array([{"a": 1}], dtype=object)),
+    ],
+)
+def test_damaged_covariances_are_refused(damage: Callable[[Path], None], tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("damaged"), images=IMAGES, points=POINTS)
+    C = covariances(seed_of("damaged C"), IMAGES, 6)
+    write_content(tmp_path / "t", "tables", Content(StoredResult("x", network, truth), exterior_covariance=C))
+    again = read_content(tmp_path / "t")
+    np.testing.assert_array_equal(again.exterior_covariance, C)
+    damage(tmp_path / "t" / "covariances.npz")
+    with pytest.raises(SurveyFileError, match=r"covariances\.npz"):
+        read_content(tmp_path / "t")
