@@ -42,13 +42,13 @@ from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
+from sfm.network_check import CORRELATION_LIMIT
 from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
 SIGMAS_PX = ("sx_px", "sy_px")
 COVARIANCE_PX = "cxy_px2"
-CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
@@ -59,8 +59,7 @@ def read_result(folder: Path) -> StoredResult:
     Raises:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
-    for place in (folder, (folder / COLMAP_SIDE_FILE).parent):
-        refuse_links_out(place)
+    refuse_links_out(folder, COLMAP_SIDE_FILE)
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}

@@ -155,16 +155,21 @@ def refuse_links(path: Path) -> None:
             )
 
 
-def refuse_links_out(folder: Path) -> None:
-    """Raise SurveyFileError if something in a folder of somebody else is a link that leaves the folder.
+def refuse_links_out(folder: Path, *below: str) -> None:
+    """Raise SurveyFileError if a file in a folder of somebody else is a link that leaves the folder.
 
     A folder that is not there is for its reader to refuse.
+
+    Args:
+        folder: the folder.
+        below: files in folders of it that are read, too.
     """
     try:
         there = os.scandir(folder) if folder.is_dir() else ()
-        links = [Path(entry.path) for entry in there if entry.is_symlink()]
-        leaving = [link for link in links if not link.resolve().is_relative_to(folder.resolve())]
+        links = [Path(entry.path) for entry in there if entry.is_symlink() and not entry.is_dir()]
+        read = (*links, *(folder / name for name in below))
+        leaving = [path for path in read if not path.resolve().is_relative_to(folder.resolve())]
     except (OSError, RuntimeError) as error:  # a circle of links
         raise SurveyFileError(f"{folder}: the folder cannot be read ({error.__class__.__name__})") from error
-    for link in sorted(leaving):
-        raise SurveyFileError(f"{link}: a link that leaves its folder; the file itself is needed there")
+    for path in sorted(leaving):
+        raise SurveyFileError(f"{path}: a link that leaves its folder; the file itself is needed there")
