@@ -212,11 +212,12 @@ class Network:
         Args:
             names: of points of the network, c of them.
             xyz: their coordinates, object unit, (c, 3).
-            sigma: standard deviations, 0 = fixed, object unit, (c, 3) or what can be broadcast to it.
+            sigma: standard deviations, 0 = fixed, infinite = not known, object unit, (c, 3) or what can be
+                broadcast to it.
 
         Raises:
             UnknownNameError: a point is not in the network.
-            GeometryError: arrays of another shape.
+            GeometryError: arrays of another shape, a negative sigma, or what is no number.
         """
         index = np.array([self.point_index(name) for name in names], dtype=np.int64)
         known, s = np.asarray(xyz, dtype=float), np.asarray(sigma, dtype=float)
@@ -226,7 +227,16 @@ class Network:
                 f"({len(index)}, 3) and the same or one number"
             )
         s = np.broadcast_to(s, known.shape)
-        return replace(self, control=ObjectPoints(index, known, np.eye(3) * s[:, None, :] ** 2))
+        if not (s >= 0).all():
+            raise GeometryError(f"control: sigma {s[~(s >= 0)][0]:g}, expected 0 (fixed) or more")
+        for name, bad in zip(names, (np.isfinite(s) & ~np.isfinite(known)).any(axis=1).tolist(), strict=True):
+            if bad:
+                raise GeometryError(
+                    f"control point {name}: expected finite coordinates where sigma is finite"
+                )
+        covariance = np.zeros((len(index), 3, 3))
+        covariance[:, range(3), range(3)] = s**2
+        return replace(self, control=ObjectPoints(index, np.where(np.isfinite(s), known, 0.0), covariance))
 
     def with_scale_bar(self, start: str, end: str, length: float, sigma: float) -> Network:
         """Return the network with one more measured distance between two of its points, object unit.

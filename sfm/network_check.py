@@ -11,6 +11,8 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
 
+CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
+
 
 def check_network(network: Network, estimate: Estimate) -> None:
     """Refuse a network and an estimate that do not belong together or hold what no adjustment can use.
@@ -87,11 +89,11 @@ def check_network(network: Network, estimate: Estimate) -> None:
 
 def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
     """Refuse control that no adjustment can use; points are the names of the object points."""
-    wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~_not_negative(control.covariance))
+    wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~possible_covariances(control.covariance))
     if wrong is not None:
         raise GeometryError(
             f"control point {points[control.point[wrong]]}: expected finite coordinates and a symmetric "
-            "covariance without negative variances"
+            "positive definite covariance, of which variances may be 0 (fixed) or infinite (not known)"
         )
     twice = np.flatnonzero(np.bincount(control.point, minlength=len(points)) > 1)
     if len(twice):
@@ -125,9 +127,24 @@ def _positive_definite(covariance: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & symmetric & (a > 0) & (a * c > b * b))
 
 
-def _not_negative(covariance: FloatArray) -> BoolArray:
-    """Return which covariances (c, 3, 3) are symmetric and have no negative variance."""
-    unknown = np.eye(3, dtype=bool) & np.isposinf(covariance)  # a variance may be infinite
+def possible_covariances(covariance: FloatArray) -> BoolArray:
+    """Return which covariances (c, n, n) coordinates can have, those fixed or not known left out, (c,).
+
+    Args:
+        covariance: variance 0 = fixed, infinite = not known; these are correlated with nothing.
+    """
+    n = covariance.shape[1]
+    unknown = np.eye(n, dtype=bool) & np.isposinf(covariance)  # a variance may be infinite
     finite = (np.isfinite(covariance) | unknown).all(axis=(1, 2))
     symmetric = np.isclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=0).all(axis=(1, 2))
-    return np.asarray(finite & symmetric & (np.diagonal(covariance, axis1=1, axis2=2) >= 0).all(axis=1))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    usable: BoolArray = np.asarray(finite & symmetric & (variance >= 0).all(axis=1))
+    free = np.isfinite(variance) & (variance > 0)
+    scale = np.where(free, 1 / np.sqrt(np.where(free, variance, 1.0)), 1.0)
+    unit = np.eye(n, dtype=bool)
+    mixed = np.where(unit | ~usable[:, None, None], 0.0, covariance)
+    correlation = np.where(unit, 1.0, mixed * scale[:, :, None] * scale[:, None, :])
+    both = free[:, :, None] & free[:, None, :]
+    bearable = unit | (correlation == 0) | (both & (np.abs(correlation) <= CORRELATION_LIMIT))
+    regular = np.linalg.eigvalsh(correlation).min(axis=1) > n * np.finfo(float).eps
+    return np.asarray(usable & bearable.all(axis=(1, 2)) & regular)

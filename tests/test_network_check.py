@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, KolinearError
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.synthetic import make_network, seed_of
@@ -116,3 +117,43 @@ def test_short_ways_of_saying_it_work() -> None:
 def test_other_functions_refuse_in_one_line(call: Callable[[], object], message: str) -> None:
     with pytest.raises(KolinearError, match=message):
         call()
+
+
+def control_of(r: float) -> FloatArray:
+    """Return a covariance of sigmas 1, 2 and 0.5 with correlations of one size, one negative."""
+    return np.array([[1, r, r], [r, 1, -r], [r, -r, 1]]) * np.outer([1, 2, 0.5], [1, 2, 0.5])
+
+
+def test_control_that_no_measurement_can_have_is_refused() -> None:
+    network, truth = make_network(seed_of("control"), images=4, points=12)
+    names, xyz = network.points[:4], truth.points[:4]
+    for sigma in (-1.0, np.nan, [1.0, -1.0, 1.0]):
+        with pytest.raises(GeometryError, match="control: sigma"):
+            network.with_control(names, xyz, sigma)
+    with pytest.raises(GeometryError, match="expected finite"):
+        network.with_control(names, np.full((4, 3), np.nan), 1.0)
+    partly = network.with_control(names, xyz, [0.0, 1.0, np.inf])
+    assert np.array_equal(partly.control.covariance[0], np.diag([0.0, 1.0, np.inf]))
+    for covariance, good in (
+        (control_of(0.3), True),
+        (control_of(0.6), False),  # every pair is possible, the three together are not
+        (np.diag([0.0, 1.0, np.inf]), True),
+        (np.diag([0.0, 1.0, np.inf]) + 0.1 * (1 - np.eye(3)), False),
+        (np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), False),
+    ):
+        held = ObjectPoints(np.arange(4), xyz, np.tile(covariance, (4, 1, 1)))
+        if good:
+            a = sfm.adjust(replace(network, control=held), truth, datum=sfm.Datum("control"))
+            assert len(a.network.control) == 4
+        else:
+            with pytest.raises(GeometryError, match="positive definite"):
+                sfm.adjust(replace(network, control=held), truth)
+
+
+@pytest.mark.parametrize("mixed", [[1.0, 0, 0], [0.6, 0.6, -0.6], [np.nan, 0, 0]])
+def test_known_points_with_impossible_covariances_are_refused(mixed: list[float]) -> None:
+    xyz, sigma = np.eye(3), np.ones((3, 3))
+    with pytest.raises(KolinearError, match="control point b: "):
+        sfm.KnownPoints(("a", "b", "c"), xyz, sigma, np.array([[0.0, 0, 0], mixed, [0, 0, 0]]))
+    with pytest.raises(KolinearError, match="control point a: "):
+        sfm.KnownPoints(("a", "b", "c"), xyz, -sigma)

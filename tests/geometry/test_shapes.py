@@ -240,3 +240,15 @@ def test_a_diverging_fit_is_one_line() -> None:
     A = 0.01 * rng.standard_normal((60, 60))
     with pytest.raises(GeometryError, match="it diverges: they are too far from any cone"):
         fit_shape(measured(xyz, A @ A.T), "cone")
+
+
+def test_what_is_no_number_is_refused() -> None:
+    points = table("sphere6.csv")
+    for kind in KINDS:
+        xyz = points.xyz.copy()
+        xyz[2, 1] = np.nan
+        with pytest.raises(GeometryError, match="point 3 has no coordinates"):
+            fit_shape(measured(xyz), kind, weights="equal")
+    for more in ({"offset": np.nan}, {"hold": {"radius": np.nan}}):
+        with pytest.raises(GeometryError, match="no number"):
+            fit_shape(points, "sphere", weights="equal", **more)  # type: ignore[arg-type]

@@ -154,6 +154,10 @@ def _fit(
     robust: bool,
     offset: float,
 ) -> ShapeFit:
+    for j in rows[~np.isfinite(points.xyz[rows]).all(axis=1)][:1]:
+        raise GeometryError(f"point {points.names[j]} has no coordinates, expected numbers")
+    if not all(np.isfinite(np.asarray(one, dtype=float)).all() for one in (offset, *hold.values())):
+        raise GeometryError("a value that is held, or the offset, is no number")
     if weights not in WEIGHTS:
         raise GeometryError(f"weights '{weights}', expected one of {', '.join(WEIGHTS)}")
     if weights == "network" and points.covariance is None:

@@ -17,10 +17,10 @@ import numpy.typing as npt
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
+from sfm.network_check import CORRELATION_LIMIT, possible_covariances
 
 MIN_SIGMA = 1e-9  # in any unit used here less than an atom
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
-CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
 CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that only checks
 COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
@@ -45,6 +45,21 @@ class KnownPoints:
     sigma: FloatArray  # standard deviations, 0 = fixed, infinite = not known, object unit, (n, 3)
     covariances: FloatArray | None = None  # of X and Y, X and Z, Y and Z, object unit^2, 0 if None, (n, 3)
     check: BoolArray | None = None  # coordinates that take no part but check the result; none if None, (n, 3)
+
+    def __post_init__(self) -> None:
+        """Refuse standard deviations and covariances that coordinates cannot have.
+
+        Raises:
+            SurveyFileError: with the name of the point.
+        """
+        good: BoolArray = np.asarray((self.sigma >= 0).all(axis=1))
+        good[good] = possible_covariances(self.covariance[good])
+        for name, own in zip(self.names, good.tolist(), strict=True):
+            if not own:
+                raise SurveyFileError(
+                    f"control point {name}: expected sigmas of 0 (fixed) or more and covariances that make a "
+                    "positive definite matrix with them"
+                )
 
     @property
     def covariance(self) -> FloatArray:
