@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfm.adjustment.result import Adjustment
 from sfm.camera import camera_from_values, pixel_from_tangents
-from sfm.distortion.balanced import BALANCED, from_balanced, to_balanced
+from sfm.distortion.balanced import BALANCED, brown_by_balanced, from_balanced, to_balanced
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
@@ -95,11 +96,44 @@ def test_a_survey_takes_and_gives_it(tmp_path: Path) -> None:
         assert result.adjustment.converged and result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.2)
         write_tables(findings_of(result), tmp_path)
         with (tmp_path / "cameras_balanced.csv").open(encoding="utf-8") as file:
-            rows = [(row["parameter"], float(row["value"])) for row in csv.DictReader(file)]
+            table = list(csv.DictReader(file))
+        rows = [(row["parameter"], float(row["value"])) for row in table]
+        sigma = {row["parameter"]: row["sigma"] for row in table}
         if free:
-            assert dict(rows)["R0"] == 4.0 and dict(rows)["c"] == pytest.approx(given[0][1], rel=1e-3)
+            assert dict(rows)["R0"] == 4.0 and dict(rows)["c"] == pytest.approx(negative[0][1], rel=1e-3)
+            assert not sigma["R0"] and not sigma["x0"]
+            assert float(sigma["c"]) > 0 and float(sigma["A1"]) > 0
+            np.testing.assert_allclose(float(sigma["c"]), sampled_sigma(result.adjustment, 4.0), rtol=0.05)
         else:
-            np.testing.assert_allclose([v for _, v in rows], [v for _, v in given], rtol=1e-12)
+            np.testing.assert_allclose([v for _, v in rows], [v for _, v in negative], rtol=1e-12)
+            assert set(sigma.values()) == {""}
+
+
+def sampled_sigma(a: Adjustment, R0: float) -> float:
+    """Return the standard deviation of the balanced c, from sampled parameters."""
+    (camera,) = a.estimate.cameras
+    rng, own = seed_of("sampled"), camera.parameters[camera.free]
+    found = []
+    for values in rng.multivariate_normal(own, a.covariance.interior[0], 4000):
+        drawn = camera.parameters.copy()
+        drawn[camera.free] = values
+        found.append(to_balanced(tuple(zip(camera.names, drawn.tolist(), strict=True)), R0)[0][1])
+    return float(np.std(found))
+
+
+def test_derivatives_of_the_balanced_form_are_those_of_its_formulas() -> None:
+    sizes = (10.0, 0.1, -0.1, 1e-4, -1e-6, 1e-9, 4.0, 1e-4, -1e-4, 2e-4, 1e-4)
+    values = tuple(zip(BALANCED, sizes, strict=True))
+    J = brown_by_balanced(values)
+    varied = [k for k, name in enumerate(BALANCED) if name != "R0"]
+    for column, k in enumerate(varied):
+        step = 1e-4 * abs(sizes[k])
+        ends = []
+        for sign in (1, -1):
+            moved = tuple((n, v + sign * step * (i == k)) for i, (n, v) in enumerate(values))
+            ends.append(np.array([v for _, v in from_balanced(moved)]))
+        numeric = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(J[:, column], numeric, rtol=1e-6, atol=1e-9 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,9 @@ Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 3
 
 from __future__ import annotations
 
+import numpy as np
+
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
 MODEL = "brown_forward"  # the model of this form
@@ -72,3 +75,27 @@ def to_balanced(values: Values, R0: float) -> Values:
     A = [p[f"K{i}"] * s ** (2 * i + 1) for i in (1, 2, 3)]
     found = (p["c"] / s, p["x0"], p["y0"], *A, R0, p["P1"] * s**2, p["P2"] * s**2, p["b1"] * s, p["b2"] * s)
     return tuple(zip(BALANCED, found, strict=True))
+
+
+def brown_by_balanced(values: Values) -> FloatArray:
+    """Return the derivatives of `brown_forward` by the balanced form, R0 held, (10, 10).
+
+    Rows are c, x0, y0, K1, K2, K3, P1, P2, b1, b2, columns `BALANCED` without R0; c is positive.
+
+    Args:
+        values: (name, value) of `BALANCED`.
+
+    Source: derivatives of the formulas above.
+    """
+    p = dict(values)
+    A, R0 = np.array([p["A1"], p["A2"], p["A3"]]), p["R0"]
+    ds = -(R0 ** (2.0 * np.arange(1, 4)))  # of s by A1, A2, A3
+    s = 1.0 + float(ds @ A)
+    J = np.zeros((10, 10))
+    scaled = (("c", 0, 1), *((f"A{i}", 2 + i, -2 * i - 1) for i in (1, 2, 3)))
+    scaled += (("B1", 6, -2), ("B2", 7, -2), ("C1", 8, -1), ("C2", 9, -1))
+    J[1, 1] = J[2, 2] = 1.0
+    for name, row, power in scaled:
+        J[row, row] = s**power
+        J[row, 3:6] += power * p[name] * s ** (power - 1) * ds
+    return J

@@ -14,8 +14,8 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
-from sfm.distortion.balanced import UNITS, to_balanced
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
 from sfm.network import Network
@@ -47,7 +47,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
             "image,point,x_px,y_px,sx_px,sy_px,cxy_px2,vx_px,vy_px,rejected",
             image_point_rows(adjustment),
         ),
-        ("cameras_balanced", "camera,parameter,value,unit", balanced_rows(findings)),
+        ("cameras_balanced", "camera,parameter,value,sigma,unit", balanced_rows(findings)),
         ("targets", "image,x_px,y_px,a_px,b_px,angle_deg,reason", target_rows(findings)),
         ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
@@ -90,13 +90,15 @@ def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
 
 
 def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return the cameras of model brown_forward in AICON's form, camera, parameter, value and unit.
+    """Return the cameras of model brown_forward in AICON's form, camera, parameter, value, sigma and unit.
 
-    R0 is that of the survey file, else two thirds of the largest image radius, as is usual. A camera that has
-    no such form, with K4 or distortion that cannot be balanced there, has no rows.
+    c is negative, as AICON writes it; sigma is empty where nothing of a value was adjusted. R0 is that of the
+    survey file, else two thirds of the largest image radius, as is usual. A camera that has no such form, as
+    with K4 or distortion that cannot be balanced there, has no rows.
     """
     given = findings.result.balance_radius_mm
-    for camera in findings.result.adjustment.estimate.cameras:
+    a = findings.result.adjustment
+    for camera, own in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         if camera.model != BALANCED_MODEL:
             continue
         half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
@@ -106,8 +108,16 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
             rows = to_balanced(tuple(zip(camera.names, camera.parameters.tolist(), strict=True)), R0)
         except GeometryError:
             continue
-        for (name, value), unit in zip(rows, UNITS, strict=True):
-            yield (camera.name, name, value, unit)
+        Q = np.zeros((len(camera.names), len(camera.names)))
+        if len(own):
+            Q[np.ix_(camera.free, camera.free)] = own
+        order = [camera.names.index(name) for name, _ in from_balanced(rows)]
+        inverse = np.linalg.inv(brown_by_balanced(rows))
+        variance = np.diagonal(inverse @ Q[np.ix_(order, order)] @ inverse.T)
+        sigma = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        at_R0 = BALANCED.index("R0")
+        for (name, value), s, unit in zip(rows, np.insert(sigma, at_R0, np.nan), UNITS, strict=True):
+            yield (camera.name, name, -value if name == "c" else value, s, unit)
 
 
 def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
