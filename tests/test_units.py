@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from typing import get_args
 
+import pytest
+from pydantic import TypeAdapter
+
+from sfm.conventions import METRES
+from sfm.survey.inputs.settings import Unit
 from sfm.units import SWELLING, UNITS, find_unit
 
 MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
@@ -40,3 +45,9 @@ def test_a_factor_is_that_of_a_unit_where_the_rest_is_no_contradiction(
 
 def test_paper_swells_by_one_to_two_permille() -> None:
     assert SWELLING == 0.002
+
+
+def test_nanometres_are_a_unit_of_surveys_and_plans() -> None:
+    assert METRES["nm"] == 1e-9
+    assert TypeAdapter(Unit).validate_python("nm") == "nm"
+    assert set(METRES) == set(get_args(get_args(Unit)[0]))

@@ -68,5 +68,6 @@ def test_command() -> None:
     )
     assert done.returncode == 2
     assert (
-        done.stderr.strip() == "kolinear: --unit furlong: expected one of km, m, dm, cm, mm, um, µm, in, ft"
+        done.stderr.strip()
+        == "kolinear: --unit furlong: expected one of km, m, dm, cm, mm, um, µm, nm, in, ft"
     )

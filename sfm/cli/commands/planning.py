@@ -49,7 +49,7 @@ def target_size_command(
         str, typer.Option("--family", help="Rings around the dots: ring12, ring14, ring20 or arcs.")
     ] = "ring14",
     unit: Annotated[
-        str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, in or ft.")
+        str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, nm, in or ft.")
     ] = "mm",
 ) -> None:
     """Compute how large targets must be for a camera and a distance.
@@ -108,7 +108,7 @@ def network_command(
         typer.Option("--free", metavar="P,Q,...", help="Camera parameters to be adjusted, or none."),
     ] = None,
     unit: Annotated[
-        str, typer.Option("--unit", help="Unit of lengths: km, m, dm, cm, mm, um, in or ft.")
+        str, typer.Option("--unit", help="Unit of lengths: km, m, dm, cm, mm, um, nm, in or ft.")
     ] = "mm",
     points: Annotated[
         int, typer.Option("--points", metavar="N", min=3, max=20000, help="Points on a mesh or a shape.")

@@ -42,7 +42,7 @@ MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millio
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
 Unit = Annotated[
-    Literal["km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft"],
+    Literal["km", "m", "dm", "cm", "mm", "um", "µm", "nm", "in", "ft"],
     BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v),
 ]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
