@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -89,6 +91,14 @@ def test_a_container_may_have_less_memory_than_the_computer(
     for said, expected in (("max\n", whole), ("2000000\n", memory.SHARE * 2e6), (f"{2**63}\n", whole)):
         limit.write_text(said, encoding="ascii")
         assert memory.available_bytes() == expected
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of a process")
+def test_a_process_may_have_less_memory_than_the_computer() -> None:
+    told = "from sfm.adjustment.engine.solvers.memory import available_bytes as a; print(a())"
+    limited = f"ulimit -v 3000000; exec {sys.executable} -c '{told}'"
+    done = subprocess.run(["sh", "-c", limited], capture_output=True, text=True, check=True)
+    assert float(done.stdout) <= memory.SHARE * 3000000 * 1024
 
 
 @pytest.mark.parametrize(("strips", "unknowns"), [(3, "all connected"), (6, "of 84 photographs")])

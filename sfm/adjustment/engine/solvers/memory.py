@@ -1,4 +1,4 @@
-"""What the normal equations may take of the memory of this computer, or of the container that it runs in."""
+"""What the normal equations may take of the memory of this computer, its container, or the process."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 from sfm.errors import GeometryError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
 UNKNOWN = 8e9  # bytes where the system does not say what it has
@@ -23,6 +28,10 @@ def available_bytes() -> float:
             known = min(known, float(file.read_text(encoding="ascii")))
         except (OSError, ValueError):  # there is no such file, or it says "max"
             continue
+    if resource is not None:  # ulimit -v
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            known = min(known, float(limit))
     return SHARE * known
 
 
