@@ -129,23 +129,34 @@ def _tags_of(plate: PlateFamily, middle: FloatArray) -> Marks:
 def _april_tags(plate: PlateFamily, middle: FloatArray, border: int) -> Marks:
     """Return the tags of an AprilGrid, upside down as Kalibr prints them, and squares at their corners."""
     size, family = plate.tag_share * PITCH, tag_family(plate.dictionary)
-    centre, half = [], []
+    black, white, half = [], [], np.array([size, size]) / 2
     gap = PITCH - size
     for corner in plate.plane(PITCH)[:, :2].reshape(plate.rows, plate.columns, 2)[::2, ::2].reshape(-1, 2):
         row, column = round(-corner[1] / PITCH), round(corner[0] / PITCH)
         number = plate.first_tag + (plate.rows // 2 - 1 - row) * plate.columns // 2 + column
-        black = np.rot90(np.pad(tag_modules(family, number), border - 1, constant_values=True), 2)
-        side = size / len(black)
-        r, c = np.nonzero(black)
-        centre.append(corner + side * np.stack([c + 0.5, -r - 0.5], axis=1))
-        half.append(np.full((len(r), 2), side / 2))
-        for x in (-gap / 2, size + gap / 2):
-            for y in (gap / 2, -size - gap / 2):
-                centre.append(corner[None] + [x, y])
-                half.append(np.full((1, 2), gap / 2))
-    joined = np.concatenate(centre)
-    k = len(joined)
-    return rectangles(0, joined - middle[:2], np.concatenate(half), np.zeros(k), np.full(k, 0.06))
+        modules = np.rot90(np.pad(tag_modules(family, number), border - 1, constant_values=True), 2)
+        side = size / len(modules)
+        r, c = np.nonzero(~modules)
+        white.append(corner + side * np.stack([c + 0.5, -r - 0.5], axis=1))
+        # edges that are drawn in parts, or twice, would move
+        black.append((corner + half * [1, -1], half))
+        right, below = column == plate.columns // 2 - 1, row == plate.rows // 2 - 1
+        square = np.full(2, gap / 2)
+        black.extend(
+            (corner + np.array([x, y]), square)
+            for x in (-gap / 2, size + gap / 2)[: 1 + right]
+            for y in (gap / 2, -size - gap / 2)[: 1 + below]
+        )
+    at, halves = (np.array(part) for part in zip(*black, strict=True))
+    squares = rectangles(0, at - middle[:2], halves, np.zeros(len(at)), np.full(len(at), 0.06))
+    bright = np.concatenate(white)
+    k = len(bright)
+    return join_marks(
+        [
+            squares,
+            rectangles(0, bright - middle[:2], np.full((k, 2), side / 2), np.zeros(k), np.full(k, 0.85)),
+        ]
+    )
 
 
 def stations(rng: np.random.Generator, count: int, plate: PlateFamily) -> tuple[FloatArray, FloatArray]:

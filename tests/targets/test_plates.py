@@ -197,7 +197,7 @@ def test_boards_are_found_in_large_photographs(square_px: int) -> None:
 def measured_crossing(drawn: FloatArray) -> FloatArray:
     """Return the crossing in the middle of a drawn photograph, (2,)."""
     picture = np.rint(cv2.GaussianBlur(drawn, (0, 0), 1.5)).astype(np.uint8)
-    return measure_saddles(picture, np.array([[41.0, 39.6]]), np.array([40.0]), noise=1.0).xy[0]
+    return measure_saddles(picture, np.array([[41.0, 39.6]]), np.array([14.0]), noise=1.0).xy[0]
 
 
 @pytest.mark.parametrize(("weak", "is_crossing"), [(0.0, False), (0.1, False), (0.2, True)])

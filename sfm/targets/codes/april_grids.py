@@ -19,7 +19,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.plates import APRIL_BORDERS, PlateFamily
 from sfm.targets.codes.tags import CORRECTED, WRONG_IN_BORDER, opencv_dictionary
-from sfm.targets.fits.saddle import measure_saddles
+from sfm.targets.fits.saddle import WINDOW, measure_saddles
 
 OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
 WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
@@ -45,7 +45,7 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
     """
     quads = _unique(np.array(list(_outlines(grey))).reshape(-1, 4, 2))
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
-    xy = measure_saddles(grey, quads.reshape(-1, 2), np.repeat(SPACING * side, 4), noise=1.0).xy
+    xy = measure_saddles(grey, quads.reshape(-1, 2), np.repeat(WINDOW * SPACING * side, 4), noise=1.0).xy
     quads = np.where(np.isfinite(xy), xy, quads.reshape(-1, 2)).reshape(-1, 4, 2)
     best: list[tuple[int, FloatArray]] = []
     for border in APRIL_BORDERS:
@@ -146,8 +146,13 @@ def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tup
     return named
 
 
-def squares_beside(xy: FloatArray, plate: PlateFamily) -> FloatArray:
-    """Return the sides of the squares at the corners of tags, four of each in turn, px, (k,)."""
+def windows_beside(xy: FloatArray, plate: PlateFamily) -> FloatArray:
+    """Return half sides of windows at the corners of tags, four of each in turn, px, (k,).
+
+    They see a part of the square, and of the tag no more than the narrowest border.
+    """
     quads = xy.reshape(-1, 4, 2)
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)
-    return np.asarray(np.minimum(side, np.roll(side, -1, axis=1)).ravel() * (1 / plate.tag_share - 1))
+    module = 1 / (opencv_dictionary(plate.dictionary).markerSize + 2 * min(APRIL_BORDERS))
+    part = min(WINDOW * (1 / plate.tag_share - 1), min(APRIL_BORDERS) * module)
+    return np.asarray(part * np.minimum(side, np.roll(side, -1, axis=1)).ravel())

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.codes.april_grids import name_corners, read_april_tags, squares_beside
+from sfm.targets.codes.april_grids import name_corners, read_april_tags, windows_beside
 from sfm.targets.codes.cut_boards import name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
-from sfm.targets.fits.saddle import Saddles, measure_saddles
+from sfm.targets.fits.saddle import WINDOW, Saddles, measure_saddles
 from sfm.targets.outlines import as_bytes
 
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -45,11 +45,14 @@ def find_crossings(
     grey = as_bytes(photograph, scale)
     if plate.name == "aprilgrid":
         xy, code = name_corners(*read_april_tags(grey, plate.dictionary), plate)
-        spacing = squares_beside(xy, plate)
+        half = windows_beside(xy, plate)
+    elif plate.name == "charuco":
+        xy, code = _charuco(grey, plate)
+        half = min(WINDOW, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
     else:
-        xy, code = _charuco(grey, plate) if plate.name == "charuco" else _checkerboard(grey, plate)
-        spacing = _spacing(xy)
-    saddles = measure_saddles(photograph, xy, spacing, noise=noise)
+        xy, code = _checkerboard(grey, plate)
+        half = WINDOW * _spacing(xy)
+    saddles = measure_saddles(photograph, xy, half, noise=noise)
     good = np.isfinite(saddles.xy[:, 0])
     return saddles.select(good), code[good]
 

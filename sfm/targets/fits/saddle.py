@@ -2,7 +2,8 @@
 
 Every pixel of an edge says that the crossing lies on the line through it across its gradient. Their
 intersection, weighted by the squared gradient, is the crossing; blur, which is the same on both sides of an
-edge, does not move it. The covariance is that of the noise of the intensities, carried through the filters.
+edge, does not move it. The covariance is that of the noise of the intensities, carried through the filters
+and the window, which moves with the crossing.
 
 Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken (precise location of corners,
 and their roundness, the squared sine of the angle between the edges).
@@ -19,7 +20,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 
-WINDOW = 0.35  # half side of the window, in the distance of the nearest crossing
+WINDOW = 0.35  # largest half side of the window, in the distance of the nearest crossing
 MIN_HALF_PX, MAX_HALF_PX = 3, 15
 ROUNDS, LAST_STEP_PX = 20, 1e-3
 FARTHEST = 1.0  # of the half window, by which a crossing may be off where it was expected
@@ -41,13 +42,13 @@ class Saddles:
         return Saddles(self.xy[rows], self.covariance[rows], self.contrast[rows])
 
 
-def measure_saddles(image: AnyArray, start: FloatArray, spacing_px: FloatArray, *, noise: float) -> Saddles:
+def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, noise: float) -> Saddles:
     """Measure crossings near approximate places.
 
     Args:
         image: intensities, shape (H, W).
         start: approximate places, px, (k, 2).
-        spacing_px: distance of the nearest other crossing, px, (k,).
+        half_px: half sides of the windows, which see no edge but those of the crossing, px, (k,).
         noise: standard deviation of an intensity.
     """
     k = len(start)
@@ -55,7 +56,7 @@ def measure_saddles(image: AnyArray, start: FloatArray, spacing_px: FloatArray, 
     if not k:
         return out
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
-    half = np.clip(np.rint(WINDOW * spacing_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
+    half = np.clip(np.floor(half_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
     _measure_all(
         np.asarray(smooth),
         np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)),
@@ -104,14 +105,13 @@ def _measure_all(
         covariance: receives their covariance, (k, 2, 2).
         contrast: receives their contrast, (k,).
     """
-    N = np.empty((2, 2))
     for i in range(len(start)):
         half = half_px[i]
-        x, y = _crossing(gx, gy, start[i, 0], start[i, 1], half, N)
+        x, y = _crossing(gx, gy, start[i, 0], start[i, 1], half)
         if math.isnan(x):
             continue
         xy[i, 0], xy[i, 1] = x, y
-        _propagate(gx, gy, x, y, half, noise, N, covariance[i])
+        _propagate(gx, gy, x, y, half, noise, covariance[i])
         column, row = round(x), round(y)
         part = np.sort(smooth[row - half : row + half + 1, column - half : column + half + 1].copy().ravel())
         last = len(part) - 1
@@ -131,10 +131,15 @@ def _weight(dx: float, dy: float, half: int) -> float:
 
 
 @compiled
-def _crossing(
-    gx: AnyArray, gy: AnyArray, x0: float, y0: float, half: int, N: FloatArray
-) -> tuple[float, float]:
-    """Return a crossing and fill its normal matrix; NaN where there is none, or the border cuts it off."""
+def _falloff(d: float, half: int) -> float:
+    """Return by what share the weight of a pixel at this distance grows as the window moves towards it."""
+    inside = half + 0.5 - abs(d)
+    return 4.0 * d / (half * half) + (math.copysign(1.0, d) / inside if inside < 1.0 else 0.0)
+
+
+@compiled
+def _crossing(gx: AnyArray, gy: AnyArray, x0: float, y0: float, half: int) -> tuple[float, float]:
+    """Return a crossing; NaN where there is none, or the border cuts it off."""
     height, width = gx.shape
     margin, x, y = half + REACH_PX + 1, x0, y0
     for _ in range(ROUNDS):
@@ -161,22 +166,23 @@ def _crossing(
         if math.hypot(x - x0, y - y0) > FARTHEST * half:
             break
         if math.hypot(step_x, step_y) < LAST_STEP_PX:
-            N[0, 0], N[0, 1], N[1, 0], N[1, 1] = xx, xy, xy, yy
             return x, y
     return math.nan, math.nan
 
 
 @compiled
 def _propagate(
-    gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: float, N: FloatArray, out: FloatArray
+    gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: float, out: FloatArray
 ) -> None:
     """Fill the covariance of a crossing, px^2, (2, 2).
 
-    By how much each intensity moves it are the filters of the gradient, the other way round.
+    By how much each intensity moves it are the filters of the gradient, the other way round. Lines of pixels
+    beside the middle of a blurred edge miss the crossing, and the window changes their weights as it moves.
     """
     column, row = round(x), round(y)
     side, reach = 2 * (half + REACH_PX) + 1, half + REACH_PX
     by_gx, by_gy = np.zeros((2, side, side)), np.zeros((2, side, side))
+    J = np.zeros((2, 2))  # of the sum that is zero at the crossing, by the crossing
     for r in range(REACH_PX - 1, side - REACH_PX + 1):
         for c in range(REACH_PX - 1, side - REACH_PX + 1):
             dx, dy = column - reach + c - x, row - reach + r - y
@@ -188,17 +194,22 @@ def _propagate(
             line = w * (a * dx + b * dy)
             by_gx[0, r, c], by_gy[0, r, c] = w * a * dx + line, w * a * dy
             by_gx[1, r, c], by_gy[1, r, c] = w * b * dx, w * b * dy + line
+            if w > 0:
+                by_x, by_y = line * _falloff(dx, half) - w * a, line * _falloff(dy, half) - w * b
+                J[0, 0] += a * by_x
+                J[0, 1] += a * by_y
+                J[1, 0] += b * by_x
+                J[1, 1] += b * by_y
     moved = np.zeros((2, side, side))
     rows = np.empty((side, side))
     for axis in range(2):
         _add_filtered(by_gx[axis], ALONG, ACROSS, rows, moved[axis])
         _add_filtered(by_gy[axis], ACROSS, ALONG, rows, moved[axis])
-    xx, xy, yy = (moved[0] ** 2).sum(), (moved[0] * moved[1]).sum(), (moved[1] ** 2).sum()
-    det = N[0, 0] * N[1, 1] - N[0, 1] * N[1, 0]
-    a, b, c = N[1, 1] / det, -N[0, 1] / det, N[0, 0] / det  # its inverse
-    out[0, 0] = noise**2 * (a * a * xx + 2 * a * b * xy + b * b * yy)
-    out[1, 1] = noise**2 * (b * b * xx + 2 * b * c * xy + c * c * yy)
-    out[0, 1] = out[1, 0] = noise**2 * (a * b * xx + (a * c + b * b) * xy + b * c * yy)
+    det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+    move_x = (J[1, 1] * moved[0] - J[0, 1] * moved[1]) / det
+    move_y = (J[0, 0] * moved[1] - J[1, 0] * moved[0]) / det
+    out[0, 0], out[1, 1] = noise**2 * (move_x**2).sum(), noise**2 * (move_y**2).sum()
+    out[0, 1] = out[1, 0] = noise**2 * (move_x * move_y).sum()
 
 
 @compiled

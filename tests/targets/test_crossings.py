@@ -1,0 +1,49 @@
+"""Crossings of boards against their true places: as good as their standard deviations state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.plates import PlateFamily
+from tests.plates import NOISE, PITCH, camera, plate_pictures, stations
+from tests.synthetic import seed_of
+
+
+def errors_over_stated(plate: PlateFamily, name: str, *, noise: float) -> tuple[float, float]:
+    """Return the RMS of the errors of crossings in a rendered photograph, px, and over the stated ones."""
+    picture = plate_pictures(plate, seed_of(name), 2, noise=noise, bits=16)[1]
+    position, rotation = stations(seed_of(name), 2, plate)
+    found, code = find_crossings(picture, plate, scale=65535.0, noise=65535 * noise)
+    assert len(code) > 0.8 * plate.count
+    off = found.xy - project(camera(), position[1], rotation[1], plate.plane(PITCH))[code]
+    ratio = np.einsum("ki,kij,kj->k", off, np.linalg.inv(found.covariance), off).mean() / 2
+    return float(np.sqrt((off**2).mean())), float(np.sqrt(ratio))
+
+
+# RMS 0.024, 0.028, 0.032, 0.044 px; windows as large as those of a checkerboard see the tags: 0.23 px at 0.8
+@pytest.mark.parametrize(("share", "rms_px"), [(0.5, 0.032), (0.6, 0.036), (0.7, 0.042), (0.8, 0.055)])
+def test_crossings_of_charuco_boards_do_not_see_the_tags(share: float, rms_px: float) -> None:
+    plate = PlateFamily("charuco", 7, 10, (), "aruco5x5_50", share)
+    rms, ratio = errors_over_stated(plate, f"crossings {share}", noise=NOISE)
+    print(f"share {share}: RMS {rms:.4f} px, {ratio:.2f} of the stated one")
+    assert rms < rms_px
+    assert 0.8 < ratio < 1.3
+
+
+@pytest.mark.parametrize("share", [0.65, 0.77])
+def test_corners_of_april_grids_are_as_good_as_stated(share: float) -> None:
+    plate = PlateFamily("aprilgrid", 8, 10, (), "apriltag36h11", share)
+    rms, ratio = errors_over_stated(plate, f"corners {share}", noise=NOISE)
+    print(f"share {share}: RMS {rms:.4f} px, {ratio:.2f} of the stated one")
+    assert rms < 0.06
+    assert 0.8 < ratio < 1.3
+
+
+def test_faint_noise_leaves_crossings_of_a_checkerboard_as_good_as_stated() -> None:
+    rms, ratio = errors_over_stated(PlateFamily("checkerboard", 7, 10), "faint crossings", noise=NOISE / 4)
+    print(f"RMS {rms:.4f} px, {ratio:.2f} of the stated one")
+    assert rms < 0.008
+    assert 0.8 < ratio < 1.3
