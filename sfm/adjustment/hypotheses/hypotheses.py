@@ -89,21 +89,26 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> Judged:
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)
-    return Judged(tuple(remark_of(plain, one, unit) for one in causes), unchecked)
+    fixed = not final.unknown_counts[2]
+    return Judged(tuple(remark_of(plain, one, unit, fixed=fixed) for one in causes), unchecked)
 
 
-def remark_of(plain: Adjustment, cause: Cause, unit: str) -> Remark:
+def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False) -> Remark:
     """Return the remark on a cause.
 
     Args:
         plain: the adjustment without it.
         cause: the alternative that holds.
         unit: object unit.
+        fixed: whether control fixes all coordinates of the result, so that only those of `plain` shift.
     """
     one, found = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
     parts = one.family.parts(one, found.adjustment, found.beta, unit)
-    return remark(one.kind, shift=found.shift, rms=found.rms, instead=instead or None, **parts)
+    without = "control" if fixed else None
+    return remark(
+        one.kind, shift=found.shift, rms=found.rms, without=without, instead=instead or None, **parts
+    )
 
 
 def find_causes(plain: Adjustment) -> tuple[Cause, ...]:

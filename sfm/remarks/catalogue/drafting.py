@@ -53,7 +53,8 @@ ROWS = (
         "note",
         "The pitch of the plate is assumed to be {pitch}.",
         "a calibration plate was found, its size is not known",
-        "Give the distance of neighbouring dots or crossings if lengths matter; cameras do not depend on it.",
+        "If lengths matter, give the distance of neighbouring dots or crossings: --pitch for a new survey "
+        "file, targets.pitch without pitch_assumed in one that exists. Cameras do not depend on it.",
     ),
     Kind(
         "sensor_not_looked_up",

@@ -7,7 +7,10 @@ from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 # Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
 # limits that anybody expects.
 SHIFT = Grade("shift", warning=3.0, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
-SHIFTED = "Coordinates shift by up to {shift} standard deviations, {rms} RMS."
+SHIFTED = (
+    "Coordinates[[ of the network without {without:@}]] shift by up to {shift} standard deviations, "
+    "{rms} RMS."
+)
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
 
 ROWS = (

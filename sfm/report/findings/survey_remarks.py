@@ -144,7 +144,10 @@ def _untested(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the points that lost more rays than chance makes or have but two, and a pair of photographs."""
+    """Return the points that lost more rays than chance makes or have but two, and a pair of photographs.
+
+    Known coordinates check the rays of a point, however few there are.
+    """
     network, rejected = a.network, a.rejected
     n, point = len(network.points), network.image_points.point
     lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
@@ -152,9 +155,12 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     remarks = []
     if len(most):
         remarks.append(remark("rays_rejected", points=[network.points[j] for j in most]))
-    if len(network.images) == 2:
+    by_rays = np.ones(n, dtype=bool)
+    if a.datum == "control":
+        by_rays[network.control.complete.point] = False
+    if len(network.images) == 2 and by_rays.any():
         remarks.append(remark("two_photographs"))
-    two = int((rays - lost == 2).sum())
+    two = int((by_rays & (rays - lost == 2)).sum())
     if two:
         remarks.append(remark("two_rays", two=two, total=n))
     return tuple(remarks)

@@ -281,7 +281,7 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
         task.datum,
         unit=task.survey.unit,
         rescale=task.survey.adjust.weights == "components",
-        decimals=plate is None or not is_plate_control(task.survey.control, plate),
+        of_plate=is_plate_control(task.survey.control, plate),
     )
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":

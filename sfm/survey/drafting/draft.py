@@ -175,14 +175,15 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
 
 
 def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
-    assumed = "" if pitch else "; ASSUMED, it sets the scale"
     lines = [
         "[targets]",
         f"codes = {_quoted(plate.name)}",
         f"rows = {plate.rows}  # of dots, of crossings inside the board, or of corners of tags",
         f"columns = {plate.columns}",
-        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots, crossings or tags{assumed}",
+        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots, crossings or tags",
     ]
+    if not pitch:
+        lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
     if plate.marks:
         lines.append(f"marks = {json.dumps([list(mark) for mark in plate.marks])}  # row and column, from 0")
     if plate.dictionary:

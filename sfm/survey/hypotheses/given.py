@@ -54,7 +54,7 @@ def judge_given(
     *,
     unit: str,
     rescale: bool = True,
-    decimals: bool = True,
+    of_plate: bool = False,
 ) -> JudgedGiven:
     """Return which given values may take part in an adjustment, and remarks on the others.
 
@@ -64,7 +64,8 @@ def judge_given(
         datum: that was asked for.
         unit: object unit.
         rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
-        decimals: whether fixed coordinates may be as precise as their decimals only, unlike those of a grid.
+        of_plate: whether control is a grid: fixed coordinates are not rounded to decimals, and the scale is
+            that of the plate, as asked for.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
@@ -75,7 +76,7 @@ def judge_given(
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    return _judged(Task(network, places, datum, unit, rescale, decimals))
+    return _judged(Task(network, places, datum, unit, rescale, of_plate))
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
@@ -204,7 +205,7 @@ def _group(
     if placed is None:
         return None
     group = Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
-    if fixed and in_datum and task.rescale and task.decimals and not placed.judgement.fits:
+    if fixed and in_datum and task.rescale and not (task.of_plate or placed.judgement.fits):
         group = _rounded(group, start, task.level)
     found = group.found
     if found.factor == 1.0:

@@ -44,7 +44,7 @@ class Task:
     datum: Datum  # that was asked for
     unit: str
     rescale: bool
-    decimals: bool  # whether fixed coordinates may be rounded
+    of_plate: bool  # whether control is the grid of a plate
 
     @property
     def level(self) -> float:

@@ -10,7 +10,9 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.targets.codes.plates import GRIDS, PLATES, TAGGED, PlateFamily, refuse_unusable_plate
 from sfm.targets.codes.tags import DICTIONARIES, tag_family
 
-OF_PLATES = ("rows", "columns", "pitch", "marks", "plate_sigma", "dictionary", "first_tag")
+OF_PLATES = (
+    *("rows", "columns", "pitch", "pitch_assumed", "marks", "plate_sigma", "dictionary", "first_tag"),
+)
 MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
 
 
@@ -45,9 +47,9 @@ def plate_control(targets: TargetSettings) -> KnownPoints | None:
     return KnownPoints(names, xyz, np.full_like(xyz, targets.plate_sigma or 0.0))
 
 
-def is_plate_control(control: KnownPoints | None, plate: KnownPoints) -> bool:
+def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> bool:
     """Return whether the control is that of the plate."""
-    if control is None or control.names != plate.names:
+    if control is None or plate is None or control.names != plate.names:
         return False
     return bool(np.array_equal(control.xyz, plate.xyz) and np.array_equal(control.sigma, plate.sigma))
 

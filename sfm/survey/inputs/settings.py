@@ -156,6 +156,7 @@ class TargetSettings(Section):
     rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
     columns: PlateSide | None = None  # of the same
     pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    pitch_assumed: bool = False  # whether nobody measured the pitch
     marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
     plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
     dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid, whose side is tag_size
