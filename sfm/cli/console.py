@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm.display import counted, program_name
+from sfm.display import MAX_LISTED, counted, program_name
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
-from sfm.report.phrases import words_of_check, words_of_precision, words_of_sigma0, words_of_test
+from sfm.report.phrases import (
+    words_of_calibration,
+    words_of_check,
+    words_of_precision,
+    words_of_sigma0,
+    words_of_test,
+)
 from sfm.result import SurveyResult
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
@@ -80,6 +86,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     if not math.isfinite(typical):
         told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
+        *_cameras(findings),
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
             "object points",
@@ -93,8 +100,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             f"{', '.join(words_of_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
-        ("point precision", told),
     ]
+    if not findings.calibrated:
+        rows.append(("point precision", told))
     if findings.check is not None:
         rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
     both = result.comparison
@@ -123,6 +131,16 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             )
         )
     return tuple(rows)
+
+
+def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
+    """Yield what a calibration is for: the cameras, where no coordinate was adjusted."""
+    for one in findings.calibrated[:MAX_LISTED]:
+        values, sigmas, within, projection = words_of_calibration(one)
+        yield f"camera {one.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
+        yield "  projection", projection
+    if len(findings.calibrated) > MAX_LISTED:
+        yield "cameras", f"{len(findings.calibrated) - MAX_LISTED} more, in the report"
 
 
 def _details(findings: Findings) -> tuple[tuple[str, str], ...]:

@@ -9,11 +9,12 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.distributions import normal_ppf
+from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.precision import Precision
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.numbers import finer_unit, significant, with_exponent
 from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
@@ -130,6 +131,23 @@ def words_of_precision(typical: float, largest: float, unit: str) -> str:
     return f"1 sigma {sigmas}; 95 % {within}"
 
 
+def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
+    """Return c and principal point, their 1 sigma, their 95 %, and the projection uncertainty."""
+    values, sigmas, within = [], [], []
+    for one in camera.parameters:
+        value, sigma = with_exponent(one.value, one.sigma)
+        held = not one.sigma > 0
+        values.append(f"{one.name} {value} {one.unit}")
+        sigmas.append("held" if held else f"{sigma} {one.unit}")
+        within.append("held" if held else f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
+    rms, largest = camera.projection_rms_px, camera.projection_largest_px
+    projection = (
+        f"1 sigma {significant(rms)} px RMS over the photograph, {significant(largest)} px at most; "
+        f"95 % {significant(NORMAL_95 * rms)} px, {significant(NORMAL_95 * largest)} px"
+    )
+    return ", ".join(values), ", ".join(sigmas), ", ".join(within), projection
+
+
 def words_of_fixed(precision: Precision) -> str:
     """Say that fixed coordinates do not count; empty where there are none."""
     count = precision.fixed_points
@@ -197,7 +215,7 @@ PHRASES = {
     one.__name__: one
     for one in (
         *(words_of_sigma0, words_of_test, words_of_weights, words_of_check, words_of_w, words_of_limiting),
-        *(words_of_fixed, words_of_datum, words_of_geometry, points_by_rays),
+        *(words_of_calibration, words_of_fixed, words_of_datum, words_of_geometry, points_by_rays),
     )
 }
 """what the templates call"""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,11 @@ from sfm.cli.console import tell_result
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.findings import Findings, findings_of
+from sfm.report.html.report_page import report_page
+from sfm.report.numbers import significant
+from sfm.report.phrases import words_of_calibration
+from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import PlateFamily
@@ -62,8 +67,24 @@ def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.Capt
     findings = findings_of(result)
     assert findings.verdict.level == "good"
     tell_result(findings, tmp_path / "report.html", seconds=0, verbose=False)
-    assert "all coordinates are fixed" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    (camera,) = findings.calibrated
+    assert [one.name for one in camera.parameters] == ["c", "x0", "y0"]
+    assert camera.projection_rms_px < camera.projection_largest_px < 1
+    for words in words_of_calibration(camera)[:3]:
+        assert all(part in told for part in words.split()[:2])
+    assert significant(camera.projection_largest_px) in told and "point precision" not in told
+    text, page = text_report(findings), report_page(findings, (), ())
+    assert "not known" not in text[text.index("Precision of the unknowns") :].split("\n\n")[0]
+    for medium in (text, page):
+        assert significant(camera.projection_largest_px) in medium
+    assert "Precision of a point" not in page and "Precision of a point" in page_of_free_points(findings)
     assert np.abs(off(result)).max() < 4
+
+
+def page_of_free_points(findings: Findings) -> str:
+    """Return the page of a result as if coordinates had been adjusted."""
+    return report_page(replace(findings, calibrated=()), (), ())
 
 
 def test_photographs_without_the_plate_are_named(tmp_path: Path) -> None:

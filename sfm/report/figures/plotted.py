@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.quality.projection import projection_map
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
 from sfm.report.figures.plot_data import PlotCamera, PlotData, ProjectionMap
+from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.precision import adjusted_sigmas, root_mean_square
 from sfm.report.numbers import finer_unit
@@ -47,14 +47,8 @@ def plot_data(findings: Findings) -> PlotData:
 
 def _projection(adjustment: Adjustment, photographs: BoolArray) -> ProjectionMap | None:
     """Return the projection uncertainty of the camera of photographs, (m,); None where it was held."""
-    network, seen = adjustment.network, adjustment.network.image_points.select(~adjustment.rejected)
-    if not photographs.any():
-        return None
-    k = int(network.camera[photographs][0])  # of several that share parameters the first
-    camera, covariance = adjustment.estimate.cameras[k], adjustment.covariance.interior[k]
-    if not len(covariance) or not np.isfinite(covariance).all() or not np.diagonal(covariance).any():
-        return None
-    return ProjectionMap(*projection_map(camera, covariance, seen.xy[photographs[seen.image]]))
+    found = projection_of(adjustment, photographs)
+    return None if found is None else ProjectionMap(*found)
 
 
 def _standardised_residuals(adjustment: Adjustment) -> FloatArray:

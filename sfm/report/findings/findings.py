@@ -12,6 +12,7 @@ from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.remarks.remark import Remark
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
+from sfm.report.findings.calibrated_cameras import CalibratedCamera, calibrated_cameras
 from sfm.report.findings.camera_remarks import camera_remarks
 from sfm.report.findings.checks import (
     CheckedControl,
@@ -62,6 +63,7 @@ class Findings:
     statistics: Statistics
     geometry: Geometry
     interior: InteriorOrientation
+    calibrated: tuple[CalibratedCamera, ...]  # where all points are held fixed, as those of a plate
     given: Given
     check: CheckedControl | None  # control that took no part
     precision: Precision
@@ -87,7 +89,7 @@ def findings_of(result: SurveyResult) -> Findings:
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
     consistency = consistency_of(a)
-    geometry, precision = geometry_of(a), precision_of(a)
+    geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
     remarks = (
         *adjustment_remarks(a),
         *photograph_remarks(result),
@@ -110,7 +112,8 @@ def findings_of(result: SurveyResult) -> Findings:
         largest=largest_residuals(a),
         statistics=statistics,
         geometry=geometry,
-        interior=interior_of(a),
+        interior=interior,
+        calibrated=calibrated_cameras(a, interior),
         given=given,
         check=check,
         precision=precision,

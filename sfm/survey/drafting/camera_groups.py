@@ -175,7 +175,7 @@ def _series(name: str) -> str:
 def _labels(firsts: list[Metadata]) -> list[str]:
     """Names of cameras, each once."""
     words = [re.sub(r"[^A-Za-z0-9]+", "-", one.model or "").strip("-").lower() for one in firsts]
-    plain = [word or "camera" for word in words]
+    plain = [word or "unnamed" for word in words]
     total, seen = Counter(plain), Counter[str]()
     labels = []
     for name in plain:
