@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
 from sfm.camera import camera_from_values
+from sfm.conventions import AnyArray
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
 from sfm.survey.diagnosis.codes_found import small_codes
+from sfm.survey.drafting.draft import draft_survey
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.detect import Targets, find_targets
@@ -16,9 +21,9 @@ from sfm.targets.detect import Targets, find_targets
 ACROSS, BLUR_PX = 5, 1.2
 
 
-def photographed(diameter_px: float) -> Targets:
-    """Return the targets of a photograph of 25 codes from the front, 1 px per unit."""
-    family = code_family("ring14")
+def picture_of_codes(diameter_px: float, name: str = "ring14") -> AnyArray:
+    """Return a photograph of 25 codes of a family from the front, 1 px per unit."""
+    family = code_family(name)
     assert isinstance(family, CodeFamily)
     radius = diameter_px / 2
     pitch = 2 * family.outer * radius + 11
@@ -37,7 +42,22 @@ def photographed(diameter_px: float) -> Targets:
         optics=Optics(blur_px=BLUR_PX, noise=2 / 255),
         rng=np.random.default_rng(7),
     )
-    return find_targets(picture, polarity="dark", codes="ring14", min_diameter_px=4.0)
+    return picture
+
+
+def photographed(diameter_px: float) -> Targets:
+    """Return the targets of a photograph of codes."""
+    return find_targets(picture_of_codes(diameter_px), polarity="dark", codes="ring14", min_diameter_px=4.0)
+
+
+@pytest.mark.parametrize("name", ["ring12", "necklace12"])
+def test_a_folder_of_rings_is_recognised(name: str, tmp_path: Path) -> None:
+    """Before: rings without parity were not tried, and the folder fell to natural texture."""
+    picture = picture_of_codes(16.0, name)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.rot90(picture, k))
+    draft = draft_survey(tmp_path)
+    assert f'codes = "{name}"' in draft.text
 
 
 def test_small_codes_are_told_with_what_would_do() -> None:

@@ -29,7 +29,7 @@ from sfm.targets.codes.plate_search import (
 )
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.ring_reading import read_codes
-from sfm.targets.codes.rings import RINGS, CodeFamily
+from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,
     TagFamily,
@@ -81,8 +81,12 @@ def try_targets(
     progress.stage("trial", TRIED + 4)
     tried, plain, unreadable = _readable(paths, store, progress)
     photographs = [read_photograph(path) for path in tried]
-    read = {family: list(map(partial(_ring_codes, family), photographs, plain)) for family in RINGS}
-    counts = {family: _repeated(codes) for family, codes in read.items()}
+    counts: dict[str, tuple[int, ...]] = {}
+    for families in (RINGS, NECKLACES):  # which have no parity, and so read the rings of others too
+        if all(len(codes) < MIN_REPEATED for codes in counts.values()):
+            for family in families:
+                codes = list(map(partial(_ring_codes, family), photographs, plain))
+                counts[family] = _repeated(codes)
     progress.advance("rings")
     best, plate, measured = max(counts, key=lambda family: len(counts[family])), None, plain
     if len(counts[best]) < MIN_REPEATED:
@@ -97,7 +101,7 @@ def try_targets(
             plate = _dots(plain, [path for path in more if path not in tried], store)
         progress.advance("plates of dots")
     coded = len(counts[best]) >= MIN_REPEATED and plate is None
-    if coded and best in RINGS:
+    if coded and best in RING_NAMES:
         measured = [_measure(path, best, store) for path in tried]
     return TargetTrial(
         best if coded else "none" if plate is None else plate.name,
