@@ -12,8 +12,19 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.whole_files import whole_file
-from sfm.rendering.scene import ARC, DISC, RECTANGLE, Marks, coded_ring, join_marks, square_tag
-from sfm.targets.codes.families import code_family
+from sfm.rendering.scene import (
+    ARC,
+    DISC,
+    RECTANGLE,
+    Marks,
+    coded_ring,
+    concentric_rings,
+    join_marks,
+    square_tag,
+)
+from sfm.targets.codes.concentric import ConcentricFamily
+from sfm.targets.codes.families import Family, code_family
+from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 
 # ISO 216 and ANSI/ASME Y14.1, width and height in mm.
@@ -32,7 +43,8 @@ FOOT_MM = 16.0  # room for the ruler and the text beside it
 LABEL_MM = 4.0  # room for the id below a target
 # Radius that stays clear around a target, in radii of its ring, so that neighbours are not taken for code.
 CLEAR = 1.35
-# Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag.
+# Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag,
+# and across the narrowest ring of the smallest concentric tag.
 MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
 MAX_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
 MAX_SHEET_BYTES = 100_000_000  # of 10,000 targets
@@ -53,12 +65,12 @@ class Sheet:
     """Coded targets on pages of one size."""
 
     family: str
-    diameter_mm: float  # of the dot; side of the square of a tag
+    diameter_mm: float  # of the dot, or of all of a concentric tag; side of the square of a tag
     ring_mm: float  # outer diameter of the ring; side of the square of a tag
     size_mm: tuple[float, float]  # width and height of a page
     pages: tuple[Page, ...]
     dark: bool  # dark on white; else white on dark squares
-    tags: bool = False  # whether its targets are square tags
+    whole: str = ""  # word for what of a target has the diameter, where that is all of it
 
 
 def lay_out_sheet(
@@ -73,9 +85,9 @@ def lay_out_sheet(
     """Lay coded targets out on pages, row by row from the upper left.
 
     Args:
-        family: arcs, ring12, ring14, ring20, a family of tags or the path of a code table.
+        family: arcs, ring12, ring14, ring20, a family of tags, cctag3, cctag4 or the path of a code table.
         numbers: code numbers, (k,).
-        diameter_mm: diameter of the dot, or side of the square of a tag.
+        diameter_mm: diameter of the dot, or of the outer edge of concentric rings, or side of a square tag.
         page: one of PAGES_MM.
         dark: dark targets on white; else white ones on dark squares.
         ring_radii: inner and outer radius of the rings in radii of the dot; else those of the family.
@@ -96,10 +108,11 @@ def lay_out_sheet(
     if not diameter_mm > 0:
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]
+    smallest = MIN_DOT_MM
     if isinstance(codes, TagFamily):
         smallest = MIN_MODULE_MM * codes.modules
-    else:
-        smallest = MIN_DOT_MM
+    elif isinstance(codes, ConcentricFamily):
+        smallest = 2 * MIN_MODULE_MM / codes.narrow
     if diameter_mm < smallest:
         raise SurveyFileError(
             f"targets: diameter is {diameter_mm:g} mm, needed at least {smallest:g} mm for {codes.name} to "
@@ -112,7 +125,7 @@ def lay_out_sheet(
             "every code once"
         )
     if ring_radii is not None:
-        if isinstance(codes, TagFamily):
+        if not isinstance(codes, CodeFamily):
             raise SurveyFileError(f"targets: radii of the ring are of rings, {codes.name} has none")
         if not 1 < ring_radii[0] < ring_radii[1]:
             raise SurveyFileError(
@@ -120,14 +133,14 @@ def lay_out_sheet(
                 "needed more than 1 and the second larger"
             )
         codes = replace(codes, inner=ring_radii[0], outer=ring_radii[1])
-    tags = isinstance(codes, TagFamily)
-    ring = diameter_mm if isinstance(codes, TagFamily) else codes.outer * diameter_mm
+    whole = {TagFamily: "square", ConcentricFamily: "outer edge"}.get(type(codes), "")
+    ring = codes.outer * diameter_mm if isinstance(codes, CodeFamily) else diameter_mm
     across, down = CLEAR * ring, CLEAR * ring + LABEL_MM
     columns = int((width - 2 * MARGIN_MM) // across)
     rows = int((height - 2 * MARGIN_MM - FOOT_MM) // down)
     if columns < 1 or rows < 1:
         raise SurveyFileError(
-            f"targets: a {'tag' if tags else 'ring'} of {ring:.1f} mm with its surroundings does not fit "
+            f"targets: a {'tag' if whole else 'ring'} of {ring:.1f} mm with its surroundings does not fit "
             f"on {page} ({width:g} x {height:g} mm)"
         )
     pages = []
@@ -137,14 +150,18 @@ def lay_out_sheet(
         left = (width - columns * across) / 2 + across / 2
         top = height - MARGIN_MM - across / 2
         centre = np.column_stack([left + across * (k % columns), top - down * (k // columns)])
-        marks = [
-            square_tag(0, at, diameter_mm / 2, int(n), codes, 1.0, 0.0)
-            if isinstance(codes, TagFamily)
-            else coded_ring(0, at, diameter_mm / 2, int(n), codes, 1.0)
-            for at, n in zip(centre, some, strict=True)
-        ]
+        marks = [_target(at, diameter_mm / 2, int(n), codes) for at, n in zip(centre, some, strict=True)]
         pages.append(Page(some, centre, join_marks(marks)))
-    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark, tags)
+    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark, whole)
+
+
+def _target(at: FloatArray, half: float, number: int, codes: Family) -> Marks:
+    """Return the marks of one target about a centre (2,); half its diameter in mm."""
+    if isinstance(codes, TagFamily):
+        return square_tag(0, at, half, number, codes, 1.0, 0.0)
+    if isinstance(codes, ConcentricFamily):
+        return concentric_rings(0, at, half, number, codes, 1.0)
+    return coded_ring(0, at, half, number, codes, 1.0)
 
 
 def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
@@ -268,8 +285,8 @@ def _texts(sheet: Sheet, k: int) -> list[tuple[float, float, float, str]]:
     height = 0.6 * LABEL_MM
     texts = [(x, y - below, height, str(n)) for (x, y), n in zip(page.centre, page.number, strict=True)]
     size = f"dot {sheet.diameter_mm:g} mm, ring {sheet.ring_mm:g} mm"
-    if sheet.tags:
-        size = f"square {sheet.diameter_mm:g} mm"
+    if sheet.whole:
+        size = f"{sheet.whole} {sheet.diameter_mm:g} mm"
     family = "".join(letter if letter.isprintable() else "?" for letter in sheet.family)
     if len(family) > MAX_LETTERS:
         family = family[: MAX_LETTERS - 3] + "..."

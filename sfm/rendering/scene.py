@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.targets.codes.concentric import ConcentricFamily
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily, tag_modules
 
@@ -173,6 +174,32 @@ def coded_ring(
     at = np.tile(np.asarray(centre, float), (k, 1))
     ring = Marks(np.full(k, face), np.full(k, ARC), at, shape, np.full(k, value))
     return join_marks([discs(face, at[:1], radius, value), ring])
+
+
+def concentric_rings(
+    face: int, centre: FloatArray, radius: float, number: int, family: ConcentricFamily, value: float
+) -> Marks:
+    """Return the rings of one concentric tag.
+
+    Args:
+        face: the face it is on.
+        centre: plane coordinates, (2,), object unit.
+        radius: of the outer edge, object unit.
+        number: id of the tag.
+        family: the family of tags.
+        value: reflectance of the rings.
+
+    Returns:
+        An arc of a full turn for each ring.
+
+    Raises:
+        GeometryError: the family has no such tag.
+    """
+    edges = radius * family.radii(number).reshape(-1, 2)
+    k = len(edges)
+    shape = np.column_stack([edges[:, 1], edges[:, 0], np.zeros(k), np.full(k, 2 * np.pi)])
+    at = np.tile(np.asarray(centre, float), (k, 1))
+    return Marks(np.full(k, face), np.full(k, ARC), at, shape, np.full(k, value))
 
 
 def square_tag(

@@ -27,6 +27,7 @@ from sfm.rendering.scene import (
     join_marks,
     rectangles,
 )
+from sfm.targets.codes.concentric import ConcentricFamily
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
@@ -179,7 +180,7 @@ def read_scene(path: Path) -> Staging:
         ) from error
     faces = _faces(file.face)
     family = code_family(file.scene.codes)
-    if isinstance(family, TagFamily):
+    if isinstance(family, TagFamily | ConcentricFamily):
         raise SurveyFileError(f"{path}: codes = '{family.name}', expected rings or arcs")
     rng = np.random.default_rng(file.scene.seed)
     marks: list[Marks] = []

@@ -19,7 +19,8 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 
-NO_CIRCLE = Flag.CORNER | Flag.CROSSING
+# No centres of ellipses: nothing is eccentric in these.
+NO_CIRCLE = Flag.CORNER | Flag.CROSSING | Flag.CONCENTRIC
 
 NOT_A_CIRCLE = (
     0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2

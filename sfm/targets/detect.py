@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from sfm.targets.candidates import (
     judge_fits,
 )
 from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
 from sfm.targets.codes.plates import BOARDS, PlateFamily
@@ -25,6 +26,7 @@ from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
 from sfm.targets.fits.centroid import WEIGHTS, measure_centroids
+from sfm.targets.fits.concentric import BACKGROUND, BLUR, CONTRAST
 from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
 from sfm.targets.fits.saddle import Saddles
 from sfm.targets.flags import Flag
@@ -139,7 +141,7 @@ def find_targets(
         raise KolinearError(
             f"diameters from {min_diameter_px} to {max_diameter_px} px, expected positive ones in order"
         )
-    if not isinstance(codes, str | CodeFamily | TagFamily | PlateFamily):
+    if not isinstance(codes, str | CodeFamily | TagFamily | ConcentricFamily | PlateFamily):
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
@@ -171,6 +173,10 @@ def find_targets(
     if isinstance(family, TagFamily):
         tags = find_tags(photograph, family, polarity=polarity, scale=scale)
         reason[(reason == 0) & inside_tags(fit.xy, tags, family)] = Flag.PART_OF_CODE
+    rings = None
+    if isinstance(family, ConcentricFamily):
+        rings = find_concentric(photograph, family, outlines, noise=noise, scale=scale)
+        reason[(reason == 0) & rings.inside(fit.xy)] = Flag.PART_OF_CODE
     good = reason == 0
     if isinstance(family, CodeFamily):
         code[~good] = UNCODED
@@ -208,6 +214,8 @@ def find_targets(
         rejected_xy=np.vstack([outlines.rejected_xy, outlines.xy[reason != 0]]),
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
     )
+    if rings is not None:
+        return _with_concentric(targets, rings)
     return targets if tags is None else _with_corners(targets, tags)
 
 
@@ -249,6 +257,36 @@ def _of_crossings(found: Saddles, code: IntArray) -> Targets:
         flag=np.full(k, Flag.CROSSING.value),
         rejected_xy=np.zeros((0, 2)),
         rejected_flag=np.zeros(0, dtype=np.int64),
+    )
+
+
+def _with_concentric(targets: Targets, rings: ConcentricTags) -> Targets:
+    """Return circular targets and the centres of concentric tags behind them, drawn as their outer edges."""
+    if not rings.fits:
+        return targets
+    theta = np.array([fit.theta for fit in rings.fits])
+    covariance = np.array([fit.covariance for fit in rings.fits])
+    semi_axes, angle = axes_from_shape(theta[:, 2:5])
+    edge = covariance[:, BACKGROUND : BLUR + 1, BACKGROUND : BLUR + 1]
+    flag = np.array([fit.flag for fit in rings.fits]) | Flag.CONCENTRIC.value
+    return replace(
+        targets,
+        xy=np.vstack([targets.xy, theta[:, :2]]),
+        covariance=np.concatenate([targets.covariance, covariance[:, :2, :2]]),
+        axes_covariance=np.concatenate(
+            [targets.axes_covariance, axes_covariance(semi_axes, angle, covariance[:, 2:5, 2:5])]
+        ),
+        edge_covariance=np.concatenate([targets.edge_covariance, edge]),
+        semi_axes=np.vstack([targets.semi_axes, semi_axes]),
+        angle=np.append(targets.angle, angle),
+        code=np.append(targets.code, rings.code),
+        confidence=np.append(targets.confidence, rings.confidence),
+        polarity=np.append(targets.polarity, np.sign(theta[:, CONTRAST]).astype(np.int64)),
+        contrast=np.append(targets.contrast, theta[:, CONTRAST]),
+        background=np.append(targets.background, theta[:, BACKGROUND]),
+        blur=np.append(targets.blur, theta[:, BLUR]),
+        noise=np.append(targets.noise, [fit.noise for fit in rings.fits]),
+        flag=np.append(targets.flag, flag),
     )
 
 

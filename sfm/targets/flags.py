@@ -40,8 +40,9 @@ class Flag(IntFlag):
     LOBED = 1 << 20  # the outline deviates from the ellipse as bars and squares do
     THIN_BACKGROUND = 1 << 21  # the background is only a thin stroke, as in a letter "o"
     NOT_ON_PLATE = 1 << 22  # no dot of the calibration plate
-    # another remark
+    # other remarks
     DAMAGED = 1 << 23  # a nick, a scratch or a mark in the target was left out of the fit
+    CONCENTRIC = 1 << 24  # the image of the common centre of rings, not eccentric
 
 
 # Reasons for a rejection, those first of which a candidate is most like a target: it has passed the tests of

@@ -60,6 +60,30 @@ def test_the_printed_page_is_read_back(tmp_path, family, dark):
         assert axes == pytest.approx(4.0 * PX_PER_MM, abs=1.0)
 
 
+@pytest.mark.parametrize("dark", [True, False])
+@pytest.mark.parametrize("family", ["cctag3", "cctag4"])
+def test_printed_concentric_tags_are_read_back(tmp_path, family, dark):
+    numbers = np.array([0, 5, 10, 21, 31])
+    sheet = lay_out_sheet(family, numbers, diameter_mm=16.0, dark=dark)
+    assert sheet.ring_mm == 16.0
+    (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
+    picture = drawn(file, sheet.size_mm)[: 60 * PX_PER_MM]
+    found = find_targets(picture, polarity="dark" if dark else "bright", codes=family, min_diameter_px=40)
+    read = found.code >= 0
+    assert sorted(found.code[read]) == numbers.tolist()
+    page = sheet.pages[0]
+    for xy, axes, code in zip(found.xy[read], found.semi_axes[read], found.code[read], strict=True):
+        at = page.centre[np.flatnonzero(page.number == code)[0]]
+        assert xy == pytest.approx(np.array([at[0], sheet.size_mm[1] - at[1]]) * PX_PER_MM - 0.5, abs=0.1)
+        assert axes == pytest.approx(8.0 * PX_PER_MM, abs=1.0)
+    with pytest.raises(SurveyFileError, match="at least"):
+        lay_out_sheet(family, numbers, diameter_mm=4.0)
+    with pytest.raises(SurveyFileError, match="radii of the ring"):
+        lay_out_sheet(family, numbers, diameter_mm=16.0, ring_radii=(2.0, 3.0))
+    with pytest.raises(GeometryError):
+        lay_out_sheet(family, np.array([128]), diameter_mm=16.0)
+
+
 def test_rings_of_other_radii_are_printed_and_read(tmp_path):
     sheet = lay_out_sheet("ring12", np.arange(1, 9), diameter_mm=8.0, ring_radii=(1.7, 2.4))
     assert sheet.ring_mm == pytest.approx(2.4 * 8)

@@ -175,8 +175,8 @@ def targets(
         str,
         typer.Option(
             "--family",
-            help="ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 ...), or a code "
-            "table file.",
+            help="ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 ...), cctag3, "
+            "cctag4, or a code table file.",
         ),
     ] = "ring14",
     ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once.")] = "1-100",
@@ -185,7 +185,8 @@ def targets(
         typer.Option(
             "--diameter-mm",
             metavar="MM",
-            help="Diameter of the dot, at least 1 mm; of tags the side of the square.",
+            help="Diameter of the dot, at least 1 mm; of cctag3 and cctag4 "
+            "that of the outer edge; of square tags the side.",
         ),
     ] = 10.0,
     page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",

@@ -19,6 +19,7 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TARGETS, MeasuredStore, measured_once
 from sfm.survey.measuring.photographs import each_photograph
+from sfm.targets.codes.concentric import ConcentricFamily
 from sfm.targets.codes.families import TargetFamily
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import TagFamily
@@ -117,7 +118,7 @@ def measure_photograph(
 def target_settings(settings: TargetSettings, family: TargetFamily | None) -> str:
     """Return what the targets of a photograph depend on besides it, for the store of what was measured."""
     codes = "none"
-    if isinstance(family, TagFamily):
+    if isinstance(family, TagFamily | ConcentricFamily):
         codes = family.name
     elif isinstance(family, PlateFamily):
         codes = repr(family)

@@ -2,9 +2,9 @@
 
 A family of rings with a table in a file needs that file only. One that follows the rule of
 `ring_patterns` is a row in `rings.RINGS`, one of all necklaces in `rings.NECKLACES`, a dictionary of square
-tags a row in `tags.DICTIONARIES`. Another kind of code is a module beside these with a type for its families,
-a row below, and its reading in `sfm.targets.detect`, behind that of rings (numbers for measured dots) or of
-tags (points of its own).
+tags a row in `tags.DICTIONARIES`, concentric rings a row in `concentric.WIDTHS`. Another kind of code is a
+module beside these with a type for its families, a row below, and its reading in `sfm.targets.detect`, behind
+that of rings (numbers for measured dots) or of tags (points of its own).
 """
 
 from __future__ import annotations
@@ -15,16 +15,18 @@ from functools import partial
 from pathlib import Path
 
 from sfm.errors import SurveyFileError
+from sfm.targets.codes.concentric import WIDTHS, ConcentricFamily, concentric_family
 from sfm.targets.codes.plates import PLATES, PlateFamily
 from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, ring_family
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
 
-Family = CodeFamily | TagFamily
+Family = CodeFamily | TagFamily | ConcentricFamily
 TargetFamily = Family | PlateFamily  # a plate has no name that says all of it
 FAMILIES: dict[str, Callable[[], Family | None]] = {
     **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,
     **{name: partial(tag_family, name) for name in DICTIONARIES},
+    **{name: partial(concentric_family, name) for name in WIDTHS},
 }
 
 

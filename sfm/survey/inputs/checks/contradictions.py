@@ -28,6 +28,7 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
     TiePointSettings,
 )
+from sfm.targets.codes.concentric import WIDTHS
 from sfm.targets.codes.families import FAMILIES, is_table
 from sfm.targets.codes.plates import PLATES, TAGGED
 from sfm.targets.codes.tags import DICTIONARIES
@@ -179,7 +180,7 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
         )
     if targets.ring_radii is not None:
         inner, outer = targets.ring_radii
-        if targets.codes in ("none", *DICTIONARIES, *PLATES):
+        if targets.codes in ("none", *DICTIONARIES, *WIDTHS, *PLATES):
             raise SurveyFileError(
                 f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
             )

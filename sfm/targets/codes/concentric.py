@@ -1,0 +1,315 @@
+"""Concentric circle tags (CCTag): black rings about one centre whose widths are the code.
+
+The outer edge has the radius 1. Each following edge is one step within the one before; a step is narrow for a
+clear bit and wide for a set one, the first step is the highest bit. Rings are black and white in turn from
+the outside, and the disc in the middle is white. The point of a tag is the image of the common centre, not
+the centre of an ellipse.
+
+Source: Calvet, Gurdjos, Griwodz and Gasparini (2016), "Detection and accurate localization of circular
+fiducials under highly challenging conditions", CVPR; widths as published with alicevision/CCTag.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.kernels.sampling import as_grey, resample
+from sfm.targets.fits.concentric import (
+    CONTRAST,
+    GEOMETRY,
+    SPREAD,
+    SPREAD_SIGMA,
+    SURROUNDINGS,
+    ConcentricFit,
+    fit_concentric,
+    fit_edges,
+    positions_at,
+    rho_at,
+)
+from sfm.targets.measure import axes_from_shape
+from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, Outlines
+
+# Number of steps, their least width and what a set bit adds, in outer radii.
+WIDTHS = {"cctag3": (5, 0.10, 0.05), "cctag4": (7, 0.08, 0.04)}
+# Rings wider than this are told apart on every ray, as modules of tags are (`tags.MIN_MODULE_PX`).
+RESOLVED_PX = 3.0
+# Rays on which edges are looked for, samples per px on them, and the share of rays that must show all edges.
+RAYS, SAMPLES_PER_PX, MIN_RAYS = 64, 2.0, 0.5
+# Blurs, px, and errors of the outline's size with which profiles of the tags are compared, samples of these.
+PROFILE_BLURS, PROFILE_SIZES, PROFILE = (0.6, 0.9, 1.3, 1.8, 2.5), (0.96, 0.98, 1.0, 1.02, 1.04), 80
+# Of a profile so much may not be explained by a tag (0.05 of those of 48 tags of 15 to 60 px, and the right
+# one explained most), and so many of the most similar tags are fitted.
+UNEXPLAINED, FITTED = 0.1, 2
+# A code is read if the radii are within a quarter of the way to any other code, the ink spreads by no more
+# than a quarter of a bit, and half the way is at least so many standard deviations.
+QUARTER, CODE_SIGMAS = 0.25, 5.0
+# A priori sigma of a radius in print, outer radii: 0.05 mm on a tag of 40 mm, one dot of 600 dots per inch.
+PRINT_SIGMA = 0.0025
+# Largest root mean square residual on a sixteenth of the circumference, in steps of intensity, as for modules
+# of tags (`whole_tag`).
+WRONG_SECTOR = 0.3
+
+
+@dataclass(frozen=True)
+class ConcentricFamily:
+    """The tags of one number of rings."""
+
+    name: str
+    """a name in WIDTHS"""
+    steps: int
+    """number of steps from the outer edge to the white disc, one bit each"""
+    narrow: float
+    """width of the step of a clear bit, outer radii"""
+    bit: float
+    """what a set bit adds, outer radii"""
+
+    @property
+    def count(self) -> int:
+        """Number of tags; their ids begin with 0."""
+        return 1 << self.steps
+
+    def radii(self, number: int) -> FloatArray:
+        """Return the radii of all edges from the outside inwards, the first is 1, shape (steps + 1,).
+
+        Raises:
+            GeometryError: the family has no such tag.
+        """
+        if not 0 <= number < self.count:
+            raise GeometryError(f"tag {number}: family {self.name} has 0 to {self.count - 1}")
+        bits = (number >> np.arange(self.steps - 1, -1, -1)) & 1
+        return np.append(1.0, 1.0 - np.cumsum(self.narrow + self.bit * bits))
+
+
+@dataclass(frozen=True)
+class ConcentricTags:
+    """The tags of one photograph."""
+
+    code: IntArray
+    """ids, shape (k,)"""
+    confidence: FloatArray
+    """1 where the radii are those of the code, 0.5 a quarter of the way to another one, shape (k,)"""
+    fits: tuple[ConcentricFit, ...]
+    """the fit of each tag"""
+
+    def inside(self, xy: FloatArray) -> BoolArray:
+        """Return which positions (n, 2) are on a tag or the paper close about it."""
+        within = np.zeros(len(xy), dtype=bool)
+        for fit in self.fits:
+            geometry = fit.theta[:GEOMETRY]
+            reach = 2 * axes_from_shape(geometry[None, 2:5])[0][0, 0]  # rho is of the plane, not behind it
+            near = np.hypot(*(xy - geometry[:2]).T) < reach
+            within[near] |= rho_at(geometry, xy[near])[0] < SURROUNDINGS
+        return within
+
+
+def concentric_family(name: str) -> ConcentricFamily:
+    """Return the family of a name in WIDTHS."""
+    return ConcentricFamily(name, *WIDTHS[name])
+
+
+def mean_radius(geometry: FloatArray) -> float:
+    """Return the mean radius of the outer edge, px."""
+    p, q, r = geometry[2:5]
+    return float(abs(p * r - q * q) ** -0.5)
+
+
+def find_concentric(
+    photograph: AnyArray, family: ConcentricFamily, outlines: Outlines, *, noise: float, scale: float
+) -> ConcentricTags:
+    """Read and measure the tags among the outlines of a photograph.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+        family: the number of rings.
+        outlines: of which some are outer edges of tags.
+        noise: standard deviation of the intensities.
+        scale: largest intensity that the photograph can hold; what reaches it is censored.
+
+    Returns:
+        The tags, each once.
+    """
+    grey = as_grey(photograph)
+    table = np.array([family.radii(k) for k in range(family.count)])
+    least = max(STEP_SIGMAS * noise, MIN_STEP * scale)
+    read = []
+    for k in np.flatnonzero(_resembles_rings(grey, outlines, least)):
+        start = np.concatenate([outlines.xy[k], outlines.shape[k], [0.0, 0.0]])
+        one = _read(grey, start, float(outlines.sign[k]), table, family, noise=noise, scale=scale)
+        if one is not None:
+            read.append(one)
+    read.sort(key=lambda one: -one[1])
+    kept: list[tuple[int, float, ConcentricFit]] = []
+    for one in read:
+        tags = ConcentricTags(np.zeros(0, np.int64), np.zeros(0), tuple(fit for _, _, fit in kept))
+        if not tags.inside(one[2].theta[None, :2])[0]:
+            kept.append(one)
+    code = np.array([number for number, _, _ in kept], dtype=np.int64)
+    confidence = np.array([sure for _, sure, _ in kept], dtype=float)
+    return ConcentricTags(code, confidence, tuple(fit for _, _, fit in kept))
+
+
+def _resembles_rings(grey: AnyArray, outlines: Outlines, least: float) -> BoolArray:
+    """Return within which outlines there is ink at the edge, and paper in the middle and outside, (k,)."""
+    if not len(outlines.xy):
+        return np.zeros(0, dtype=bool)
+    p, q, r = outlines.shape.T[:, :, None]
+    angle = np.linspace(0, 2 * math.pi, 16, endpoint=False)
+    c, s = np.cos(angle), np.sin(angle)
+    det = p * r - q * q
+    ray = np.stack([(r * c - q * s) / det, (p * s - q * c) / det], axis=-1)
+    radii = np.array([0.0, 0.93, SURROUNDINGS])
+    places = outlines.xy[:, None, None] + radii[:, None, None] * ray[:, None]
+    height, width = grey.shape
+    low, high = places.min(axis=(1, 2)), places.max(axis=(1, 2))
+    inside = (low >= 0).all(axis=1) & (high[:, 0] < width - 1) & (high[:, 1] < height - 1)
+    places = np.clip(places, 0, [width - 1, height - 1])
+    value = resample(grey, places.reshape(-1, 2), interpolation="bilinear").reshape(places.shape[:3])
+    middle, ring, paper = np.median(value, axis=2).T * outlines.sign
+    step = ring - paper
+    return np.asarray(inside & (step > least / 2) & (ring - middle > step / 4))
+
+
+def _read(
+    grey: AnyArray,
+    start: FloatArray,
+    sign: float,
+    table: FloatArray,
+    family: ConcentricFamily,
+    *,
+    noise: float,
+    scale: float,
+) -> tuple[int, float, ConcentricFit] | None:
+    """Return id, confidence and fit of the tag with about this outer edge; None if there is none."""
+    least = max(STEP_SIGMAS * noise, MIN_STEP * scale)
+    length = mean_radius(start)
+    found = _edges_on_rays(grey, start, sign, family)
+    if found is None:
+        return None
+    geometry = found
+    length = mean_radius(geometry)
+    angle = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)
+    rho = (np.arange(PROFILE) + 0.5) / PROFILE * SURROUNDINGS
+    places = positions_at(geometry, rho, angle)
+    if not _within(grey, places):
+        return None
+    profile = np.median(_sampled(grey, places), axis=0)
+    for number, size, blur in _most_similar(profile, rho, table, length):
+        begin = geometry.copy()
+        begin[2:5] /= size
+        fit = fit_concentric(grey, begin, table[number], blur, noise=noise, saturation=scale)
+        if fit is None:
+            continue
+        contrast = sign * fit.theta[CONTRAST]
+        confidence = _confidence(fit, number, table, family)
+        if confidence > 0 and contrast > least and fit.sectors.max() < WRONG_SECTOR * contrast:
+            return number, confidence, fit
+    return None
+
+
+def _confidence(fit: ConcentricFit, number: int, table: FloatArray, family: ConcentricFamily) -> float:
+    """Return how well the radii agree with the code, 0 where another code is not excluded.
+
+    The line from this code to each other one is followed to the place where the photograph fits best: 0 is
+    this code, 1 the other. Errors of the radii in print and the spread of the ink are random, a priori.
+    """
+    others = np.delete(table, number, axis=0)[:, 1:] - table[number, 1:]
+    n = family.steps
+    spreads = SPREAD_SIGMA * (1 - 2 * (np.arange(1, n + 1) % 2))
+    printed = PRINT_SIGMA**2 * np.eye(n) + np.outer(spreads, spreads)
+    # (M^-1 + R)^-1 of the information M and the covariance R in print, and its product with the corrections
+    weight = np.linalg.inv(np.eye(n) + fit.radius_information @ printed)
+    length = np.einsum("ki,ij,kj->k", others, weight @ fit.radius_information, others)
+    place = others @ (weight @ fit.radius_gradient) / np.maximum(length, 1e-12)
+    spread = abs(fit.theta[SPREAD]) / family.bit
+    if spread > QUARTER or np.abs(place).max() > QUARTER or length.min() < (2 * CODE_SIGMAS) ** 2:
+        return 0.0
+    return float(1 - 2 * np.abs(place).max())
+
+
+def _edges_on_rays(
+    grey: AnyArray, start: FloatArray, sign: float, family: ConcentricFamily
+) -> FloatArray | None:
+    """Return the geometry through the edges on rays.
+
+    Where the rays do not show all edges of a small tag, the outermost alone gives the geometry.
+    """
+    edges = family.steps + 1
+    angle = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)
+    longest, shortest = axes_from_shape(start[None, 2:5])[0][0]
+    count = int(np.clip(SAMPLES_PER_PX * SURROUNDINGS * longest, 40, 1000))
+    rho = np.linspace(SURROUNDINGS, 0.0, count)
+    places = positions_at(start, rho, angle)
+    if not _within(grey, places):
+        return None
+    value = sign * _sampled(grey, places)
+    paper = float(np.median(value[:, rho > 1.07]))
+    ink = float(np.percentile(value[:, rho < 1.0], 95))
+    if ink <= paper:
+        return None
+    level = (value - paper) / (ink - paper) - 0.5
+    crossing = (level[:, 1:] > 0) != (level[:, :-1] > 0)
+    complete = (crossing.sum(axis=1) == edges) & (level[:, 0] < 0)
+    some = crossing.any(axis=1) & (level[:, 0] < 0)
+    if some.mean() < MIN_RAYS:
+        return None
+    ray, at = np.nonzero(crossing)
+    ring = (np.cumsum(crossing, axis=1) - 1)[ray, at]
+    before, after = level[ray, at], level[ray, at + 1]
+    share = before / (before - after)
+    xy = places[ray, at] + share[:, None] * (places[ray, at + 1] - places[ray, at])
+    geometry = None
+    if complete.mean() >= MIN_RAYS:
+        of = complete[ray]
+        geometry = fit_edges(start, xy[of], ring[of], edges)
+    elif family.narrow * shortest > RESOLVED_PX:
+        return None
+    if geometry is None:
+        of = some[ray] & (ring == 0)
+        geometry = fit_edges(start, xy[of], ring[of], 1)
+    return geometry
+
+
+def _most_similar(
+    profile: FloatArray, rho: FloatArray, table: FloatArray, length: float
+) -> list[tuple[int, float, float]]:
+    """Return the most similar tags, sizes of their outer edges and blurs, px, at most FITTED."""
+    size = np.array(PROFILE_SIZES)
+    blur = np.array(PROFILE_BLURS)[:, None, None] / length
+    sign = 1.0 - 2 * (np.arange(table.shape[1]) % 2)
+    shape = (len(table), len(size), len(blur), len(rho))
+    ink = np.zeros(shape)
+    for i in range(table.shape[1]):
+        edge = (table[:, i, None] * size)[:, :, None, None]
+        ink += sign[i] * ndtr((edge - rho) / blur[:, :, 0][None, None])
+    weight = rho / rho.sum()
+    ink -= (ink @ weight)[..., None]
+    seen = profile - profile @ weight
+    explained = (ink @ (weight * seen)) ** 2 / np.maximum((ink * ink) @ weight, 1e-12)
+    share = explained / max(float(weight @ (seen * seen)), 1e-12)
+    best = share.reshape(len(table), -1)
+    order = np.argsort(-best.max(axis=1))[:FITTED]
+    at = best.argmax(axis=1)
+    return [
+        (int(k), float(size[at[k] // len(blur)]), PROFILE_BLURS[at[k] % len(blur)])
+        for k in order
+        if best[k].max() > 1 - UNEXPLAINED
+    ]
+
+
+def _within(grey: AnyArray, places: FloatArray) -> bool:
+    """Return whether all positions (..., 2) are in the photograph."""
+    height, width = grey.shape
+    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
+    return bool(np.isfinite(places).all() and low.min() >= 0 and high[0] < width - 1 and high[1] < height - 1)
+
+
+def _sampled(grey: AnyArray, places: FloatArray) -> FloatArray:
+    """Return the intensities at positions (k, m, 2), shape (k, m)."""
+    value = resample(grey, places.reshape(-1, 2), interpolation="bilinear")
+    return np.asarray(value, dtype=float).reshape(places.shape[:2])
