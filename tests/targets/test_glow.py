@@ -85,7 +85,8 @@ def test_glare_on_one_side_is_flare() -> None:
 
 
 def test_every_flag_has_its_own_colour_in_the_overlays() -> None:
-    rejections = [flag for flag in Flag if flag.value >= 1 << 8 and flag is not Flag.DAMAGED]
+    remarks = (Flag.DAMAGED, Flag.CONCENTRIC)
+    rejections = [flag for flag in Flag if flag.value >= 1 << 8 and flag not in remarks]
     colours = (*REASON_COLOURS, *REMARK_COLOURS)
     assert [flag for flag, _ in REASON_COLOURS] == rejections
     assert len({colour for _, colour in colours}) == len(colours)
