@@ -133,16 +133,15 @@ def _tags_and_boards(
     A checkerboard may be a ChArUco board, which its tags show.
     """
     none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
-    plate = search_april_grid(tried)  # first, since modules of tags may pass for squares
+    others = [_as_bytes(read_photograph(path)) for path in more if path not in read_already]
+    plate = search_april_grid(tried, others)  # first, since modules of tags may pass for squares
     if plate is not None:
         return "", plate
-    plate = search_checkerboard(
-        [read_already[path] if path in read_already else _as_bytes(read_photograph(path)) for path in more]
-    )
+    plate = search_checkerboard([*tried, *others])
     progress.advance("boards")
-    read = [read_dictionaries(photograph) for photograph in (tried if plate is None else tried[:1])]
-    if plate is not None and read[0]:
-        read += [read_dictionaries(photograph) for photograph in tried[1:]]
+    read = [read_dictionaries(photograph) for photograph in tried]
+    if any(read):
+        read += [read_dictionaries(photograph) for photograph in others]
     progress.advance("tags")
     repeated = {
         family: _shared([one.get(family, none)[0] for one in read]) for family in LARGEST_DICTIONARIES
@@ -152,7 +151,7 @@ def _tags_and_boards(
         return "", plate
     seen = [one.get(family, none) for one in read]
     family = smallest_dictionary(family, repeated[family])
-    return family, search_charuco(tried, family, seen) or plate
+    return family, search_charuco([*tried, *others], family, seen) or plate
 
 
 def _shared(photographs: Sequence[IntArray]) -> IntArray:

@@ -105,14 +105,29 @@ def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:
 
 def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
     """Return the crossings of a ChArUco board and their points."""
+    for board in charuco_patterns(plate):
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if ids is not None and len(ids):  # none are found on a board whose tags are elsewhere
+            code = np.asarray(ids).reshape(-1).astype(np.int64)
+            return np.asarray(corners, dtype=float).reshape(-1, 2), code
+    return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+
+
+def charuco_patterns(plate: PlateFamily) -> list[cv2.aruco.CharucoBoard]:
+    """Return the boards of these rows and columns: the tags begin in the second square, or in the first.
+
+    The latter is that of OpenCV before 4.6 where rows of squares are even in number.
+    """
     size = plate.columns + 1, plate.rows + 1
     numbers = plate.first_tag + np.arange(size[0] * size[1] // 2)
-    dictionary = opencv_dictionary(plate.dictionary)
-    board = cv2.aruco.CharucoBoard(size, 1.0, plate.tag_share, dictionary, numbers)
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-    if ids is None or len(ids) == 0:
-        return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-    return np.asarray(corners, dtype=float).reshape(-1, 2), np.asarray(ids).reshape(-1).astype(np.int64)
+    boards = []
+    for is_older in (False, True) if size[1] % 2 == 0 else (False,):
+        board = cv2.aruco.CharucoBoard(
+            size, 1.0, plate.tag_share, opencv_dictionary(plate.dictionary), numbers
+        )
+        board.setLegacyPattern(is_older)
+        boards.append(board)
+    return boards
 
 
 def _spacing(xy: FloatArray) -> FloatArray:

@@ -16,12 +16,11 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.targets.codes.april_grids import name_corners, read_april_tags
-from sfm.targets.codes.boards import find_crossings, reduced
+from sfm.targets.codes.boards import charuco_patterns, find_crossings, reduced
 from sfm.targets.codes.cut_boards import board_ends
 from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
 from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plates import GRIDS, PlateFamily, quarter_turn, refuse_unusable_plate
-from sfm.targets.codes.tags import opencv_dictionary
 
 LEAST_SIDE, LEAST_DOTS, LEAST_CROSSINGS = 3, 20, 12
 FILLED = 0.8  # of the places of a plate hold dots
@@ -73,9 +72,13 @@ def search_charuco(
         down = next((n for n in range(2, MAX_SQUARES) if across * n // 2 > last), None)
         if down is None:
             continue
-        board = cv2.aruco.CharucoBoard((across, down), 1.0, 0.5, opencv_dictionary(dictionary))
-        middle = np.array(board.getObjPoints())[:, :, :2].mean(axis=1)
-        shares = [share for one in tags if (share := _tag_share(*one, middle)) is not None]
+        middles = [
+            np.array(board.getObjPoints())[:, :, :2].mean(axis=1)
+            for board in charuco_patterns(PlateFamily("charuco", down - 1, across - 1, (), dictionary, 0.5))
+        ]
+        shares = max(
+            ([share for one in tags if (share := _tag_share(*one, middle))] for middle in middles), key=len
+        )
         if len(shares) < 2:
             continue
         share = round(float(np.median(shares)), 3)
@@ -85,16 +88,17 @@ def search_charuco(
     return None
 
 
-def search_april_grid(photographs: Sequence[AnyArray]) -> PlateFamily | None:
+def search_april_grid(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()) -> PlateFamily | None:
     """Return the AprilGrid that photographs (uint8) show, of tags of Kalibr's family; None without.
 
-    The first photograph decides whether others are read. Of several grids side by side it is the one with
-    the lowest numbers.
+    Others are read where one that is tried has tags. Of several grids side by side it is the one with the
+    lowest numbers.
     """
-    seen = [read_april_tags(photographs[0], KALIBR_TAGS)] if photographs else []
-    if not seen or len(seen[0][0]) < LEAST_TAGS:
+    seen = [read_april_tags(grey, KALIBR_TAGS) for grey in tried]
+    if not any(len(number) >= LEAST_TAGS for number, _ in seen):
         return None
-    seen += [read_april_tags(grey, KALIBR_TAGS) for grey in photographs[1:]]
+    photographs = [*tried, *others]
+    seen += [read_april_tags(grey, KALIBR_TAGS) for grey in others]
     first = min(int(number.min()) for number, _ in seen if len(number))
     last = max(int(number.max()) for number, _ in seen if len(number)) - first
     sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # whole, or with other grids behind it

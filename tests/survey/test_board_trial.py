@@ -1,0 +1,68 @@
+"""Boards that a trial of some photographs recognises: behind empty photographs, of older patterns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import AnyArray
+from sfm.survey.drafting.target_trial import try_targets
+from sfm.targets.codes.plate_search import search_april_grid
+from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.tags import opencv_dictionary
+from sfm.targets.detect import find_targets
+from tests.synthetic import seed_of
+from tests.targets.test_april_grids import drawn, photographed
+
+CHARUCO = PlateFamily("charuco", 7, 5, (), "aruco4x4_50", 0.74)
+EMPTY = np.full((520, 640), 128, dtype=np.uint8)
+SQUARE_PX = 52
+
+
+def charuco_photograph(name: str, *, is_older: bool = False) -> AnyArray:
+    """Return an oblique photograph of OpenCV's drawing of a board."""
+    board = cv2.aruco.CharucoBoard(
+        (CHARUCO.columns + 1, CHARUCO.rows + 1), 1.0, CHARUCO.tag_share, opencv_dictionary(CHARUCO.dictionary)
+    )
+    board.setLegacyPattern(is_older)
+    size = SQUARE_PX * (CHARUCO.columns + 1), SQUARE_PX * (CHARUCO.rows + 1)
+    sheet = cv2.copyMakeBorder(board.generateImage(size), 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=[255])
+    rng = seed_of(name)
+    turn = cv2.getRotationMatrix2D((186, 238), rng.uniform(-20, 20), 0.9)
+    turn[:, 2] += 134, 22
+    H = np.vstack([turn, [*rng.uniform(-2e-4, 2e-4, 2), 1.0]])
+    seen = cv2.warpPerspective(sheet, H, (640, 520), flags=cv2.INTER_AREA, borderValue=[200])
+    noisy = cv2.GaussianBlur(seen.astype(float), (0, 0), 0.8) * 0.8 + 20 + 2 * rng.standard_normal(seen.shape)
+    return np.rint(noisy).clip(0, 255).astype(np.uint8)
+
+
+def test_an_empty_first_photograph_does_not_hide_an_april_grid() -> None:
+    grid = PlateFamily("aprilgrid", 6, 8, (), "apriltag36h11", 0.8, 17)
+    shown = [photographed(drawn(grid), f"trial {k}") for k in range(2)]
+    plate = search_april_grid([EMPTY, shown[0]], shown[1:])
+    assert plate is not None and (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_older", [False, True])
+def test_charuco_boards_of_both_patterns_are_found_behind_an_empty_photograph(
+    is_older: bool, tmp_path: Path
+) -> None:
+    for k in range(5):
+        shown = EMPTY if k == 0 else charuco_photograph(f"trial {k}", is_older=is_older)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), shown)
+    plate = try_targets(sorted(tmp_path.glob("*.png"))).plate
+    assert plate is not None
+    assert (plate.name, plate.rows, plate.columns, plate.dictionary) == ("charuco", 7, 5, "aruco4x4_50")
+
+
+def test_crossings_of_both_patterns_have_the_same_numbers() -> None:
+    newer, older = (
+        find_targets(charuco_photograph("pattern", is_older=one), codes=CHARUCO) for one in (False, True)
+    )
+    assert len(newer) == len(older) == CHARUCO.count
+    off = newer.xy[np.argsort(newer.code)] - older.xy[np.argsort(older.code)]
+    assert np.abs(off).max() < 0.5
