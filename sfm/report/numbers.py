@@ -54,6 +54,11 @@ def or_unlimited(value: float) -> str:
     return "unlimited" if np.isinf(value) else significant(value)
 
 
+def or_fixed(sigma: float) -> str:
+    """Write the standard deviation of a coordinate, which a fixed one has not."""
+    return "fixed" if sigma == 0 else significant(sigma)
+
+
 def with_exponent(value: float, sigma: float) -> tuple[str, str]:
     """Write a parameter to the second digit of its standard deviation, and the latter; small ones as m e-n.
 
@@ -138,6 +143,7 @@ FILTERS = {
         significant,
         signed,
         or_unlimited,
+        or_fixed,
         with_exponent,
         with_sigma,
     )

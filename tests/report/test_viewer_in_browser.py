@@ -158,9 +158,7 @@ def test_colours_follow_the_legend(tab: Tab, scene: ViewerScene) -> None:
         "() => { const { point } = document.getElementById('explore').viewer.scene.scales;"
         " return [point.from, point.to] }"
     )
-    assert low <= sigma.min() < sigma.max() <= high
-    for value in (low, high):  # round numbers in the unit of the legend, here µm
-        assert f"{value * 1e6:.3e}"[:5] in ("1.000", "2.000", "5.000")
+    assert (low, high) == pytest.approx((sigma.min(), sigma.max()), rel=1e-6)
     places = np.log(sigma / low) / np.log(high / low) * (len(colours) - 1)
     away = np.abs(colours[np.rint(places).astype(int)] - np.array(page.evaluate(PIXELS))).max(axis=1)
     assert (away <= 6).mean() >= 0.8  # some points lie behind others
@@ -238,10 +236,31 @@ def test_every_scale_spans_the_values_of_the_page(tab: Tab, scene: ViewerScene) 
             "() => { const { point } = document.getElementById('explore').viewer.scene.scales;"
             " return [point.from, point.to] }"
         )
-        inner = np.quantile(all_of_them, [0.03, 0.97])
-        assert low <= inner[0] and inner[1] <= high
-        assert high - low <= max(5 * np.ptp(all_of_them), 1.0)
+        assert low == pytest.approx(all_of_them.min(), rel=1e-6)
+        assert high == pytest.approx(all_of_them.max() if np.ptp(all_of_them) else low + 1, rel=1e-6)
+        ends = page.locator(".v-legend").first.locator(".v-end")
+        ticks = page.locator(".v-legend").first.locator(".v-ticks span").all_inner_texts()
+        assert not {ends.nth(0).input_value(), ends.nth(1).input_value()} & set(ticks)
     page.select_option("#points-by", "sigma")
+
+
+def test_fixed_points_are_coloured_by_what_the_list_names(
+    browser: Any, scene: ViewerScene, tmp_path: Path
+) -> None:
+    """They have no standard deviation: "fixed" in the table and the panel, and no colours by it."""
+    fixed = replace(scene, covariance=np.zeros_like(scene.covariance), distance_sigma=None)
+    path = write_view(fixed, tmp_path / "fixed.html", source="here", paths={})
+    tab = Tab(browser, path)
+    page = tab.ready()
+    chosen = page.locator("#points-by")
+    assert chosen.input_value() == "rms" and chosen.locator("option[value=sigma]").count() == 0
+    assert page.locator(".v-legend-name").first.inner_text().startswith("RMS residual of a point")
+    page.evaluate(SELECT, ["point", 3])
+    panel = page.locator(".v-panel").inner_text()
+    assert panel.count("fixed") == 3 and "sigma" not in panel
+    row = page.locator("table:has(th:has-text('sX')) tbody tr:has-text('fixed')").first
+    assert row.inner_text().count("fixed") == 4
+    tab.close()
 
 
 def test_colours_are_visible_in_dark_mode(browser: Any, page_file: Path) -> None:

@@ -1,4 +1,4 @@
-// Values as colours on scales between round numbers about the values of the page.
+// Values as colours on scales from the smallest value of the page to the largest.
 
 import { roundStep, significant } from "./numbers.js"
 
@@ -15,7 +15,6 @@ const SIGNED = [
 // The darker steps of viridis are under the contrast of 3 : 1 with a dark page (WCAG 2.2, criterion 1.4.11).
 const DARK_STEPS = STEPS.slice(3)
 const UNKNOWN = [128, 134, 142]
-const OUTSIDE = 0.02 // of the values lie beyond either end of a scale
 
 /** A scale of colours from one value to another, in equal parts or in equal ratios. */
 export class Scale {
@@ -80,14 +79,14 @@ export function pointScales(model) {
   if (!known.length) delete scales.sigma
   if (model.a["point.displacement"]) {
     const displacement = Float64Array.from({ length: model.pointCount }, (_, j) => model.displacement(j))
-    const first = new Scale("displacement of a point", model.fine.unit, 0, roundAbove(displacement, model.fine.factor), {
+    const first = new Scale("displacement of a point", model.fine.unit, 0, largest(displacement), {
       factor: model.fine.factor,
     })
     return { scales: { displacement: first, ...scales }, values: { displacement, ...values } }
   }
   const deviation = model.a["point.deviation"]
   if (deviation) {
-    const most = roundAbove(deviation, model.fine.factor)
+    const most = largest(deviation)
     const options = { factor: model.fine.factor, signed: true }
     const first = new Scale("deviation of a point", model.fine.unit, -most, most, options)
     return { scales: { deviation: first, ...scales }, values: { deviation, ...values } }
@@ -95,41 +94,31 @@ export function pointScales(model) {
   return { scales, values }
 }
 
-/** A round number of the fine unit that no value is larger than. */
-function roundAbove(values, factor) {
-  const size = values.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
-  const step = 10 ** Math.floor(Math.log10(size * factor)) / factor
-  return step * Math.ceil(size / step)
+/** The largest size of values; 1 where all are 0, so that a scale has an extent. */
+function largest(values) {
+  return values.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
 }
 
 export function photoScale(model) {
   return ratioScale("RMS residual of a photograph", "px", model.a["photo.rms"])
 }
 
-/** A scale of equal ratios, from one of 1, 2, 5 times a power of ten to another, about all values but a few. */
+/** A scale of equal ratios from the smallest value above 0 to the largest. */
 function ratioScale(name, unit, values, { factor = 1 } = {}) {
-  const sorted = Float64Array.from(values).filter((x) => x > 0 && Number.isFinite(x)).sort()
-  const [least, most] = sorted.length ? ends(sorted) : [0.1, 1]
-  const from = roundStep(least * factor)
-  return new Scale(name, unit, from / factor, Math.max(roundUp(most * factor), 2 * from) / factor, { log: true, factor })
+  const [from, to] = ends(values.filter((x) => x > 0 && Number.isFinite(x)), [0.1, 1])
+  return new Scale(name, unit, from, to > from ? to : 2 * from, { log: true, factor })
 }
 
-/** A scale of equal parts between round numbers about all values but a few. */
+/** A scale of equal parts from the smallest value to the largest. */
 function equalScale(name, unit, values, options) {
-  const sorted = Float64Array.from(values).filter(Number.isFinite).sort()
-  const [least, most] = sorted.length ? ends(sorted) : [0, 1]
-  const step = Math.max(1, roundStep((most - least) / 4 || 1))
-  const from = step * Math.floor(least / step)
-  return new Scale(name, unit, from, Math.max(step * Math.ceil(most / step), from + step), options)
+  const [from, to] = ends(values.filter(Number.isFinite), [0, 1])
+  return new Scale(name, unit, from, to > from ? to : from + 1, options)
 }
 
-function ends(sorted) {
-  return [OUTSIDE, 1 - OUTSIDE].map((part) => sorted[Math.round(part * (sorted.length - 1))])
-}
-
-/** The smallest of 1, 2, 5 times a power of ten that is not below a value. */
-function roundUp(value) {
-  return 1 / roundStep(1 / value)
+/** The smallest and the largest of values; others without any. */
+function ends(values, others) {
+  if (!values.length) return others
+  return values.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity])
 }
 
 /** Draw a scale with its labels; its ends can be typed. */
@@ -142,7 +131,8 @@ export function drawLegend(scale, element, make, onchange) {
     context.fillRect(x, 0, 1, 1)
   }
   const ticks = make("div", { className: "v-ticks" })
-  for (const value of scale.ticks()) {
+  const shown = [scale.from, scale.to].map((value) => scale.words(value)) // beside the bar
+  for (const value of scale.ticks().filter((tick) => !shown.includes(scale.words(tick)))) {
     const label = make("span", {}, scale.words(value))
     label.style.left = `${100 * scale.place(value)}%`
     ticks.append(label)

@@ -9,6 +9,7 @@ export function tablesOf(model, hub, element) {
   const { unit, fine } = model
   const a = model.a
   const short = (value) => (Number.isFinite(value) ? significant(value) : "")
+  const orFixed = (sigma) => (sigma === 0 ? "fixed" : short(sigma))
   const number = (key, name, of, words, u = "") => ({ key, name, unit: u, value: of, words: (k) => words(of(k), k) })
   const text = (key, name, value) => ({ key, name, value })
   const made = []
@@ -21,8 +22,8 @@ export function tablesOf(model, hub, element) {
     [
       text("name", "point", (j) => model.points[j]),
       ...[0, 1, 2].map((c) => number("XYZ"[c], "XYZ"[c], (j) => model.xyz(j)[c], (v, j) => toPrecision(v, model.sigmas(j)[c]), unit)),
-      ...[0, 1, 2].map((c) => number(`s${"XYZ"[c]}`, `s${"XYZ"[c]}`, (j) => model.sigmas(j)[c] * fine.factor, short, fine.unit)),
-      number("sigma", "sigma", (j) => model.sigma(j) * fine.factor, short, fine.unit),
+      ...[0, 1, 2].map((c) => number(`s${"XYZ"[c]}`, `s${"XYZ"[c]}`, (j) => model.sigmas(j)[c] * fine.factor, orFixed, fine.unit)),
+      number("sigma", "sigma", (j) => model.sigma(j) * fine.factor, orFixed, fine.unit),
       number("rays", "rays", (j) => a["point.rays"][j], String),
       number("angle", "angle", (j) => a["point.angle"][j], (v) => (Number.isFinite(v) ? v.toFixed(1) : ""), "deg"),
       number("rms", "RMS", (j) => a["point.rms"][j], short, "px"),

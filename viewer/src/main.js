@@ -6,7 +6,7 @@ import { MAX_ELLIPSOIDS } from "./ellipsoids.js"
 import { unpack } from "./data.js"
 import { button, choice, Hub, make, tick } from "./page.js"
 import { Panel } from "./panel.js"
-import { counted, roundStep, significant } from "./numbers.js"
+import { counted, roundStep, sigmaWords, significant } from "./numbers.js"
 import { Scene } from "./scene.js"
 import { tablesOf } from "./columns.js"
 
@@ -223,7 +223,7 @@ function showHover(model, stage, box, { found, x, y }) {
   const { kind, index } = found
   if (kind === "point") {
     const s = model.sigma(index)
-    const words = Number.isFinite(s) ? `sigma ${significant(s * model.fine.factor)} ${model.fine.unit}, ` : ""
+    const words = Number.isFinite(s) ? `${sigmaWords(s * model.fine.factor, model.fine.unit)}, ` : ""
     box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${counted(model.a["point.rays"][index], "ray")}, RMS ${significant(model.a["point.rms"][index])} px`)
   } else {
     const address = model.picture("thumbnail", index)

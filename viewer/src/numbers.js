@@ -18,6 +18,12 @@ export function toPrecision(value, sigma) {
   return value.toFixed(decimals)
 }
 
+/** A standard deviation: a fixed coordinate has none, nor has one of an adjustment without covariance. */
+export function sigmaWords(sigma, unit = "") {
+  if (sigma === 0) return "fixed"
+  return Number.isFinite(sigma) ? `sigma ${significant(sigma)} ${unit}`.trimEnd() : `sigma ${UNKNOWN}`
+}
+
 export function fixed(value, decimals) {
   return Number.isFinite(value) ? value.toFixed(decimals) : UNKNOWN
 }

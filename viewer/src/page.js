@@ -24,8 +24,11 @@ export function tick(text, checked, onchange, properties = {}) {
 }
 
 export function choice(text, options, onchange, properties = {}) {
-  const select = make("select", properties)
+  const select = make("select")
   for (const [value, words] of options) select.append(make("option", { value }, words))
+  const { value = select.value, ...others } = properties // which is none before there are options
+  select.value = value
+  for (const [name, one] of Object.entries(others)) select.setAttribute(name, one)
   select.addEventListener("change", () => onchange(select.value))
   return make("label", { className: "v-choice" }, `${text} `, select)
 }

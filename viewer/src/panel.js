@@ -2,7 +2,7 @@
 
 import { cropCard, cropFactor, cropLegend } from "./crops.js"
 import { button, facts, make } from "./page.js"
-import { fixed, significant, toPrecision, UNKNOWN } from "./numbers.js"
+import { fixed, sigmaWords, significant, toPrecision } from "./numbers.js"
 import { PhotographView } from "./photoview.js"
 
 const MAX_CROPS = 60 // cards at once; more are shown on demand
@@ -43,10 +43,9 @@ export class Panel {
     const [x, y, z] = model.xyz(j)
     const rays = [...model.raysOfPoint(j)].sort((a, b) => order(model, b) - order(model, a))
     const rejected = rays.filter((k) => model.rejected(k)).length
-    const fine = (v) => (Number.isFinite(v) ? `${significant(v * model.fine.factor)} ${model.fine.unit}` : UNKNOWN)
     const coordinates = [x, y, z].map((v, c) => [
       "XYZ"[c],
-      `${toPrecision(v, s[c])} ${unit}, sigma ${s[c] === 0 ? "fixed" : fine(s[c])}`,
+      `${toPrecision(v, s[c])} ${unit}, ${sigmaWords(s[c] * model.fine.factor, model.fine.unit)}`,
     ])
     const factor = cropFactor(model, rays)
     const cards = make("div", { className: "v-crops" })
