@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import atexit
 import gc
+import re
 import sys
+from collections.abc import Sequence
+from typing import Any
 
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.cli.outlets import guard_outlets
@@ -69,11 +72,24 @@ def _run() -> None:
             error.show()
             raise SystemExit(BAD_INPUT) from None
         command = error.ctx.command_path if error.ctx else "kolinear"
-        _refuse(f"{error.format_message().rstrip()} (see {command} --help)".replace(". (see", " (see"))
+        said = f"{error.format_message().rstrip()}{_decimal_comma(error, sys.argv[1:])}"
+        _refuse(f"{said} (see {command} --help)".replace(". (see", " (see"))
     if code == INTERRUPTED:  # which is what typer makes of Ctrl-C, and says nothing
         raise KeyboardInterrupt
     if isinstance(code, int) and code:
         raise SystemExit(code)
+
+
+def _decimal_comma(error: Any, arguments: Sequence[str]) -> str:
+    """Return what is wrong with a decimal comma in a numeric option; nothing for other errors."""
+    if "number" not in error.format_message():
+        return ""
+    for name in getattr(getattr(error, "param", None), "opts", ()):
+        for given, following in zip(arguments, (*arguments[1:], ""), strict=True):
+            value = following if given == name else given.removeprefix(f"{name}=")
+            if re.fullmatch(r"[-+]?\d+,\d+", value):
+                return f"; a number has a decimal point, not a comma: {value.replace(',', '.')}"
+    return ""
 
 
 def _report_fault(error: Exception) -> None:

@@ -13,7 +13,8 @@ READER_GONE = 141  # exit code; 128 + SIGPIPE, as a shell tells it of other prog
 def guard_outlets() -> None:
     """Make stdout and stderr bear what comes before them and after them.
 
-    A reader of stdout that ends, as `head` does, ends the program quietly; one of stderr ends nothing.
+    A reader of stdout that ends, as `head` does, ends the program quietly; one of stderr ends nothing. Lines
+    of both have their order where both go to one file or pipe.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # of a code page that lacks a name's letters
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -32,7 +33,7 @@ def _guarded(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
         io.BufferedWriter(_Outlet(outlet.fileno(), ends_program=ends_program)),
         encoding=outlet.encoding,
         errors="backslashreplace",
-        line_buffering=outlet.line_buffering,
+        line_buffering=outlet.line_buffering or not ends_program,
     )
 
 
@@ -47,6 +48,8 @@ class _Outlet(io.FileIO):
         self._ends_program = ends_program
 
     def write(self, data: Any) -> int:
+        if not self._ends_program and sys.stdout is not None and not sys.stdout.closed:
+            sys.stdout.flush()  # what was printed before
         try:
             return super().write(data) or 0
         except OSError as error:

@@ -11,12 +11,24 @@ import typer
 
 from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
-from sfm.errors import OutputError
+from sfm.errors import KolinearError, OutputError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.remarks.remark import Remark
     from sfm.survey.drafting.draft import Draft
+
+
+Pitch = Annotated[
+    float | None,
+    typer.Option(
+        "--pitch",
+        metavar="MM",
+        min=1e-6,
+        help="Squares of a board, or distance of the dots of a plate, mm, for a drafted survey file.  "
+        "[default: assumed]",
+    ),
+]
 
 
 def init(
@@ -31,15 +43,7 @@ def init(
             help="File to write; no other is replaced.  [default: PHOTOS/survey.toml]",
         ),
     ] = None,
-    pitch: Annotated[
-        float | None,
-        typer.Option(
-            "--pitch",
-            metavar="MM",
-            min=1e-6,
-            help="Squares of a board, or distance of the dots of a plate, mm.  [default: assumed]",
-        ),
-    ] = None,
+    pitch: Pitch = None,
 ) -> None:
     """Draft a survey file from a folder of photographs.
 
@@ -56,18 +60,19 @@ def init(
     print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
 
 
-def drafted_beside(photographs: Path, out: Path | None) -> tuple[Path, Path]:
+def drafted_beside(photographs: Path, out: Path | None, pitch: float | None) -> tuple[Path, Path]:
     """Draft the survey of a folder of photographs, unless a file beside the result has it already.
 
     Args:
         photographs: the folder.
         out: folder of the result, None for out/NAME OF THE FOLDER.
+        pitch: of a plate, mm; None to assume it.
 
     Returns:
         The survey file, and the folder of the result.
 
     Raises:
-        KolinearError: no photographs, or the file cannot be written.
+        KolinearError: no photographs, a pitch beside a file that has one, or the file cannot be written.
     """
     with loading():
         from sfm.files.open_folders import refuse_links
@@ -77,11 +82,21 @@ def drafted_beside(photographs: Path, out: Path | None) -> tuple[Path, Path]:
     file = out.parent / f"{out.name}.toml"
     refuse_links(file)
     if file.exists():
+        refuse_pitch(pitch, file)
         print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
         return file, out
-    draft = _draft(photographs)
+    draft = _draft(photographs, pitch)
     _write(draft, file)
     return file, out
+
+
+def refuse_pitch(pitch: float | None, file: Path) -> None:
+    """Raise KolinearError where a pitch is given for a survey file that is there already."""
+    if pitch is not None:
+        raise KolinearError(
+            f"{file}: --pitch {pitch:g} is for a survey file that is drafted, this one is there already; "
+            "write targets.pitch in it, or remove it"
+        )
 
 
 def _draft(photographs: Path, pitch: float | None = None) -> Draft:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.commands.drafting import drafted_beside
+from sfm.cli.commands.drafting import Pitch, drafted_beside, refuse_pitch
 from sfm.cli.commands.starting import FAILED, loading
 from sfm.cli.first_use import compile_first
 from sfm.errors import KolinearError
@@ -91,6 +91,7 @@ def run(
             "--images", metavar="DIR", help="Folder of the photographs, in place of that of the survey file."
         ),
     ] = None,
+    pitch: Pitch = None,
     camera: Calibration = None,
     camera_weighted: Weighted = False,
     out: Out = None,
@@ -115,7 +116,10 @@ def run(
             print(f"Running {survey_file}", file=sys.stderr)
         else:
             images = survey_file
-            survey_file, out = drafted_beside(images, out)
+            survey_file, out = drafted_beside(images, out, pitch)
+            pitch = None
+    if survey_file.is_file():
+        refuse_pitch(pitch, survey_file)
     _run_survey(
         survey_file,
         images,

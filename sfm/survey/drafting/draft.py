@@ -97,6 +97,7 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
             f"it holds {', '.join(as_plain(path.name) for path in every[:SHOWN])}" if every else "it is empty"
         )
         holds += f": {conversion_of(files[0])}" if files else ""
+        holds += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
         raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {holds}")
     metadata, unreadable = {}, []
     for path in files:
@@ -111,6 +112,14 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
         except PhotographError as error:
             unreadable.append((path.name, str(error).removeprefix(f"{path.name}: ")))
     return metadata, tuple(unreadable)
+
+
+def _has_photographs(folder: Path) -> bool:
+    """Return whether photographs lie directly in a folder."""
+    try:
+        return folder.is_dir() and any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _text(
@@ -228,7 +237,7 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
     if trial.plate is not None:
         plate = trial.plate
         marks = f", {len(plate.marks)} marks" if plate.marks else ""
-        found.append(("targets", f"{plate.name} of {plate.rows} x {plate.columns}{marks}"))
+        found.append(("targets", f"{plate.name} of {plate.rows} rows and {plate.columns} columns{marks}"))
     elif trial.codes != "none":
         repeated = (
             f"{counted(len(trial.repeated), 'code')} that two of {len(trial.photographs)} photographs have"

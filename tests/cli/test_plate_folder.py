@@ -1,0 +1,85 @@
+"""The commands on a folder of a plate: its pitch, order of lines, and where photographs are."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.cli import main
+from sfm.cli.commands import drafting
+from sfm.cli.commands.starting import stopped_once
+from sfm.errors import KolinearError, SurveyFileError
+from sfm.survey.drafting.draft import Draft, draft_survey
+
+FOUR_LINES = """
+import sys
+from sfm.cli.outlets import guard_outlets
+guard_outlets()
+for k in range(2):
+    print(2 * k)
+    print(2 * k + 1, file=sys.stderr)
+"""
+
+
+def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
+    """Return the line with which a command is refused."""
+    monkeypatch.setattr(sys, "argv", ["kolinear", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [("--pitch", "12,5"), ("--pitch=12,5",)])
+def test_a_decimal_comma_is_explained(
+    given: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "12.5" in refused(capsys, monkeypatch, "init", "here", *given)
+    assert "comma" not in refused(capsys, monkeypatch, "init", "here", "--pitch", "wide")
+
+
+def test_lines_of_both_outlets_keep_their_order() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FOUR_LINES], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=True
+    )
+    assert done.stdout.split() == [b"0", b"1", b"2", b"3"]
+
+
+def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float | None] = []
+
+    def drafted(photographs: Path, pitch: float | None = None) -> Draft:
+        asked.append(pitch)
+        return Draft("plate", "[survey]\n", (), (), ())
+
+    monkeypatch.setattr(drafting, "_draft", drafted)
+    out = tmp_path / "out" / "plate"
+    with stopped_once():  # as every command
+        file, _ = drafting.drafted_beside(tmp_path, out, 12.5)
+        assert asked == [12.5] and file.is_file()
+        with pytest.raises(KolinearError, match=r"targets\.pitch"):
+            drafting.drafted_beside(tmp_path, out, 12.5)
+        assert drafting.drafted_beside(tmp_path, out, None)[0] == file
+
+
+def test_a_pitch_for_a_survey_file_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "survey.toml").write_text("", encoding="utf-8")
+    for given in (tmp_path, tmp_path / "survey.toml"):
+        assert "targets.pitch" in refused(capsys, monkeypatch, "run", str(given), "--pitch", "12.5")
+
+
+def test_the_folder_that_has_photographs_is_named(tmp_path: Path) -> None:
+    for name in ("images", "notes"):
+        (tmp_path / name).mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "1.png"), np.zeros((8, 8), np.uint8))
+    with pytest.raises(SurveyFileError) as refusal:
+        draft_survey(tmp_path)
+    assert str(tmp_path / "images") in str(refusal.value)
+    assert str(tmp_path / "notes") not in str(refusal.value)
