@@ -1,4 +1,4 @@
-"""Boards that a trial of some photographs recognises: behind empty photographs, of older patterns."""
+"""Boards that a trial recognises: behind empty photographs, of older patterns, cut by the border."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import AnyArray
 from sfm.survey.drafting.target_trial import try_targets
-from sfm.targets.codes.plate_search import search_april_grid
+from sfm.targets.codes.plate_search import search_april_grid, search_checkerboard
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
 from sfm.targets.detect import find_targets
@@ -66,3 +66,15 @@ def test_crossings_of_both_patterns_have_the_same_numbers() -> None:
     assert len(newer) == len(older) == CHARUCO.count
     off = newer.xy[np.argsort(newer.code)] - older.xy[np.argsort(older.code)]
     assert np.abs(off).max() < 0.5
+
+
+def test_a_checkerboard_that_is_whole_in_one_photograph_is_found_where_another_cuts_it() -> None:
+    squares = np.add.outer(np.arange(8), np.arange(11)) % 2
+    board = np.where(squares, 220, 30).astype(np.uint8).repeat(40, 0).repeat(40, 1)
+    whole = cv2.GaussianBlur(np.pad(board, 60, constant_values=220), (0, 0), 1.0)
+    plate = search_checkerboard([whole, whole[:, 160:480]])  # cut on both sides, 7 by 7 crossings
+    assert plate is not None and (plate.rows, plate.columns) == (7, 10)
+    for other in (EMPTY, whole[:, 160:340], whole[160:360, 160:480]):  # none, and less than half of it
+        assert search_checkerboard([whole, other]) is None
+    shorter = np.pad(board[:, :320], 60, constant_values=220)
+    assert search_checkerboard([whole, cv2.GaussianBlur(shorter, (0, 0), 1.0)]) is None  # another board

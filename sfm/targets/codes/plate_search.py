@@ -1,6 +1,7 @@
 """Which calibration plate photographs show, when nothing is known of it but that the photographs show it.
 
-A plate is believed if two photographs show one of the same size whole. Larger dots or rings are marks if both
+A plate is believed if two photographs show one of the same size whole, a checkerboard also if one shows it
+whole and another half of it or more, cut by the border. Larger dots or rings are marks if both
 photographs have them in the same places.
 """
 
@@ -40,7 +41,7 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
 
     Source: Duda and Frese (2018), in OpenCV, for boards of any size.
     """
-    sizes = Counter[tuple[int, int]]()
+    whole, parts = Counter[tuple[int, int]](), list[tuple[tuple[int, int], tuple[bool, bool]]]()
     for grey in photographs:
         small, _ = reduced(grey, SEARCHED_PX)
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
@@ -48,13 +49,30 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
             continue
         place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
         ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
-        if all(all(both) for both in ends):
-            sizes[min(meta.shape[:2]), max(meta.shape[:2])] += 1
-    for (rows, columns), count in sizes.most_common():
+        is_cut = not all(ends[0]), not all(ends[1])
+        parts.append((meta.shape[:2], is_cut))
+        if not any(is_cut):
+            whole[min(meta.shape[:2]), max(meta.shape[:2])] += 1
+    for (rows, columns), _ in whole.most_common():
         plate = PlateFamily("checkerboard", rows, columns)
-        if count > 1 and plate.count >= LEAST_CROSSINGS and _named(photographs, plate):
+        showing = sum(_is_part(*part, plate) for part in parts)
+        if (
+            showing > 1
+            and plate.count >= LEAST_CROSSINGS
+            and _named(photographs, plate, whole[rows, columns])
+        ):
             return plate
     return None
+
+
+def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
+    """Return whether crossings of this size, cut along these directions, are half of a board or more."""
+    if size[0] * size[1] < max(plate.count / 2, LEAST_CROSSINGS):
+        return False
+    return any(
+        all(n == all_ or (cut and n < all_) for n, all_, cut in zip(size, sides, is_cut, strict=True))
+        for sides in ((plate.rows, plate.columns), (plate.columns, plate.rows))
+    )
 
 
 def search_charuco(
@@ -182,14 +200,14 @@ def shows_a_lattice(xy: FloatArray) -> bool:
     return lattice is not None and len(lattice.rows) > max(LEAST_DOTS, len(xy) / 2)
 
 
-def _named(photographs: Sequence[AnyArray], plate: PlateFamily) -> bool:
-    """Return whether two photographs show at least half of the crossings of a board."""
+def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2) -> bool:
+    """Return whether two photographs, or as many as needed, show half of the crossings of a board or more."""
     found = 0
     for grey in photographs:
         # the noise is of no consequence for what is found
         saddles, _ = find_crossings(grey, plate, scale=255.0, noise=1.0)
         found += len(saddles.xy) >= max(plate.count / 2, LEAST_CROSSINGS / 2)
-        if found > 1:
+        if found >= min(needed, 2):
             return True
     return False
 
