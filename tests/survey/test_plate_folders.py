@@ -1,6 +1,7 @@
 """Photographs of plates and boards in a folder, and nothing else: found, and the camera as it truly is.
 
-The calibration is that of OpenCV on the same image points."""
+Image points are as good as stated, by their truth. The adjustment alone is that of OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +15,16 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
+from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import ObjectPoints, rows_of
 from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.plate import plate_family
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import TAGGED, PlateFamily
-from tests.plates import GRID, PITCH, PIXEL_MM, TRUTH, plate_pictures
+from tests.plates import GRID, PITCH, PIXEL_MM, TRUTH, camera, plate_pictures, stations
 from tests.synthetic import seed_of
 
 PLATES = {
@@ -72,9 +74,29 @@ def test_a_folder_of_a_plate_calibrates_the_camera(kind: str, tmp_path: Path) ->
         sigma = covariance[free.index(name), free.index(name)] ** 0.5
         error = found.value(name) - TRUTH[name] * found.pixel_mm[0] / PIXEL_MM
         assert abs(error) < 4.5 * sigma, name
+    assert findings_of(result).verdict.level != "bad"
+    ratio = errors_over_stated(adjustment, plate, f"folder of {kind}", survey.adjust.sigma_px)
+    print(f"{kind}: errors of image points {ratio:.2f} of the stated ones")
+    assert 0.8 < ratio < 1.3
     off = beside_opencv(adjustment, family.plane(PITCH).astype(np.float32))
     print(f"{kind}: largest difference from OpenCV {off.max():.1e} sigma")
     assert off.max() < 0.1
+
+
+def errors_over_stated(found: Adjustment, plate: PlateFamily, seed: str, sigma_px: float) -> float:
+    """Return the RMS of the errors of accepted image points over those that the photographs state."""
+    points = found.network.image_points.select(~found.rejected)
+    position, rotation = stations(seed_of(seed), 8, plate)
+    squares = []
+    for k, name in enumerate(found.network.images):
+        own = points.select(points.image == k)
+        n = int(Path(name).stem.split()[1])
+        xy = project(camera(), position[n], rotation[n], plate.plane(PITCH))
+        apart = own.xy[:, None] - xy[None]  # plates that look alike turned may be named in another turn
+        off = apart[np.arange(len(apart)), np.hypot(*np.moveaxis(apart, 2, 0)).argmin(axis=1)]
+        stated = own.covariance - sigma_px**2 * np.eye(2)
+        squares.append(np.einsum("ki,kij,kj->k", off, np.linalg.inv(stated), off) / 2)
+    return float(np.sqrt(np.concatenate(squares).mean()))
 
 
 def beside_opencv(found: Adjustment, plane: FloatArray) -> FloatArray:
