@@ -215,7 +215,7 @@ def test_precision_where_everything_is_fixed_is_not_known() -> None:
     control = ObjectPoints(np.arange(12), truth.points, np.zeros((12, 3, 3)))
     a = adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
     assert np.isnan(point_precision(a)).all()
-    assert "not known" in text_report(findings_of(result_of(a)))
+    assert "held fixed" in text_report(findings_of(result_of(a)))
     assert "not known" not in report_page(findings_of(result_of(a)), (), ())  # but that all are held fixed
 
 
