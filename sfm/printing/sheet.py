@@ -15,6 +15,7 @@ from sfm.files.whole_files import whole_file
 from sfm.rendering.scene import (
     ARC,
     DISC,
+    MAX_ARCS,
     RECTANGLE,
     Marks,
     coded_ring,
@@ -46,6 +47,7 @@ CLEAR = 1.35
 # Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag,
 # and across the narrowest ring of the smallest concentric tag.
 MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
+DEFAULT_TARGETS = 100
 MAX_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
 MAX_SHEET_BYTES = 100_000_000  # of 10,000 targets
 CHECK = "print without scaling and check"  # stands on every page; a file with it is an earlier sheet
@@ -75,7 +77,7 @@ class Sheet:
 
 def lay_out_sheet(
     family: str,
-    numbers: IntArray,
+    numbers: IntArray | None,
     *,
     diameter_mm: float,
     page: str = "a4",
@@ -86,7 +88,7 @@ def lay_out_sheet(
 
     Args:
         family: arcs, ring12, ring14, ring20, a family of tags, cctag3, cctag4 or the path of a code table.
-        numbers: code numbers, (k,).
+        numbers: code numbers, (k,); None for the first DEFAULT_TARGETS of the family.
         diameter_mm: diameter of the dot, or of the outer edge of concentric rings, or side of a square tag.
         page: one of PAGES_MM.
         dark: dark targets on white; else white ones on dark squares.
@@ -118,6 +120,11 @@ def lay_out_sheet(
             f"targets: diameter is {diameter_mm:g} mm, needed at least {smallest:g} mm for {codes.name} to "
             "be printed"
         )
+    if numbers is None:
+        numbers = codes.number if isinstance(codes, CodeFamily) else np.arange(codes.count)
+        numbers = numbers[:DEFAULT_TARGETS]
+        if codes.name.startswith("arcs"):  # their number is the code
+            numbers = np.arange(1, MAX_ARCS + 1)
     values, count = np.unique(numbers, return_counts=True)
     if (count > 1).any():
         raise SurveyFileError(

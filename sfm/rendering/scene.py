@@ -20,6 +20,7 @@ DISC, ARC, RECTANGLE = 0, 1, 2
 UNCODED = -1
 # Gap between the arcs around a dot, as measured on the camcal sheet, rad.
 ARC_GAP = np.radians(44.0)
+MAX_ARCS = int(2 * np.pi / (2 * ARC_GAP))  # of a ring, as long as its gaps at least
 
 
 @dataclass(frozen=True)
@@ -253,9 +254,8 @@ def square_tag(
 def _runs(number: int, family: CodeFamily) -> FloatArray:
     """Return start and length (rad, clockwise) of each run of set cells, (k, 2)."""
     if family.cells == 0:
-        most = int(2 * np.pi / (2 * ARC_GAP))
-        if not 1 <= number <= most:
-            raise GeometryError(f"code {number}: a ring of arcs has 1 to {most}")
+        if not 1 <= number <= MAX_ARCS:
+            raise GeometryError(f"code {number}: a ring of arcs has 1 to {MAX_ARCS}")
         start = 2 * np.pi * np.arange(number) / number
         return np.column_stack([start, np.full(number, 2 * np.pi / number - ARC_GAP)])
     entry = np.flatnonzero(family.number == number)

@@ -84,6 +84,16 @@ def test_printed_concentric_tags_are_read_back(tmp_path, family, dark):
         lay_out_sheet(family, np.array([128]), diameter_mm=16.0)
 
 
+@pytest.mark.parametrize(
+    ("family", "first", "count"),
+    [("cctag3", 0, 32), ("apriltag16h5", 0, 30), ("ring14", 1, 100), ("arcs", 1, 4)],
+)
+def test_a_sheet_without_numbers_has_the_first_of_the_family(family, first, count):
+    sheet = lay_out_sheet(family, None, diameter_mm=10.0)
+    numbers = np.concatenate([page.number for page in sheet.pages])
+    assert numbers.tolist() == list(range(first, first + count))
+
+
 def test_rings_of_other_radii_are_printed_and_read(tmp_path):
     sheet = lay_out_sheet("ring12", np.arange(1, 9), diameter_mm=8.0, ring_radii=(1.7, 2.4))
     assert sheet.ring_mm == pytest.approx(2.4 * 8)

@@ -179,7 +179,10 @@ def targets(
             "cctag4, or a code table file.",
         ),
     ] = "ring14",
-    ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once.")] = "1-100",
+    ids: Annotated[
+        str | None,
+        typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once; the first 100 of the family."),
+    ] = None,
     diameter: Annotated[
         float,
         typer.Option(
@@ -209,7 +212,12 @@ def targets(
 
     radii = None if ring_radii is None else _two(ring_radii)
     sheet = lay_out_sheet(
-        family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright, ring_radii=radii
+        family,
+        None if ids is None else _numbers(ids),
+        diameter_mm=diameter,
+        page=page,
+        dark=not bright,
+        ring_radii=radii,
     )
     for path in write_sheet(sheet, out):
         print(path)
