@@ -19,11 +19,11 @@ import numpy as np
 from adapters.formats.content import Content
 from adapters.formats.known_points import CONTROL, write_known_points
 from sfm.camera import Camera
+from sfm.conventions import METRES
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, Network
 
 MIN_CONTROL = 3  # points that fix position, attitude and scale
-UNITS = ("km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft")  # that a survey may be in
 EXTERIOR = ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 EXTERIOR_SIGMAS = ("sX", "sY", "sZ", "somega_deg", "sphi_deg", "skappa_deg")
 
@@ -40,7 +40,7 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
     result = content.result
     network, estimate, control = result.network, result.estimate, result.network.control
     unit = 'unit = "m"  # other programs do not state it: put here what the coordinates are in'
-    if result.unit in UNITS:
+    if result.unit in METRES:
         unit = f"unit = {_text(result.unit)}"
     lines = ["[survey]", f"name = {_text(title)}", unit, ""]
     for camera, images, own in _families(network, estimate):

@@ -145,7 +145,8 @@ def run_of(content: Content, folder: Path) -> Adjustment:
     return run_survey(read_survey(folder / "survey.toml")).adjustment
 
 
-def test_tables_are_a_survey_with_all_that_was_given(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", ["mm", "nm"])
+def test_tables_are_a_survey_with_all_that_was_given(unit: str, tmp_path: Path) -> None:
     """Written, adjusted as they are, and in the unit that was known: nothing that took part is missing."""
     network, truth = make_network(seed_of("whole survey"), images=6, points=20, free=("c", "x0", "y0", "K1"))
     sigma = np.tile(np.eye(3) * 1e-8, (4, 1, 1))
@@ -165,10 +166,10 @@ def test_tables_are_a_survey_with_all_that_was_given(tmp_path: Path) -> None:
         ),
     )
     checks = ObjectPoints(np.array([8, 9]), truth.points[8:10], sigma[:2])
-    content = Content(StoredResult("whole", network, truth, unit="mm", datum="control"), checks=checks)
+    content = Content(StoredResult("whole", network, truth, unit=unit, datum="control"), checks=checks)
     a = run_of(content, tmp_path / "out")
     survey = read_survey(tmp_path / "out" / "survey.toml")
-    assert (survey.unit, survey.datum.kind) == ("mm", "control")
+    assert (survey.unit, survey.datum.kind) == (unit, "control")
     assert survey.control is not None and survey.control.check is not None and survey.control.check.sum() == 6
     b = adjust(network, truth, datum="control", reject="none")
     assert (len(a.network.scale_bars), len(a.network.exterior), len(a.network.interior)) == (1, 1, 1)
