@@ -41,14 +41,8 @@ def drawn(svg, size_mm):
     return cv2.GaussianBlur(picture, (0, 0), 0.8)
 
 
-@pytest.mark.parametrize("family", ["ring12", "ring14", "ring20"])
-@pytest.mark.parametrize("dark", [True, False])
-def test_the_printed_page_is_read_back(tmp_path, family, dark):
-    numbers = code_family(family).number[:12]
-    sheet = lay_out_sheet(family, numbers, diameter_mm=8.0, dark=dark)
-    (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
-    picture = drawn(file, sheet.size_mm)
-    found = find_targets(picture, polarity="dark" if dark else "bright", codes=family, min_diameter_px=40)
+def assert_as_printed(found, sheet, numbers, *, radius_mm):
+    """Assert that all targets of a page are read, at their places and in their size."""
     read = found.code >= 0
     assert sorted(found.code[read]) == numbers.tolist()
     page = sheet.pages[0]
@@ -57,7 +51,18 @@ def test_the_printed_page_is_read_back(tmp_path, family, dark):
         expected = np.array([at[0], sheet.size_mm[1] - at[1]]) * PX_PER_MM - 0.5
         assert xy == pytest.approx(expected, abs=0.1)
         # OpenCV fills the pixels of the outline as well, so dots come out larger by up to a pixel.
-        assert axes == pytest.approx(4.0 * PX_PER_MM, abs=1.0)
+        assert axes == pytest.approx(radius_mm * PX_PER_MM, abs=1.0)
+
+
+@pytest.mark.parametrize("family", ["ring12", "ring14", "ring20"])
+@pytest.mark.parametrize("dark", [True, False])
+def test_the_printed_page_is_read_back(tmp_path, family, dark):
+    numbers = code_family(family).number[:12]
+    sheet = lay_out_sheet(family, numbers, diameter_mm=8.0, dark=dark)
+    (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
+    picture = drawn(file, sheet.size_mm)
+    found = find_targets(picture, polarity="dark" if dark else "bright", codes=family, min_diameter_px=40)
+    assert_as_printed(found, sheet, numbers, radius_mm=4.0)
 
 
 @pytest.mark.parametrize("dark", [True, False])
@@ -69,13 +74,7 @@ def test_printed_concentric_tags_are_read_back(tmp_path, family, dark):
     (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
     picture = drawn(file, sheet.size_mm)[: 60 * PX_PER_MM]
     found = find_targets(picture, polarity="dark" if dark else "bright", codes=family, min_diameter_px=40)
-    read = found.code >= 0
-    assert sorted(found.code[read]) == numbers.tolist()
-    page = sheet.pages[0]
-    for xy, axes, code in zip(found.xy[read], found.semi_axes[read], found.code[read], strict=True):
-        at = page.centre[np.flatnonzero(page.number == code)[0]]
-        assert xy == pytest.approx(np.array([at[0], sheet.size_mm[1] - at[1]]) * PX_PER_MM - 0.5, abs=0.1)
-        assert axes == pytest.approx(8.0 * PX_PER_MM, abs=1.0)
+    assert_as_printed(found, sheet, numbers, radius_mm=8.0)
     with pytest.raises(SurveyFileError, match="at least"):
         lay_out_sheet(family, numbers, diameter_mm=4.0)
     with pytest.raises(SurveyFileError, match="radii of the ring"):

@@ -25,7 +25,12 @@ from sfm.adjustment.hypotheses.alternatives import (
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
 from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
-from sfm.adjustment.hypotheses.score import Reduced, log_likelihood_gain, reduce_adjustment
+from sfm.adjustment.hypotheses.score import (
+    Reduced,
+    log_likelihood_gain,
+    reduce_adjustment,
+    squares_gained,
+)
 from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
@@ -184,8 +189,8 @@ def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
     """
     if isinstance(one.family, InteriorFamily):
         return gain
-    squares = reduced.redundancy * -np.expm1(-2 * gain / reduced.redundancy)  # as in `log_likelihood_gain`
-    return one.spread.evidence(float(squares), one.gain.rank, reduced.redundancy)
+    squares = squares_gained(gain, reduced.redundancy)
+    return one.spread.evidence(squares, one.gain.rank, reduced.redundancy)
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:

@@ -384,6 +384,11 @@ def log_likelihood_gain(gain: float, redundancy: int) -> float:
     return float(redundancy / 2 * (np.log(redundancy) - np.log(left)))
 
 
+def squares_gained(gain: float, redundancy: int) -> float:
+    """Return by how much v'Pv falls from r where ln of the likelihood grows by a gain."""
+    return float(redundancy * -np.expm1(-2 * gain / redundancy))
+
+
 @dataclass(frozen=True)
 class Spread:
     """How much parts that an alternative does not concern differ among themselves, over what chance makes.

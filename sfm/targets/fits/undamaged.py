@@ -16,7 +16,13 @@ from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
 from sfm.targets.fits.damage import MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
 from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
-from sfm.targets.fits.outline_noise import OutlineNoise, judge_outlines, outline_shape, rise_to_first
+from sfm.targets.fits.outline_noise import (
+    OutlineNoise,
+    OutlineShape,
+    judge_outlines,
+    outline_shape,
+    rise_to_first,
+)
 from sfm.targets.flags import Flag
 
 # Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
@@ -165,7 +171,7 @@ def _repaired(
     keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
     judged = _least_curvature(fits.theta) > MIN_CURVATURE_BLURS * fits.theta[:, BLUR]
     for _ in range(ROUNDS):
-        h, weight, common, sound = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+        h, weight, _, sound, _ = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
         skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
         damaged = find_damage(h, weight, sound, skirt)
         inside = np.maximum(fits.statistics[:, goodness.INSIDE], 1.0)
@@ -182,7 +188,9 @@ def _repaired(
         repaired = fit(begin, sign[again], keep[again], depth[again])
         for whole, part in zip(fits, repaired, strict=True):
             whole[again] = part
-    h, weight, common, sound = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+    h, weight, common, sound, outlines = _deviations(
+        fits, keep, variance_of_noise + least_variance, least_variance
+    )
     cut = ~keep.all(axis=1)
     small = _radii(fits.theta) < MIN_RADIUS_PX
     fits.flag[cut | np.isfinite(depth)] |= Flag.DAMAGED.value
@@ -200,7 +208,7 @@ def _repaired(
     fits.theta[cut, :2] -= px.T[cut]
     softness = float(np.median((fits.theta[:, BLUR] / _radii(fits.theta))[sound])) if sound.any() else 0.0
     rise = rise_to_first(h[sound], weight[sound], softness)
-    return fits, variance, judge_outlines(outline_shape(fits.shape), variance, sound, rise)
+    return fits, variance, judge_outlines(outlines, variance, sound, rise)
 
 
 def _variances(fits: EllipseFits, least: float) -> FloatArray:
@@ -211,8 +219,10 @@ def _variances(fits: EllipseFits, least: float) -> FloatArray:
 
 def _deviations(
     fits: EllipseFits, keep: BoolArray, variance_of_noise: float, least_variance: float
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, OutlineShape]:
     """Return deviations of outlines without the common shape, their weights, the common shape, sound targets.
+
+    The harmonics of the outlines come last.
 
     Damage that was not left out makes the variance of a target larger; it counts up to the usual one.
     """
@@ -239,7 +249,7 @@ def _deviations(
     weight = np.where(fitted[:, None], squares / np.maximum(variance, 1e-12)[:, None], 0.0)
     h = np.divide(fits.sectors[:, 0], squares, out=np.zeros_like(squares), where=weight > 0)
     common = common_shape(h, weight, sound)
-    return h - common, weight, common, sound
+    return h - common, weight, common, sound, outlines
 
 
 def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:

@@ -182,10 +182,7 @@ def _derivatives(theta: FloatArray, at: FloatArray, place: FloatArray) -> tuple[
 def _model(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return the share of black at scaled pixels, (n,), and its derivatives by homography and blur (n, 9)."""
     modules = len(black)
-    H = np.append(theta[_H], 1.0).reshape(3, 3)
-    w = P @ H[2]
-    uv = P @ H[:2].T / w[:, None]
-    along, rest = _blur_in_modules(theta[_S], H, uv, w)
+    uv, w, along, rest = _in_modules(theta, P)
     c = black.astype(float)  # rows are v, columns u
     share, d_u, d_v, d_s = np.zeros((4, len(P)))
     for node, weight in zip(NODES, WEIGHTS, strict=True):
@@ -209,23 +206,24 @@ def _model(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArr
     return share, D
 
 
-def _blur_in_modules(
-    blur: float, H: FloatArray, uv: FloatArray, w: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the blur along one direction and that of u and v by themselves, in modules, both (n, 2)."""
+def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return where scaled pixels are in modules, (n, 2), their denominators, (n,), and the blur there.
+
+    It acts along one direction, and on u and v by themselves, both (n, 2).
+    """
+    H, blur = np.append(theta[_H], 1.0).reshape(3, 3), theta[_S]
+    w = P @ H[2]
+    uv = P @ H[:2].T / w[:, None]
     gradient = (H[None, :2, :2] - uv[:, :, None] * H[2, :2]) / w[:, None, None]
     sigma = blur * np.sqrt((gradient**2).sum(axis=2))
     rho = blur**2 * (gradient[:, 0] * gradient[:, 1]).sum(axis=1) / sigma.prod(axis=1)
     along = np.sqrt(np.abs(rho))[:, None] * sigma * np.column_stack([np.ones(len(rho)), np.sign(rho)])
-    return along, sigma * np.sqrt(np.maximum(1 - np.abs(rho), MIN_REST))[:, None]
+    return uv, w, along, sigma * np.sqrt(np.maximum(1 - np.abs(rho), MIN_REST))[:, None]
 
 
 def _module_errors(theta: FloatArray, P: FloatArray, residual: FloatArray, modules: int) -> FloatArray:
     """Return how far the level of each module is from that of its code, in steps, (modules^2,)."""
-    H = np.append(theta[_H], 1.0).reshape(3, 3)
-    w = P @ H[2]
-    uv = P @ H[:2].T / w[:, None]
-    along, rest = _blur_in_modules(theta[_S], H, uv, w)
+    uv, _, along, rest = _in_modules(theta, P)
     share = np.zeros((len(P), modules, modules))
     for node, weight in zip(NODES, WEIGHTS, strict=True):
         phi = ndtr(((uv + node * along)[:, :, None] - np.arange(modules + 1)) / rest[:, :, None])
