@@ -180,6 +180,8 @@ def dense() -> Dense:
 
     kept: list[Alternative] = []
     with pytest.MonkeyPatch.context() as patch:
+        one_camera = np.zeros(7, dtype=np.int64)  # all photographs in every pattern
+        patch.setattr(alternatives, "cameras_of_photographs", lambda a: one_camera)
         patch.setattr(alternatives, "_made", recorded)
         found = alternatives_of(a, reduced, every)
     residual = (float(a.estimate.cameras[0].parameters[0]) - 10.0) / 2e-3 / a.sigma0
@@ -340,6 +342,61 @@ def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
         assert every[family, "linear"].factor == pytest.approx(np.linspace(-1, 1, m))
         assert every[family, "alternating"].factor.tolist() == [0, 1, 0, 1, 0, 1, 0]
         assert every[family, "linear"].search == every[family, "alternating"].search == 0
+
+
+def test_a_camera_differs_in_photographs_of_its_own_only() -> None:
+    """Two cameras taking turns, the second one zoomed between: each by itself, by all its patterns."""
+    rng = seed_of("two cameras")
+    network, truth = make_network(rng, images=10, points=25, cameras=2, free=("c",))
+    zoomed = replace(truth.cameras[1], parameters=truth.cameras[1].parameters * ([1.02] + [1.0] * 9))
+    third = replace(network, camera=np.where(np.arange(10) >= 6, network.camera * 2, network.camera))
+    moved = observed_anew(third, replace(truth, cameras=(*truth.cameras, zoomed)), 0.05, rng)
+    network = replace(moved, camera=network.camera)
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    assert alternatives.cameras_of_photographs(a).tolist() == [0, 1] * 5
+    every_columns = columns_of(a)
+    reduced = reduce_adjustment(a, every_columns)
+    every = alternatives.alternatives_of(a, reduced, every_columns)
+    found = [one for one in every if isinstance(one.family, families.CameraFamily) and one.pattern != "each"]
+    for one in found:
+        assert len({int(network.camera[i]) for i in np.flatnonzero(one.factor)}) == 1
+        assert len({int(network.camera[i]) for i in one.photographs}) == 1
+    D = reduced.whiten(every_columns.freedoms[:, :, :1])
+
+    def gain(factor: FloatArray) -> float:
+        return gain_of(*reduced.project(factor[reduced.image][:, None, None] * D)).value
+
+    for camera in (0, 1):
+        own = np.arange(10) % 2 == camera
+        of_camera = {one.pattern: one for one in found if one.family.name == "c" and one.factor[own].any()}
+        splits = [own & (np.cumsum(own) > k) for k in (2, 3)]
+        assert of_camera["split"].gain.value == pytest.approx(max(gain(one * 1.0) for one in splits))
+        assert of_camera["split"].search == pytest.approx(np.log(2))
+        groups = [some for some in product((0.0, 1.0), repeat=5) if 2 <= sum(some) <= 3]
+        largest = 0.0
+        for some in groups:
+            factor = np.zeros(10)
+            factor[own] = some
+            largest = max(largest, gain(factor))
+        assert of_camera["group"].gain.value == pytest.approx(largest)
+        assert of_camera["group"].search == pytest.approx(4 * np.log(2))
+    best = next(one for one in every if one.kind == "other_camera")
+    assert best.photographs.tolist() == [7, 9]
+    cause = hypotheses.find_causes(a)[0]
+    named = hypotheses.remark_of(a, cause, "m")
+    assert named.subjects["camera"] == ("camera 2",)
+    assert named.subjects["photographs"] == tuple(network.images[i] for i in (7, 9))
+    assert named.number("change") == pytest.approx(2.0, abs=0.1)
+
+
+def test_runs_are_of_one_camera_and_in_the_order_of_the_sequence() -> None:
+    camera = np.arange(150) % 2
+    run = alternatives._runs(camera)
+    assert run.max() + 1 == 60 and all(len(set(camera[run == k])) == 1 for k in range(60))
+    middle = [np.flatnonzero(run == k).mean() for k in range(60)]
+    assert middle == sorted(middle)
+    assert alternatives._runs(np.zeros(150, dtype=np.int64)).tolist() == (np.arange(150) * 60 // 150).tolist()
+    assert alternatives._runs(np.zeros(7, dtype=np.int64)).tolist() == list(range(7))
 
 
 def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense) -> None:

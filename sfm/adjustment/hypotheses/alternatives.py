@@ -63,7 +63,7 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
         *interiors(a, reduced, HELD),
         *interiors(a, reduced, GIVEN),
         *_format(a, reduced),
-        *_by_photographs(reduced, columns),
+        *_by_photographs(a, reduced, columns),
         *_moved_points(reduced),
     ]
     return tuple(sorted(found, key=lambda one: -one.evidence))
@@ -106,6 +106,7 @@ def _made(
     points: IntArray | None = None,
     parameters: tuple[tuple[int, int], ...] = (),
     parts: int = 1,
+    among: BoolArray | None = None,
 ) -> Alternative:
     """Return an alternative with its test; of that many parts each has parameters of its own."""
     r = reduced.redundancy
@@ -121,7 +122,7 @@ def _made(
     price = price_of(gain.rank, touched, search)
     evidence = spread.evidence(gain.value, gain.rank, r) - price
     return Alternative(
-        *(family, pattern, factor, gain, spread, log_p, price, search, evidence), some, parameters
+        *(family, pattern, factor, gain, spread, log_p, price, search, evidence), some, parameters, among
     )
 
 
@@ -191,36 +192,75 @@ def _of_scores(scores: FloatArray, variance: float) -> Spread:
     return Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False) if m > 1 else NONE
 
 
-def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
     """Return the alternatives of cameras, strain and bending in some of the photographs.
 
-    Of more than MAX_RUNS photographs those next to one another in the sequence are taken together.
+    Of more than MAX_RUNS photographs those next to one another in the sequence are taken together. A camera
+    changes in some of its own photographs, an object in some of all.
     """
     photographs = reduced.photographs
-    m = min(photographs, MAX_RUNS)
-    if m < 2 * MIN_GROUP:
+    if photographs < 2 * MIN_GROUP:
         return
-    run = np.arange(photographs) * m // photographs
+    camera = cameras_of_photographs(a)
+    run = _runs(camera)
+    m = int(run.max()) + 1
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
     yield from _each(reduced, H, g, squares, run)
+    every = np.ones(photographs, dtype=bool)
+    of_cameras = [camera == k for k in range(int(camera.max()) + 1)]
     for family in OF_PHOTOGRAPHS:
         some = np.array(family.places)
-        part = _Part(H[:, some][:, :, :, some], g[:, some], squares[:, some])
-        for pattern, factors, search in _patterns(m):
-            if pattern == "single" and not family.of_one:
-                continue
-            gains = [part.gain(factor) for factor in factors]
-            best = max(range(len(gains)), key=lambda k: gains[k].value)
-            spread = part.spread(factors[best], gains[best])
-            if pattern == "single":
-                own = _variance_of(reduced, run == best, gains[best])
-                spread = replace(spread, factor=max(spread.factor, own))
-            yield _made(reduced, family, pattern, factors[best][run], gains[best], search, spread)
-        if m > 2 * MIN_GROUP:
-            factor, gain = part.group()
-            if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
-                spread = part.spread(factor, gain)
-                yield _made(reduced, family, "group", factor[run], gain, (m - 1) * np.log(2), spread)
+        for among in of_cameras if family.of_camera else [every]:
+            runs = np.unique(run[among])
+            part = _Part(
+                H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)]
+            )
+            for pattern, factors, search in _patterns(len(runs)):
+                if pattern == "single" and not family.of_camera:
+                    continue  # an object that one photograph shows otherwise is that photograph's fault
+                gains = [part.gain(factor) for factor in factors]
+                best = max(range(len(gains)), key=lambda k: gains[k].value)
+                spread = part.spread(factors[best], gains[best])
+                factor = _of_photographs(factors[best], runs, run, m)
+                if pattern == "single":
+                    own = _variance_of(reduced, factor > 0, gains[best])
+                    spread = replace(spread, factor=max(spread.factor, own))
+                yield _made(reduced, family, pattern, factor, gains[best], search, spread, among=among)
+            if len(runs) > 2 * MIN_GROUP:
+                members, gain = part.group()
+                if MIN_GROUP <= members.sum() <= len(runs) - MIN_GROUP:
+                    spread, search = part.spread(members, gain), (len(runs) - 1) * np.log(2)
+                    factor = _of_photographs(members, runs, run, m)
+                    yield _made(reduced, family, "group", factor, gain, search, spread, among=among)
+
+
+def cameras_of_photographs(a: Adjustment) -> IntArray:
+    """Return the number of the camera that took each photograph, (m,); parameters of its own leave it one.
+
+    More than MAX_RUNS cameras count as one.
+    """
+    names = [next(filter(None, camera.shared), camera.name) for camera in a.estimate.cameras]
+    _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
+    return np.where(number.max() < MAX_RUNS, number, 0)
+
+
+def _runs(camera: IntArray) -> IntArray:
+    """Return the run of each photograph, (m,): those of one camera that follow one another."""
+    m = len(camera)
+    if m <= MAX_RUNS:
+        return np.arange(m)
+    piece = np.empty(m, dtype=np.int64)
+    piece[np.argsort(camera, kind="stable")] = np.arange(m) * MAX_RUNS // m
+    _, run = np.unique([camera, piece], axis=1, return_inverse=True)
+    middle = np.bincount(run, weights=np.arange(m)) / np.bincount(run)
+    return np.asarray(np.argsort(np.argsort(middle, kind="stable"))[run])
+
+
+def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: int) -> FloatArray:
+    """Return the factors of photographs, (m,), from those of some of the runs, 0 in the others."""
+    every = np.zeros(count)
+    every[runs] = factor
+    return every[run]
 
 
 def _each(
@@ -260,7 +300,12 @@ def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
 
 def _patterns(m: int) -> Iterator[tuple[str, FloatArray, float]]:
     """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
-    yield "single", np.eye(m), np.log(m)
+    if m == MIN_GROUP:
+        yield "single", np.eye(m)[1:], 0.0  # that the other one differs says the same
+    elif m > MIN_GROUP:
+        yield "single", np.eye(m), np.log(m)
+    if m < 2 * MIN_GROUP:
+        return
     splits = np.array([np.arange(m) >= k for k in range(MIN_GROUP, m - MIN_GROUP + 1)], dtype=float)
     yield "split", splits, np.log(len(splits))
     yield "linear", np.linspace(-1, 1, m)[None], 0.0

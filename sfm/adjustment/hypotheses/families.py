@@ -24,7 +24,7 @@ from sfm.adjustment.hypotheses.columns import (
 )
 from sfm.adjustment.hypotheses.score import Gain, Spread
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.remarks.remark import Quantity
 from sfm.similarity import without_motions
 
@@ -48,12 +48,14 @@ class Alternative:
     evidence: float  # gain of ln likelihood less the price
     points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
     parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
+    among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
 
     @property
     def photographs(self) -> IntArray:
         """The fewer photographs: those that differ from the others."""
-        on = np.flatnonzero(self.factor > 0)
-        off = np.flatnonzero(self.factor <= 0)
+        among = np.ones(len(self.factor), dtype=bool) if self.among is None else self.among
+        on = np.flatnonzero(among & (self.factor > 0))
+        off = np.flatnonzero(among & (self.factor <= 0))
         return on if len(on) <= len(off) else off
 
     @property
@@ -109,6 +111,7 @@ class OfPhotographs(Family):
     """
 
     places: tuple[int, ...]  # in the freedoms
+    of_camera: ClassVar[bool]  # whether a camera has it, which took some of the photographs
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points, px, (k, 2, q)."""
@@ -125,7 +128,7 @@ class OfPhotographs(Family):
 class CameraFamily(OfPhotographs):
     """Another camera in some photographs."""
 
-    of_one = True  # whether a single photograph may have it
+    of_camera = True
     unchecked = "camera_weakly_tested"
 
     def kind(self, pattern: str) -> str:
@@ -151,6 +154,9 @@ class CameraFamily(OfPhotographs):
             "photographs": tuple(a.network.images[i] for i in one.photographs),
             "change": (100 * sign * largest * float(beta[0]) / half, "%"),
         }
+        if one.among is not None and not one.among.all():
+            camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
+            parts["camera"] = next(filter(None, camera.shared), camera.name)
         if len(beta) > 2 and not linear:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
         return parts
@@ -171,7 +177,7 @@ class CameraFamily(OfPhotographs):
 class ObjectFamily(OfPhotographs):
     """Another shape of the object in some photographs."""
 
-    of_one = False  # an object that one photograph shows otherwise is that photograph's fault
+    of_camera = False
     unchecked = "shape_weakly_tested"
 
     def kind(self, pattern: str) -> str:

@@ -16,7 +16,12 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chndtrinc
 
-from sfm.adjustment.hypotheses.alternatives import MIN_GROUP, interior_parameters, needed_gain
+from sfm.adjustment.hypotheses.alternatives import (
+    MIN_GROUP,
+    cameras_of_photographs,
+    interior_parameters,
+    needed_gain,
+)
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import (
     CAMERA_FAMILIES,
@@ -79,13 +84,18 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
                 *(HELD, "all", np.ones(reduced.photographs), nothing, NONE, 0.0, 0.0, 0.0, 0.0),
                 parameters=some,
             )
-    m = reduced.photographs
-    if m < 2 * MIN_GROUP:
-        return
-    half = (np.arange(m) >= m // 2).astype(float)
-    search = float(np.log(m - 2 * MIN_GROUP + 1))
+    camera, every = cameras_of_photographs(a), np.ones(reduced.photographs, dtype=bool)
+    of_cameras = [camera == k for k in range(int(camera.max()) + 1)]
     for family in (*CAMERA_FAMILIES, STRAIN):
-        yield Alternative(family, "split", half, nothing, NONE, 0.0, 0.0, search, 0.0)
+        for among in of_cameras if family.of_camera else [every]:
+            m = int(among.sum())
+            if m < 2 * MIN_GROUP:
+                continue
+            half = among & (np.cumsum(among) > m // 2)
+            search = float(np.log(m - 2 * MIN_GROUP + 1))
+            yield Alternative(
+                *(family, "split", half.astype(float), nothing, NONE, 0.0, 0.0, search, 0.0), among=among
+            )
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns) -> float:

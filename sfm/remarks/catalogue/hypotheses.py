@@ -17,7 +17,7 @@ ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "The camera of {photographs} is not that of the others (c {change:+}"
+        "The camera of {photographs} is not that of the others[[ of camera {camera}]] (c {change:+}"
         f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
         "Give these photographs another camera in the survey file, or set per_photograph.",
@@ -35,7 +35,7 @@ ROWS = (
     Kind(
         "camera_drift",
         SHIFT,
-        "The camera changes steadily through the sequence (c by {change:+} from first to last). "
+        "The camera[[ {camera}]] changes steadily through the sequence (c by {change:+} from first to last). "
         f"{SHIFTED}{INSTEAD}",
         "the camera warmed up, or its focus crept",
         "Set per_photograph for c, and let the camera warm up before the survey.",
