@@ -10,6 +10,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.conventions import rotation_from_vector
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind, remark
 from sfm.remarks.verdict import Verdict
@@ -17,7 +18,7 @@ from sfm.report.findings import camera_remarks
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from tests.surveys import survey_of
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of
 
 
 def verdict_of(a: Adjustment) -> Verdict:
@@ -80,3 +81,25 @@ def test_a_lens_may_be_decentred_by_a_fiftieth_of_the_diagonal() -> None:
         assert camera_remarks._format_around(at, 2000, 1500) == right
     for away, severity in ((0.0999, "note"), (0.1001, "warning")):  # of the centre, where others are tried
         assert remark("principal_point_far", camera="c", share=away).severity == severity
+
+
+def test_photographs_from_the_front_do_not_calibrate() -> None:
+    """With known points the camera is the result, and c with 10 % is none; else it is a weak part of one."""
+    rng = seed_of("frontal")
+    network, truth = make_network(rng, images=6, points=60, planar=True, free=("c", "x0", "y0"))
+    position = np.array([0.0, 0.0, 2.5]) + rng.normal(0, 0.05, (6, 3))
+    tilts = np.array([rotation_from_vector(w) for w in rng.normal(0, 2e-3, (6, 3))])
+    frontal = replace(truth, position=position, rotation=tilts)
+    for stations, level in ((truth, "good"), (frontal, "bad")):
+        seen = observed_anew(network, stations, 0.1, rng)
+        known = seen.with_control(seen.points, stations.points)
+        found = verdict_of(adjust(known, stations, datum=Datum("control")))
+        assert found.level == level
+        for one in of_kind(found.remarks, "camera_not_calibrated"):
+            assert 0.05 < one.number("share") < 1 / 3
+    assert of_kind(found.remarks, "camera_not_calibrated")
+    assert not of_kind(found.remarks, "c_hardly_determined")
+    some = known.with_control(seen.points[:10], stations.points[:10])
+    weak = verdict_of(adjust(some, stations, datum=Datum("control")))
+    assert of_kind(weak.remarks, "c_hardly_determined")
+    assert not of_kind(weak.remarks, "camera_not_calibrated")

@@ -73,8 +73,18 @@ ROWS = (
         "Give c from a calibration, or add photographs from other distances.",
     ),
     Kind(
+        "camera_not_calibrated",
+        "error",
+        "{parameter} of camera {camera} is known to {share:%} only, and all object points are given: "
+        "the camera is not calibrated.",
+        "photographs from the front: their distance takes up an error of c",
+        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+    ),
+    Kind(
         "c_hardly_determined",
-        Grade("share", warning=0.05, error=1 / 3),  # three standard deviations reach c = 0
+        # a warning where EXIF data and the size of a sensor give c as well; an error where three standard
+        # deviations reach c = 0
+        Grade("share", warning=0.05, error=1 / 3),
         "{parameter} of camera {camera} is known to {share:%} only[[, strongly correlated with {partners}]].",
         "a long lens, few photographs, or small angles between them",
         "Hold it fixed at a calibrated value, or add photographs at larger angles and other distances.",

@@ -25,11 +25,13 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
         sigma = float(result.adjustment.interior_sigma(number)[0])
         owner = camera.owner_of(0)
         if np.isfinite(sigma):
-            partners = strong.get(f"{name} of camera {owner}")
-            one = remark(
-                "c_hardly_determined", parameter=name, camera=owner, share=sigma / abs(c), partners=partners
+            share, partners = sigma / abs(c), strong.get(f"{name} of camera {owner}")
+            one = unless_note(
+                remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
             )
-            found.setdefault(owner, unless_note(one))
+            if one and not result.adjustment.unknown_counts[2]:  # the camera is the result
+                one = (remark("camera_not_calibrated", parameter=name, camera=owner, share=share),)
+            found.setdefault(owner, one)
     return tuple(one for remarks in found.values() for one in remarks)
 
 
