@@ -9,6 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import residuals
+from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.gross_errors.robust import (
@@ -306,3 +307,23 @@ def once_more(again):  # type: ignore[no-untyped-def]
         return again(run, optimum, weight)
 
     return counted
+
+
+def test_reweighting_ends_where_its_rounds_do_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two photographs of a plane do not determine a camera: three reweightings by each estimator show it."""
+    rng = seed_of("flat valley")
+    network, truth = make_network(rng, images=2, points=60, planar=True, free=("c", "x0", "y0", "K1", "P1"))
+    rounds = []
+    again = rejection.Run.again
+
+    def counted(run: rejection.Run, optimum: Optimum, weight: FloatArray) -> Optimum:
+        found = again(run, optimum, weight)
+        rounds.append(found.converged)
+        return found
+
+    monkeypatch.setattr(rejection.Run, "again", counted)
+    a = adjust(network, truth, datum=FREE, covariance=False, max_iterations=3)
+    assert not a.converged and not any(rounds)
+    assert (
+        len(rounds) == 3 + 1 + 3 + 3 + 1 + 1
+    )  # by Tukey, by Huber and Tukey, with what is left; and the last one

@@ -37,6 +37,7 @@ BENT_ALONE = 10.0  # the same of one photograph, over the median of all photogra
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
 MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they tell no depth
 REWEIGHTINGS = 30
+MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence: of 400 networks with gross errors more helped none
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
@@ -329,7 +330,7 @@ def _reweight(
     if out is not None:
         ready &= ~out
     count = 2 * int(ready.sum()) + run.problem.weighted.count
-    freedom = run.redundancy(optimum, ready.astype(float)) / max(count, 1)
+    freedom, vague = run.redundancy(optimum, ready.astype(float)) / max(count, 1), 0
     for _ in range(REWEIGHTINGS):
         v = residuals(layout.observations, optimum.state)
         sigma0 = robust_scale(layout.observations, v, ready & np.isfinite(v).all(axis=1), freedom=freedom)
@@ -337,6 +338,7 @@ def _reweight(
         change = float(np.abs(new - weight).max())
         weight = new
         optimum = run.again(optimum, weight)
-        if change <= REWEIGHTED:
+        vague += not optimum.converged
+        if change <= REWEIGHTED or vague > MAX_VAGUE_WEIGHTS:
             break
     return optimum, weight
