@@ -11,9 +11,16 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.solve import adjust
+from sfm.errors import GeometryError
 from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
-from sfm.survey.inputs.checks.copies import MIN_CORRELATION, SAME_PLACE, find_copies
+from sfm.survey.inputs.checks.copies import (
+    MIN_CORRELATION,
+    SAME_PLACE,
+    find_copies,
+    without_copies,
+)
+from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import survey_of, write_photograph_survey
 from tests.synthetic import make_network, seed_of
@@ -88,3 +95,13 @@ def test_photographs_whose_errors_correlate(rho: float) -> None:
             ("image 6", "image 3")
         ]
     assert SAME_PLACE == 1e-3
+
+
+def test_photographs_of_one_place_are_named_as_such() -> None:
+    """A fixed camera and a fixed board: what is seen differs by far less than residuals."""
+    network, truth = make_network(seed_of("still"), images=3, points=60, noise_px=0.1)
+    measured = measurements_from_observations(survey_of(network, truth))
+    copies = {"image 2": ("image 1", 0.99), "image 3": ("image 1", 0.98)}
+    assert len(without_copies(measured, {"image 2": copies["image 2"]}).network.images) == 2
+    with pytest.raises(GeometryError, match="2 photographs of 3 show"):
+        without_copies(measured, copies)

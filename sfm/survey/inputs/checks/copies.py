@@ -22,7 +22,9 @@ from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
+from sfm.display import counted, listed
 from sfm.distributions import f_sf
+from sfm.errors import GeometryError
 from sfm.network import Estimate, rows_of
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import remark
@@ -82,9 +84,18 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     Args:
         measured: all photographs.
         copies: by `find_copies`.
+
+    Raises:
+        GeometryError: fewer than two photographs are left.
     """
     network = measured.network
     keep = np.array([name not in copies for name in network.images], dtype=bool)
+    if keep.sum() < 2:
+        raise GeometryError(
+            f"{counted(len(copies), 'photograph')} of {len(keep)} show the object as another one does, "
+            f"down to the errors ({listed(copies)}): they are copies, or nothing moved "
+            "between the exposures; photograph from other directions, or move the plate"
+        )
     every = np.ones(len(network.image_points), dtype=bool)
     points = np.ones(len(network.points), dtype=bool)
     empty = np.full((len(keep), 3), np.nan), np.full((len(keep), 3, 3), np.nan)
