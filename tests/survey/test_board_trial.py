@@ -1,4 +1,4 @@
-"""Boards that a trial recognises: behind empty photographs, of older patterns, cut by the border."""
+"""Targets that a trial recognises: boards behind empty photographs, of older patterns, cut; CCTags."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import pytest
 
 from sfm.conventions import AnyArray
 from sfm.survey.drafting.target_trial import try_targets
+from sfm.targets.codes.concentric import concentric_family
 from sfm.targets.codes.plate_search import search_april_grid, search_checkerboard
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
 from sfm.targets.detect import find_targets
 from tests.synthetic import seed_of
+from tests.targets.concentric_tags import draw_tag
+from tests.targets.shapes import PAPER
 from tests.targets.test_april_grids import drawn, photographed
 
 CHARUCO = PlateFamily("charuco", 7, 5, (), "aruco4x4_50", 0.74)
@@ -78,3 +81,24 @@ def test_a_checkerboard_that_is_whole_in_one_photograph_is_found_where_another_c
         assert search_checkerboard([whole, other]) is None
     shorter = np.pad(board[:, :320], 60, constant_values=220)
     assert search_checkerboard([whole, cv2.GaussianBlur(shorter, (0, 0), 1.0)]) is None  # another board
+
+
+@pytest.mark.parametrize("family", ["cctag3", "cctag4"])
+def test_concentric_tags_are_recognised_by_the_codes_that_photographs_share(
+    family: str, tmp_path: Path
+) -> None:
+    """By their rings where these are resolved; the two families have other widths."""
+    rng, numbers = seed_of(f"trial {family}"), (3, 10, 17, 24, 31)
+    for k in range(2):
+        picture = np.full((400, 600), PAPER, dtype=np.uint8)
+        for place, number in enumerate(numbers):
+            tag = draw_tag(
+                concentric_family(family), number, 45.0, tilt_deg=20.0, blur=0.8, noise=1.0, rng=rng
+            )
+            row, column = divmod(place, 3)
+            side = tag.image.shape[0]
+            picture[200 * row : 200 * row + side, 200 * column : 200 * column + side] = tag.image
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
+    trial = try_targets(sorted(tmp_path.iterdir()))
+    assert (trial.codes, trial.polarity) == (family, "dark")
+    assert sorted(map(int, trial.repeated)) == list(numbers)

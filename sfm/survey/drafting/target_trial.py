@@ -1,4 +1,4 @@
-"""Which targets a few photographs show: rings, square tags, boards and plates of dots, in this order."""
+"""Which targets photographs show: rings, tags, boards, plates of dots, concentric tags, in this order."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
+from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
+from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.plate_search import (
     search_april_grid,
@@ -78,7 +80,7 @@ def try_targets(
     Raises:
         GeometryError: fewer than two of them can be decoded.
     """
-    progress.stage("trial", TRIED + 4)
+    progress.stage("trial", TRIED + 5)
     tried, plain, unreadable = _readable(paths, store, progress)
     photographs = [read_photograph(path) for path in tried]
     counts: dict[str, tuple[int, ...]] = {}
@@ -100,6 +102,13 @@ def try_targets(
         elif plate is None:
             plate = _dots(plain, [path for path in more if path not in tried], store)
         progress.advance("plates of dots")
+        if plate is None and not tags:
+            read = [read_resolved(photograph) for photograph in photographs]
+            counts |= {family: _repeated([one[family] for one in read]) for family in CONCENTRIC}
+            best = max(counts, key=lambda family: len(counts[family]))
+            if len(counts[best]) >= MIN_REPEATED:
+                measured = [_measure(path, best, store) for path in tried]
+        progress.advance("concentric tags")
     coded = len(counts[best]) >= MIN_REPEATED and plate is None
     if coded and best in RING_NAMES:
         measured = [_measure(path, best, store) for path in tried]

@@ -33,7 +33,14 @@ from sfm.targets.fits.concentric import (
     rho_at,
 )
 from sfm.targets.measure import axes_from_shape
-from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, Outlines
+from sfm.targets.outlines import (
+    MIN_STEP,
+    STEP_SIGMAS,
+    Outlines,
+    estimate_noise,
+    find_outlines,
+    scale_of,
+)
 
 # Number of steps, their least width and what a set bit adds, in outer radii.
 WIDTHS = {"cctag3": (5, 0.10, 0.05), "cctag4": (7, 0.08, 0.04)}
@@ -152,6 +159,23 @@ def find_concentric(
     code = np.array([number for number, _, _ in kept], dtype=np.int64)
     confidence = np.array([sure for _, sure, _ in kept], dtype=float)
     return ConcentricTags(code, confidence, tuple(fit for _, _, fit in kept))
+
+
+def read_resolved(photograph: AnyArray) -> dict[str, IntArray]:
+    """Return the ids of the tags whose rings are told apart on every ray, by family, to see which is shown.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+    """
+    noise, scale = estimate_noise(photograph), scale_of(photograph)
+    families = [concentric_family(name) for name in WIDTHS]
+    least = 2 * RESOLVED_PX / max(family.narrow for family in families)
+    limits = {"min_diameter_px": least, "max_diameter_px": math.inf}
+    outlines = find_outlines(photograph, (1, -1), noise=noise, scale=scale, **limits)
+    return {
+        family.name: find_concentric(photograph, family, outlines, noise=noise, scale=scale).code
+        for family in families
+    }
 
 
 def _resembles_rings(grey: AnyArray, outlines: Outlines, least: float) -> BoolArray:
