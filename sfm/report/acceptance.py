@@ -12,8 +12,7 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.measurements import length_error_figure
-from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import png
+from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.page_files import write_files
 
@@ -57,7 +56,7 @@ def write_acceptance(found: Acceptance, out: Path) -> Path:
         remarks=verdict.lines,
         rows=acceptance_rows(found),
         decisions=DECISIONS,
-        picture=Plot("errors", PICTURE, png(length_error_figure(found))),
+        picture=plot("errors", PICTURE, length_error_figure(found)),
     )
     texts = (csv_text(COLUMNS, acceptance_rows(found)), text + "\n", page)
     return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])

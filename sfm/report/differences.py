@@ -15,7 +15,7 @@ from sfm.conventions import FloatArray
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import png
+from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
@@ -162,7 +162,7 @@ def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
 
 def _picture(found: ResultComparison, xyz: FloatArray) -> Plot:
     figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
-    return Plot("differences", PICTURE, png(figure))
+    return plot("differences", PICTURE, figure)
 
 
 def _tested(found: ResultComparison) -> int:

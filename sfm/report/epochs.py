@@ -19,7 +19,7 @@ from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import png
+from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit
 from sfm.report.page_files import write_files
@@ -230,7 +230,7 @@ def _picture(found: Displacements, number: int) -> Plot | None:
         return None
     d = found.differences
     figure = difference_figure(d.xyz, found.displacement, found.moved, d.unit)
-    return Plot(f"displacements-{number}", PICTURE, png(figure))
+    return plot(f"displacements-{number}", PICTURE, figure)
 
 
 def _series_picture(found: EpochSeries) -> Plot | None:
@@ -249,7 +249,7 @@ def _series_picture(found: EpochSeries) -> Plot | None:
     factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
     rows = [_along(name, pairs) for name in chosen]
     length, sigma = (factor * np.array([row[k] for row in rows]) for k in (0, 1))
-    return Plot("series", BANDS, png(series_figure(found.names, tuple(chosen), length, sigma, unit)))
+    return plot("series", BANDS, series_figure(found.names, tuple(chosen), length, sigma, unit))
 
 
 def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:

@@ -20,8 +20,7 @@ from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
 from sfm.inspection.measure import Measurement
 from sfm.report.figures.measurements import deviation_figure
-from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import png
+from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
@@ -277,9 +276,12 @@ def worst_deviation(found: Measurement) -> FloatArray:
 def measurement_page(found: Measurement, viewer: Viewer | None) -> str:
     """Return the page: verdict, tolerances, shapes, functions and points."""
     pictures = [
-        Plot(f"deviations {k}", f"Deviations of {one.name} from {one.against}, with its limits.", png(figure))
+        plot(
+            f"deviations {k}",
+            f"Deviations of {one.name} from {one.against}, with its limits.",
+            deviation_figure(one, found.unit),
+        )
         for k, one in enumerate(found.tolerances)
-        for figure in (deviation_figure(one, found.unit),)
     ]
     verdict = found.verdict
     return render(

@@ -17,8 +17,7 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.remarks.catalogue import KINDS
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
-from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import png
+from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.page_files import write_files
 
@@ -166,7 +165,7 @@ def validation_page(validation: Validation) -> str:
         networks=[(trial, ended(trial.remark.kind)) for trial in validation.trials],
         largest=[(name, in_words(value, unit)) for name, value, unit in largest(validation)],
         marginal_over_conditional=_median_ratio(validation),
-        picture=Plot("time", TIME_CAPTION, png(time_figure(validation))),
+        picture=plot("time", TIME_CAPTION, time_figure(validation)),
     )
 
 

@@ -276,7 +276,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     assert tags.tags.count("script") == 1  # that of the tables; nothing needs it
     assert EVIL in tags.text
     assert EVIL + ".jpg" in tags.text
-    assert tags.tags.count("img") == 6
+    assert tags.tags.count("img") == 11  # panels of six plots
     for source in tags.sources:
         assert source.startswith(("data:image/png;base64,", "#")) or source.rstrip("/") in WRITTEN, source
     for question in (
@@ -293,14 +293,41 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
 
 
 def test_plots_are_legible_on_a_telephone(browser: Any, result: SurveyResult, tmp_path: Path) -> None:
-    """They keep a width at which their numbers can be read and are moved sideways, the page is not."""
+    """Their panels go below one another, whole, and are hardly made smaller."""
     found = findings_of(result)
     (tmp_path / "report.html").write_text(report_page(found, all_plots(plot_data(found)), ()), "utf-8")
-    tab = Tab(browser, tmp_path / "report.html", width=390)
-    widths = tab.page.locator(".plot img").evaluate_all("all => all.map((one) => one.clientWidth)")
-    assert min(widths) >= 700
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
-    tab.close()
+    sizes = "all => all.map((one) => [one.clientWidth, one.naturalWidth, one.getBoundingClientRect().left])"
+    for width, scale, columns in ((390, 0.6, 1), (1300, 0.9, 2)):
+        tab = Tab(browser, tmp_path / "report.html", width=width)
+        shown = np.array(tab.page.locator(".plot img").evaluate_all(sizes))
+        assert (shown[:, 0] >= scale * shown[:, 1]).all()
+        assert len(np.unique(shown[:, 2])) == columns
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+        tab.close()
+
+
+def test_plots_are_on_the_paper_of_the_page_light_and_dark(
+    browser: Any, result: SurveyResult, tmp_path: Path
+) -> None:
+    found = findings_of(result)
+    (tmp_path / "report.html").write_text(report_page(found, all_plots(plot_data(found)), ()), "utf-8")
+    for scheme, paper, ink in (("light", (255, 255, 255), 0), ("dark", (23, 29, 37), 255)):
+        tab = Tab(browser, tmp_path / "report.html", color_scheme=scheme)
+        image = cv2.imdecode(np.frombuffer(tab.page.locator(".plot img").first.screenshot(), np.uint8), 1)
+        assert np.abs(image[4, 4, ::-1].astype(int) - paper).max() <= 1
+        assert (np.abs(image.astype(int) - ink).max(axis=2) < 40).any()
+        tab.close()
+
+
+def test_pictures_are_cut_into_panels_that_show_something(result: SurveyResult) -> None:
+    drawn = {one.stem: one for one in all_plots(plot_data(findings_of(result)))}
+    width = {
+        stem: [cv2.imdecode(np.frombuffer(png, np.uint8), 0).shape[1] for png in (one.png, *one.panels)]
+        for stem, one in drawn.items()
+    }
+    assert len(width.pop("projection")) == 2  # the place of a second camera is empty
+    assert len(width) == 5
+    assert all(len(found) == 3 and found[0] == found[1] + found[2] for found in width.values())
 
 
 def test_precision_is_told_as_one_sigma_and_as_what_95_of_100_are_within(

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import program_name
-from sfm.report.figures.plots import BLUE, RED, plan_axes
+from sfm.report.figures.plots import ALONE_IN, BLUE, RED, alone, plan_axes
 from sfm.report.numbers import finer_unit, significant
 
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
@@ -34,8 +34,8 @@ def difference_figure(
     factor = LONGEST_ARROW * size / longest if longest > 0 else 1.0
     finer, fine_unit = finer_unit(unit, max(longest, across))
     fine_unit = fine_unit or "object units"
-    height = float(np.clip(8.5 * np.ptp(flat[:, 1]) / max(np.ptp(flat[:, 0]), 1e-12 * size), 2.5, 8.0))
-    picture = Figure(figsize=(8.5, height + 0.8), layout="constrained")
+    height = float(np.clip(ALONE_IN * np.ptp(flat[:, 1]) / max(np.ptp(flat[:, 0]), 1e-12 * size), 2.5, 8.0))
+    picture = alone(height + 0.8)
     axes = picture.subplots()
     colours = np.where(significant_ones, RED, BLUE)
     arrows = axes.quiver(
@@ -69,7 +69,7 @@ def time_figure(validation: Validation) -> Figure:
     """Draw the seconds of both adjusters over the number of image points."""
     k = np.array([t.image_points for t in validation.trials])
     seconds = np.array([t.seconds for t in validation.trials])
-    picture = Figure(figsize=(8.5, 3.6), layout="constrained")
+    picture = alone(3.6)
     axes = picture.subplots()
     axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label=program_name("kolinear"))
     axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=program_name(validation.backend))
@@ -92,7 +92,7 @@ def series_figure(
         sigma: standard deviations of these, unit, (p, k).
         unit: of lengths.
     """
-    picture = Figure(figsize=(8.5, 3.8), layout="constrained")
+    picture = alone(3.8)
     axes = picture.subplots()
     at = np.arange(len(names))
     for name, values, s in zip(points, length, sigma, strict=True):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from sfm.geometry.tolerance import IN, OUT, Deviations
 from sfm.inspection.acceptance import Acceptance
-from sfm.report.figures.plots import BLUE, GREEN, GREY, ORANGE, RED
+from sfm.report.figures.plots import BLUE, GREEN, GREY, ORANGE, RED, alone, panelled
 from sfm.report.numbers import finer_unit
 
 BINS = 30
@@ -20,8 +20,8 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
     largest = float(np.abs([*found.value, *limits]).max())
     factor, fine = finer_unit(unit, largest)
     value, U = found.value * factor, found.coverage * np.nan_to_num(found.sigma) * factor
-    picture = Figure(figsize=(8.5, 3.4), layout="constrained")
-    left, right = picture.subplots(1, 2, width_ratios=(2, 3))
+    picture = panelled(3.6)
+    left, right = picture.subplots(1, 2)
     left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
     left.set_xlabel(f"deviation [{fine}]")
     left.set_ylabel("points")
@@ -55,7 +55,7 @@ def length_error_figure(found: Acceptance) -> Figure:
     length, error = found.lengths.length, found.error
     U = found.coverage * np.nan_to_num(found.lengths.sigma)
     factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
-    picture = Figure(figsize=(8.5, 4.2), layout="constrained")
+    picture = alone(4.2)
     axes = picture.subplots()
     x = np.linspace(0, 1.05 * float(length.max()), 200)
     limit = np.minimum(found.a + found.k * x, found.b) * factor

@@ -9,11 +9,12 @@ from sfm.conventions import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture of a page."""
+    """A picture of a page, whole and in its panels."""
 
     stem: str  # of its file name
     caption: str
     png: bytes
+    panels: tuple[bytes, ...]  # PNG each, row by row: a page puts as many beside one another as are legible
 
 
 @dataclass(frozen=True)

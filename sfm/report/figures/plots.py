@@ -11,15 +11,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from PIL import Image
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
 COMPRESSION = 2  # of PNG, 1 to 9: more takes its time and hardly makes lines on white smaller
-WIDTH_IN = 11.0  # of the pictures of the report
-LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.75, 0.15, 0.55, 0.35, 0.95  # margins
+WIDTH_IN = 9.6  # of pictures of two panels
+ALONE_IN = 6.0  # of pictures of one
+LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.9, 0.15, 0.55, 0.35, 1.05  # margins
 LETTER_IN = 0.065  # width of a letter of the names of photographs
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
@@ -43,16 +45,43 @@ def all_plots(shown: PlotData) -> tuple[Plot, ...]:
         drawn += (("precision", _PRECISION, precision_figure),)
     if any(shown.projection):
         drawn += (("projection", _PROJECTION, projection_figure),)
-    return tuple(Plot(stem, caption, png(draw(shown))) for stem, caption, draw in drawn)
+    return tuple(plot(stem, caption, draw(shown)) for stem, caption, draw in drawn)
 
 
-def png(figure: Figure) -> bytes:
-    """Return a picture as PNG."""
-    buffer = io.BytesIO()
+def plot(stem: str, caption: str, figure: Figure) -> Plot:
+    """Draw a figure, and cut it into its panels where it is `panelled`."""
     figure.set_dpi(DPI)
-    canvas = FigureCanvasAgg(figure)  # savefig would draw it twice
-    canvas.print_png(buffer, pil_kwargs={"compress_level": COMPRESSION})  # type: ignore[no-untyped-call]
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]  # type: ignore[no-untyped-call]
+    return Plot(
+        stem, caption, _png(pixels), tuple(_png(pixels[rows, columns]) for rows, columns in _cells(figure))
+    )
+
+
+def _png(pixels: AnyArray) -> bytes:
+    """Return a picture, (h, w, 3), as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=COMPRESSION)
     return buffer.getvalue()
+
+
+def _cells(figure: Figure) -> list[tuple[slice, slice]]:
+    """Return rows and columns of pixels of each panel that shows something, with its labels."""
+    specs = [panel.get_subplotspec() for panel in figure.axes if panel.axison]
+    shown = [spec.get_topmost_subplotspec() for spec in specs if spec is not None]
+    grid = shown[0].get_gridspec()
+    _, tops, lefts, _ = (np.asarray(edge) for edge in grid.get_grid_positions(figure))
+    width, height = figure.get_size_inches() * DPI
+    x = [0, *np.rint(lefts[1:] * width - LEFT_IN * DPI).astype(int), round(width)]
+    y = [0, *np.rint((1 - tops[1:]) * height - TOP_IN * DPI).astype(int), round(height)]
+    places = dict.fromkeys((spec.rowspan.start, spec.colspan.start) for spec in shown)
+    return [(slice(y[r], y[r + 1]), slice(x[c], x[c + 1])) for r, c in places]
+
+
+def alone(height_in: float) -> Figure:
+    """Return a figure for one panel, no wider than a telephone makes legible."""
+    return Figure(figsize=(ALONE_IN, height_in), layout="constrained")
 
 
 def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
@@ -72,13 +101,13 @@ def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -
 
 def entitled(panel: Axes, title: str) -> None:
     """Put a title above a panel, where it is; matplotlib else measures all labels to find the place."""
-    panel.set_title(title, y=1.0)
+    panel.set_title(title, y=1.0, fontsize=10)
 
 
 _NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
 _RESIDUALS = (
-    "Residual vectors over the format of each camera: all of them, and their mean in each cell. A pattern in "
-    "the means is distortion that the camera model does not describe."
+    "Residual vectors over the format of each camera, enlarged by the factor behind ×: all of them, and their "
+    "mean in each cell. A pattern in the means is distortion that the camera model does not describe."
 )
 _DISTRIBUTION = (
     "Residuals divided by their own standard deviation, against the normal distribution, and residuals by "
@@ -127,7 +156,7 @@ def network_figure(shown: PlotData) -> Figure:
                 (x, y),
                 xytext=(4, 4),
                 textcoords="offset points",
-                fontsize=6,
+                fontsize=7,
                 color="#444",
             )
     plan.legend(loc="upper right", fontsize=7)
@@ -183,7 +212,7 @@ def projection_figure(shown: PlotData) -> Figure:
         panel.set_aspect("equal")
         panel.set_xlabel("x [px]")
         panel.set_ylabel("y [px]")
-        entitled(panel, _plain(camera.name))
+        entitled(panel, _plain(_clipped(camera.name)))
     for panel in panels[len(adjusted) :]:
         panel.set_axis_off()
     return figure
@@ -202,12 +231,12 @@ def residual_figure(shown: PlotData) -> Figure:
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
-        entitled(panels[k, 0], f"{_plain(camera.name)}: {len(xy)} residuals, drawn {factor:g} times as long")
+        entitled(panels[k, 0], f"{_plain(_clipped(camera.name))}: {len(xy)} residuals, × {factor:g}")
         centres, means = _cell_means(xy, v, width, height)
         if len(centres):
             factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
             _arrows(panels[k, 1], centres, means * factor, RED)
-        entitled(panels[k, 1], f"{_plain(camera.name)}: mean of each cell, drawn {factor:g} times as long")
+        entitled(panels[k, 1], f"{_plain(_clipped(camera.name))}: mean of each cell, × {factor:g}")
         for panel in panels[k]:
             panel.set_xlim(-0.5, width - 0.5)
             panel.set_ylim(height - 0.5, -0.5)
@@ -361,8 +390,12 @@ def _round_factor(factor: float) -> float:
 
 def _short(name: str) -> str:
     """Return a file name without folder and suffix, shortened from the left."""
-    stem = name.rsplit("/", 1)[-1].rsplit(".", 1)[0]
-    return stem if len(stem) <= 16 else "..." + stem[-13:]
+    return _clipped(name.rsplit("/", 1)[-1].rsplit(".", 1)[0])
+
+
+def _clipped(name: str) -> str:
+    """Return a name, its end alone where it is long."""
+    return name if len(name) <= 16 else "..." + name[-13:]
 
 
 def _plain(text: str) -> str:
