@@ -22,6 +22,7 @@ COMPRESSION = 2  # of PNG, 1 to 9: more takes its time and hardly makes lines on
 WIDTH_IN = 9.6  # of pictures of two panels
 ALONE_IN = 6.0  # of pictures of one
 LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.9, 0.15, 0.55, 0.35, 1.05  # margins
+BAR_FRACTION = 0.2  # of a panel, for the scale of its colours with its labels
 LETTER_IN = 0.065  # width of a letter of the names of photographs
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
@@ -106,8 +107,8 @@ def entitled(panel: Axes, title: str) -> None:
 
 _NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
 _RESIDUALS = (
-    "Residual vectors over the format of each camera, enlarged by the factor behind ×: all of them, and their "
-    "mean in each cell. A pattern in the means is distortion that the camera model does not describe."
+    "Residual vectors over the format of each camera, enlarged by the factor behind ×: all of them, and "
+    "their mean in each cell. A pattern in the means is distortion that the camera model does not describe."
 )
 _DISTRIBUTION = (
     "Residuals divided by their own standard deviation, against the normal distribution, and residuals by "
@@ -149,12 +150,15 @@ def network_figure(shown: PlotData) -> Figure:
         entitled(panel, title)
         panel.grid(color="#ddd", linewidth=0.5)
     plan = figure.axes[0]
+    middle = sum(plan.get_xlim()) / 2
     for name, x, y in zip(shown.images, position[:, 0], position[:, 1], strict=True):
         if len(position) <= MAX_NAMED:
+            right = x > middle  # names go inwards
             plan.annotate(
                 _plain(_short(name)),
                 (x, y),
-                xytext=(4, 4),
+                xytext=(-4 if right else 4, 4),
+                ha="right" if right else "left",
                 textcoords="offset points",
                 fontsize=7,
                 color="#444",
@@ -179,7 +183,9 @@ def precision_figure(shown: PlotData) -> Figure:
             s=14,
             cmap="viridis",
         )
-        figure.colorbar(drawn, ax=panel, label=f"sigma [{_plain(shown.sigma_unit)}]", shrink=0.85)
+        figure.colorbar(
+            drawn, ax=panel, label=f"sigma [{_plain(shown.sigma_unit)}]", shrink=0.85, fraction=BAR_FRACTION
+        )
         panel.set_aspect("equal", adjustable="datalim")
         panel.set_xlabel(f"{labels[across]} [{_plain(shown.unit)}]")
         panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
@@ -206,7 +212,15 @@ def projection_figure(shown: PlotData) -> Figure:
         )
         xy = shown.xy[owner == k]
         panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="white", markersize=1, alpha=0.6)
-        figure.colorbar(drawn, ax=panel, label="sigma [px]", shrink=0.85, ticks=levels, format="%.2g")
+        figure.colorbar(
+            drawn,
+            ax=panel,
+            label="sigma [px]",
+            shrink=0.85,
+            fraction=BAR_FRACTION,
+            ticks=levels,
+            format="%.2g",
+        )
         panel.set_xlim(-0.5, width - 0.5)
         panel.set_ylim(height - 0.5, -0.5)
         panel.set_aspect("equal")
@@ -258,7 +272,7 @@ def distribution_figure(shown: PlotData) -> Figure:
     )
     t = np.linspace(-5, 5, 201)
     histogram.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color="black", linewidth=1, label="normal")
-    histogram.set_xlabel("residual / its standard deviation  (beyond 5 in the last bar)")
+    histogram.set_xlabel("residual / its sigma (beyond 5 in the last bar)")
     histogram.set_ylabel("frequency")
     histogram.legend(fontsize=8, loc="upper right")
     distance = np.linalg.norm(ray, axis=1)
@@ -275,7 +289,9 @@ def distribution_figure(shown: PlotData) -> Figure:
     radial.axhline(0, color="black", linewidth=0.5)
     radial.set_xlabel("distance from the centre of the photograph [px]")
     radial.set_ylabel("residual [px]")
-    radial.legend(fontsize=8, loc="upper left")  # "best" takes seconds with many points
+    lowest, highest = radial.get_ylim()
+    radial.set_ylim(lowest, highest + 0.25 * (highest - lowest))  # for the legend
+    radial.legend(fontsize=8, loc="upper left", ncols=2)  # "best" takes seconds with many points
     return figure
 
 
