@@ -186,6 +186,7 @@ def test_the_object_fills_the_canvas_and_a_chosen_point_is_in_its_middle(
     if orthographic:
         page.get_by_label("orthographic").check()
     for _ in range(2):
+        page.get_by_label("standard views").select_option("home")
         seen = np.array(page.evaluate(EXTENT))
         assert seen.min() >= 0.04 and seen.max() <= 0.96
         assert np.ptp(seen, axis=1).max() == pytest.approx(0.9, abs=0.01)
@@ -194,7 +195,6 @@ def test_the_object_fills_the_canvas_and_a_chosen_point_is_in_its_middle(
         chosen = np.array(page.evaluate(EXTENT))
         np.testing.assert_allclose(chosen[:, 9], 0.5, atol=0.01)
         assert np.linalg.norm(np.diff(chosen[:, [4, 9]])) > 1.3 * before
-        page.get_by_role("button", name="reset").click()
     page.evaluate(SELECT, ["photograph", 2])  # not seen: the view takes it in
     at = np.array(
         page.evaluate(
@@ -205,6 +205,40 @@ def test_the_object_fills_the_canvas_and_a_chosen_point_is_in_its_middle(
     )
     assert at.min() >= 0 and at.max() <= 1
     assert tab.complaints == []
+    tab.close()
+
+
+STATIONS = """(farther) => {
+  const { scene } = document.getElementById('explore').viewer
+  const { clientWidth, clientHeight } = scene.canvas
+  const stations = scene.stations
+  scene.stations = stations.map((p) => p.clone().multiplyScalar(farther))
+  scene.home([...scene.object, ...scene.stations])
+  const [share, places] = [scene.share(), scene.stations.map((p) => scene.project(p))]
+  scene.begin()
+  const seen = scene.stations.map((p) => scene.project(p) ?? [-1, -1])
+  scene.stations = stations
+  return [share, scene.share(), [...places, ...seen].map(([x, y]) => [x / clientWidth, y / clientHeight])]
+}"""
+
+
+@pytest.mark.parametrize("width", [1300, 400])
+def test_the_first_view_shows_photographs_too_unless_the_object_is_small_among_them(
+    browser: Any, page_file: Path, width: int
+) -> None:
+    tab = Tab(browser, page_file, width=width)
+    page = tab.ready()
+    shares = []
+    for farther in (0.5, 0.7, 1.0, 1.4, 2.0, 2.8):
+        with_photographs, share, places = page.evaluate(STATIONS, farther)
+        inside = (np.abs(np.array(places) - 0.5) <= 0.46).all(axis=1)
+        assert inside[:IMAGES].all()
+        if with_photographs >= 1 / 3:
+            assert share == with_photographs and inside.all()
+        else:
+            assert share == pytest.approx(0.9, abs=0.01) and not inside.all()
+        shares.append(with_photographs)
+    assert any(1 / 6 < s < 1 / 3 for s in shares) and any(1 / 3 < s < 2 / 3 for s in shares)
     tab.close()
 
 

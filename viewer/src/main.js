@@ -100,7 +100,7 @@ function toolbar(model, scene, hub, tools, legends) {
   find.addEventListener("change", () => findName(model, scene, hub, find))
   const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
-  const views = [["", "view ..."], ["home", "oblique"], ["all", "with all photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
+  const views = [["", "view ..."], ["home", "object alone"], ["all", "with all photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {
     if (name) scene.standard(name)
     standard.firstElementChild.value = ""
@@ -114,7 +114,7 @@ function toolbar(model, scene, hub, tools, legends) {
       paint()
     }),
     standard,
-    button("reset", () => scene.home(), { title: "the whole object, from obliquely above" }),
+    button("reset", () => scene.begin(), { title: "as at the start" }),
     tick("orthographic", false, (on) => scene.setOrthographic(on)),
     tick("names", false, (on) => {
       scene.names = on

@@ -16,6 +16,7 @@ const SLOW_MS = 36 // from frame to frame: then fewer points are drawn while the
 const MAX_THIN = 16
 const REST_MS = 250 // after which all points are drawn again
 const FILLED = 0.9 // part of the canvas that a view fills
+const SMALLEST = 1 / 3 // part of the canvas of an object that the first view shows with all photographs
 const FAR_RADII = 1.5 // points farther out than so many radii of the object do not make a view smaller
 const NEIGHBOURS = 6 // points seen around a chosen one
 const CLOSEST = 0.1 // of the object's radius: the smallest radius around a chosen point
@@ -45,7 +46,7 @@ export class Scene {
     this.camera = this.perspective
     this.names = false
     this.picker = new Picker(this)
-    this.home()
+    this.begin()
     this.resize()
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement)
     this.listen()
@@ -131,7 +132,7 @@ export class Scene {
     if (turns[event.key]) this.turn(turns[event.key][0] * STEP_RAD, turns[event.key][1] * STEP_RAD)
     else if (event.key === "+" || event.key === "=") this.zoom(0.85)
     else if (event.key === "-") this.zoom(1 / 0.85)
-    else if (event.key === "Home") this.home()
+    else if (event.key === "Home") this.begin()
     else return
     event.preventDefault()
   }
@@ -202,6 +203,20 @@ export class Scene {
     this.camera.updateMatrixWorld()
   }
 
+  /** Look at object and photographs, or at the object where it would be small between them. */
+  begin() {
+    this.home([...this.object, ...this.stations])
+    if (this.share() < SMALLEST) this.home()
+  }
+
+  /** Part of the canvas that the object takes, along the side of which it takes more. */
+  share() {
+    const places = this.object.map((p) => p.clone().project(this.camera))
+    const range = (values) => values.reduce((most, v) => Math.max(most, v), -Infinity) + values.reduce((most, v) => Math.max(most, -v), -Infinity)
+    return Math.max(range(places.map((p) => p.x)), range(places.map((p) => p.y))) / 2
+  }
+
+  /** Look from obliquely above, at the object unless positions are given. */
   home(seen) {
     const [a, b] = across(this.up)
     this.look(this.up.clone().multiplyScalar(0.75).add(a.multiplyScalar(-0.35)).add(b.multiplyScalar(-0.8)), this.up, seen)
