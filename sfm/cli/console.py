@@ -16,6 +16,7 @@ from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.phrases import (
+    words_left_out,
     words_of_calibration,
     words_of_check,
     words_of_precision,
@@ -111,11 +112,12 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         if both.better is not None and both.agree:
             word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
         rms, other = both.comparison.rms_px, program_name(both.backend)
+        left_out = words_left_out(findings)
         rows.append(
             (
                 other,
-                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both with equal "
-                f"weights, free datum, {both.model}",
+                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both of the image "
+                f"points alone{f', {left_out}' if left_out else ''}, equal weights, free datum, {both.model}",
             )
         )
     found = result.baseline

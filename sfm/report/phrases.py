@@ -154,6 +154,26 @@ def words_of_fixed(precision: Precision) -> str:
     return f"without the fixed coordinates of {counted(count, 'point')}" if count else ""
 
 
+def words_left_out(findings: Findings) -> str:
+    """Say what of the survey the comparison with the other adjuster leaves out; empty where nothing."""
+    counts, fixed = findings.counts, findings.precision.fixed_points
+    control = findings.result.adjustment.datum == "control"
+    left_out = [
+        *([counted(fixed, "fixed point")] if control and fixed else []),
+        *(
+            counted(number, what)
+            for number, what in (
+                (counts.control, "control coordinate"),
+                (counts.exterior, "observed exterior orientation parameter"),
+                (counts.interior, "observed interior orientation parameter"),
+                (counts.scale_bars, "scale bar"),
+            )
+            if number
+        ),
+    ]
+    return f"without {listed(left_out)}" if left_out else ""
+
+
 def words_of_datum(adjustment: Adjustment) -> str:
     """Return what carries the datum: its kind, and how many points where they were chosen."""
     points = adjustment.datum_points
@@ -215,7 +235,14 @@ PHRASES = {
     one.__name__: one
     for one in (
         *(words_of_sigma0, words_of_test, words_of_weights, words_of_check, words_of_w, words_of_limiting),
-        *(words_of_calibration, words_of_fixed, words_of_datum, words_of_geometry, points_by_rays),
+        *(
+            words_of_calibration,
+            words_of_fixed,
+            words_of_datum,
+            words_left_out,
+            words_of_geometry,
+            points_by_rays,
+        ),
     )
 }
 """what the templates call"""

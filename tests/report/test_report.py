@@ -34,10 +34,12 @@ from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
+from sfm.report.findings.other_adjuster import comparison_of
 from sfm.report.html.page import environment
 from sfm.report.html.report_page import report_page
 from sfm.report.numbers import finer_unit, probability, significant, to_precision, with_exponent
 from sfm.report.output import WRITTEN, write_result
+from sfm.report.phrases import words_left_out
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
 from sfm.report.text.filters import WIDTH
@@ -601,3 +603,31 @@ def test_table_escapes_and_aligns() -> None:
         template.render()
     assert "<th class=n>b [px]</th>" in text
     assert "<td class=n>1.5</td>" in text
+
+
+def test_the_comparison_says_what_of_the_survey_it_leaves_out(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Fixed control takes no part in it: COLMAP agrees on the image points alone."""
+    found = findings_of(result)
+    barred = replace(found, counts=replace(found.counts, scale_bars=2))
+    assert words_left_out(barred).endswith("2 scale bars")
+    fixed = replace(
+        found,
+        counts=replace(found.counts, scale_bars=0, control=0),
+        precision=replace(found.precision, fixed_points=7),
+        result=replace(result, adjustment=replace(result.adjustment, datum="control")),
+    )
+    told = words_left_out(fixed)
+    assert "7 fixed points" in told
+    minimal = replace(result, adjustment=replace(result.adjustment, datum="minimal"))
+    assert words_left_out(replace(fixed, result=minimal)) == ""
+    both = compare_adjusters(result.adjustment, in_house_adjuster)
+    fixed = replace(
+        fixed,
+        result=replace(fixed.result, comparison=both),
+        comparison=comparison_of(replace(result, comparison=both)),
+    )
+    tell_result(fixed, Path("page"), seconds=1.0, verbose=False)
+    for shown in (" ".join(capsys.readouterr().out.split()), report_page(fixed, (), ())):
+        assert told in shown
