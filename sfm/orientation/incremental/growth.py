@@ -170,12 +170,8 @@ class Growth:
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
                 if not np.isfinite(position[i]).all():
-                    self.reasons[i] = remark(
-                        "photograph_with_few_fitting",
-                        fitting=int(result.inliers.sum()),
-                        points=len(own),
-                        needed=result.needed,
-                    )
+                    fitting = int(result.inliers.sum())
+                    self.reasons[i] = _too_few(fitting, len(own), result.needed)
                 continue
             if np.isfinite(position[i]).all():
                 limit = self.tolerance_px[self.network.camera[i]] ** 2
@@ -310,12 +306,8 @@ class Growth:
             worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
             for i in worst.tolist():
                 if few[i]:
-                    self.reasons[i] = remark(
-                        "photograph_with_few_fitting",
-                        fitting=int(found.fitting[i]),
-                        points=int(found.known[i]),
-                        needed=int(needed[i]),
-                    )
+                    fitting = int(found.fitting[i])
+                    self.reasons[i] = _too_few(fitting, int(found.known[i]), int(needed[i]))
                 else:
                     self.reasons[i] = remark(
                         "photograph_contradicting",
@@ -387,3 +379,10 @@ def _determined_early(camera: Camera) -> BoolArray:
     early = camera.plays(Role.FOCAL)
     early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
     return early
+
+
+def _too_few(fitting: int, points: int, needed: int) -> Remark:
+    """Return the reason why a photograph is not oriented: it shows too few points, or too few of them fit."""
+    if points < needed:
+        return remark("photograph_with_few_points", seen=points, needed=needed)
+    return remark("photograph_with_few_fitting", fitting=fitting, points=points, needed=needed)

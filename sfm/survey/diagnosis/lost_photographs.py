@@ -33,11 +33,17 @@ class Lost:
 def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
     """Return the orientation with what is missing between the groups of photographs that are not connected.
 
+    A photograph with fewer points than any orientation needs is no group: its own reason says so.
+
     Args:
         network: image points that have names.
         found: its orientation.
     """
-    groups = [one for one in lost_groups(network, found.estimate) if not one.connected]
+    groups = [
+        one
+        for one in lost_groups(network, found.estimate)
+        if not one.connected and len(_points_of(network, one.images)) >= MIN_POINTS
+    ]
     if not groups:
         return found
     oriented = found.estimate.oriented
