@@ -25,6 +25,7 @@ from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
 # coordinates, and where it is the root mean square of all, nothing of a result is right.
 WRONG_SIGMAS = 5.0
+EXPECTED_SIGMAS = 3.0  # below them a shifted result stays within the limits that anybody expects
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
     "centres": "the projection centres",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
+from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
 # What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
@@ -98,9 +98,11 @@ ROWS = (
     ),
     Kind(
         "given_not_exact",
-        DETECTED,
-        "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points. This "
-        "shifts the result by up to {shift} of its standard deviations, which do not contain it.",
+        # the test is of the differences: a result that they hardly shift has lost nothing
+        Grade("shift", warning=EXPECTED_SIGMAS, error=WRONG_SIGMAS),
+        "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points, more "
+        "than by chance. This shifts the result by up to {shift} of its standard deviations, which do not "
+        "contain it.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
     ),

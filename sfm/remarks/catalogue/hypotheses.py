@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
+from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
-# Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
-# limits that anybody expects.
-SHIFT = Grade("shift", warning=3.0, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
+# Standard deviations by which a coordinate shifts with the alternative.
+SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
 SHIFTED = (
     "Coordinates[[ of the network without {without:@}]] shift by up to {shift} standard deviations, "
     "{rms} RMS."
