@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 
@@ -21,9 +22,11 @@ from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth
 from sfm.survey.drafting.target_trial import MANY_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.targets.codes.plates import BOARDS, PlateFamily
+from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+COMMENT_WIDTH = 100  # letters
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
@@ -174,8 +177,10 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
 
 
 def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
-    counted = ", ".join(f"{family} {count}" for family, count in trial.counts)
+    counted = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
     lines = [f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"]
+    families = fill(", ".join((*FAMILIES, *PLATES)), COMMENT_WIDTH, break_on_hyphens=False)
+    lines += [f"# {line}" for line in f"Families of codes, plates and boards:\n{families}".splitlines()]
     if trial.plate is not None:
         return [*lines, *_plate_lines(trial.plate, pitch)]
     if trial.codes == "none":

@@ -18,6 +18,8 @@ from sfm import cli
 from sfm.errors import GeometryError
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
+from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.plates import PLATES
 from tests.surveys import write_photograph_survey
 
 
@@ -64,6 +66,9 @@ def test_a_folder_becomes_a_result(
     assert len(first) == 20 and "112 accepted, 0 rejected" in told.out
 
     survey = tmp_path / "mine/first.toml"
+    comments = [line for line in survey.read_text().splitlines() if line.startswith("#")]
+    listed = set(" ".join(comments).replace("#", "").replace(",", "").split())
+    assert {*FAMILIES, *PLATES} <= listed and max(map(len, comments[1:])) <= 110
     survey.write_text(survey.read_text().replace('kind = "free"', 'kind = "minimal"'))
     capsys.readouterr()
     assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
