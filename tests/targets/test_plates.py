@@ -265,6 +265,10 @@ def survey_text(**changes: str) -> str:
         ({"marks": "marks = [[3, 3], [12, 4]]"}, r"mark \[12, 4\] is not on a plate of 9 rows"),
         ({"marks": "marks = [[3, 3], [5, 3]]"}, "the marks look alike turned by 180 degrees"),
         ({"marks": "", "kind": 'kind = "free"'}, "looks alike turned by 180 degrees has no"),
+        (
+            {"marks": "", "columns": "columns = 9", "kind": 'kind = "free"'},
+            "looks alike turned by 90 degrees has no",
+        ),
         ({"codes": 'codes = "charuco"', "marks": ""}, "targets.dictionary = '', codes = 'charuco' needs"),
         (
             {"codes": 'codes = "aprilgrid"\ndictionary = "apriltag36h11"\ntag_size = 9.0', "marks": ""},

@@ -113,7 +113,8 @@ def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: 
     plate = plate_family(targets)
     if plate is None or datum == "control" or not plate.is_ambiguous:
         return
+    turned = 360 // (1 + len(plate.turns))
     raise SurveyFileError(
-        f"{where}: a plate that looks alike turned by 180 degrees has no points of its own; needed [datum] "
-        "kind = 'control', which takes the plate as flat and true, or a plate with marks"
+        f"{where}: a plate that looks alike turned by {turned} degrees has no points of its own; needed "
+        "[datum] kind = 'control', which takes the plate as flat and true, or a plate with marks"
     )
