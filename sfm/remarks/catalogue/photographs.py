@@ -37,6 +37,14 @@ ROWS = (
         "Look at this photograph; leave it out if you do not trust it.",
     ),
     Kind(
+        "photographs_blurred",
+        "note",
+        "{photographs} {photographs:is|are} blurred: edges of targets are {blur} soft (standard deviation), "
+        "those of the other photographs {others}.",
+        "out of focus, or the camera or the object moved during the exposure",
+        "Take the photograph again, or leave it out.",
+    ),
+    Kind(
         "camera_by_size",
         "note",
         "{photographs:photograph} of camera {camera} {photographs:has|have} {size} in place of {usual} "

@@ -6,6 +6,7 @@ Whatever prints a result takes its numbers from here.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
@@ -35,6 +36,7 @@ from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
 from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.protocol import Protocol, check_coordinates, protocol_of
 from sfm.report.findings.rejected import Rejected, rejected_of
+from sfm.report.findings.sharpness import edges_of, sharpness_remarks
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
 from sfm.report.findings.survey_remarks import (
     adjustment_remarks,
@@ -73,6 +75,7 @@ class Findings:
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
     consistency: Consistency  # tests of points and photographs
+    edges: Mapping[str, float]  # blur of each photograph with measured edges, px
     protocol: Protocol  # entries of a bundle protocol
 
 
@@ -88,7 +91,7 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
-    consistency = consistency_of(a)
+    consistency, edges = consistency_of(a), edges_of(result.photographs)
     geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
     remarks = (
         *adjustment_remarks(a),
@@ -99,6 +102,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *residual_remarks(result, longest),
         *ray_remarks(a),
         *consistency_remarks(consistency),
+        *sharpness_remarks(result, edges, consistency),
         *camera_remarks(result),
         *given_remarks(result, given, statistics, check_coordinates(result)),
         *comparison_remarks(result),
@@ -123,5 +127,6 @@ def findings_of(result: SurveyResult) -> Findings:
         comparison=comparison_of(result),
         object_size=size,
         consistency=consistency,
+        edges=edges,
         protocol=protocol_of(result, given, check),
     )

@@ -42,6 +42,7 @@ class MeasuredPhotographs:
                 found.rejected_flag,
                 found.flag,
                 stored,
+                found.blur,
             )
             for name, path, found, stored in zip(
                 self.names, self.paths, self.targets, self.stored or (False,) * len(self.names), strict=True

@@ -1,0 +1,71 @@
+"""How sharp the photographs are, by the edges of their targets, and which are blurred beside the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sfm.adjustment.quality.consistency import FAMILY, Consistency
+from sfm.conventions import BoolArray, FloatArray
+from sfm.distributions import t_ppf
+from sfm.remarks.remark import Remark, remark
+from sfm.result import PhotographTargets, SurveyResult
+
+
+def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
+    """Return the median blur of the edges of the targets of each photograph.
+
+    Args:
+        photographs: with their targets.
+
+    Returns:
+        Standard deviation of an edge, px, by name; photographs without measured edges, as those of crossings
+        of a board, are left out.
+    """
+    found = {}
+    for one in photographs:
+        blur = np.zeros(0) if one.blur is None else one.blur[np.isfinite(one.blur)]
+        if len(blur):
+            found[one.image] = float(np.median(blur))
+    return found
+
+
+def sharpness_remarks(
+    result: SurveyResult, edges: Mapping[str, float], consistency: Consistency
+) -> tuple[Remark, ...]:
+    """Return that photographs are blurred where that explains their residuals, or that they are left out."""
+    suspected = {one.image for one in result.failed}
+    if consistency.uneven is not None:
+        suspected.add(consistency.uneven.worst)
+    names = list(edges)
+    blur = np.array([edges[name] for name in names])
+    large = larger_than_the_others(np.log(blur))
+    blurred = [name for name, one in zip(names, large, strict=True) if one and name in suspected]
+    if not blurred:
+        return ()
+    largest, others = max(edges[name] for name in blurred), float(np.median(blur[~large]))
+    return (remark("photographs_blurred", photographs=blurred, blur=(largest, "px"), others=(others, "px")),)
+
+
+def larger_than_the_others(values: FloatArray) -> BoolArray:
+    """Return which values are larger than those of the others by more than chance, fewer than half, (n,).
+
+    Source: Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics
+    25(2), 165-172; one-sided, at `FAMILY` for all values together.
+    """
+    n = len(values)
+    order = np.argsort(-values, kind="stable")
+    outliers = 0
+    for k in range((n - 1) // 2):
+        kept = values[order[k:]]
+        left = n - k
+        if left < 3 or not kept.std():
+            break
+        t = float(t_ppf(1 - FAMILY / left, left - 2))
+        critical = (left - 1) * t / np.sqrt((left - 2 + t**2) * left)
+        if (kept[0] - kept.mean()) / kept.std(ddof=1) > critical:
+            outliers = k + 1
+    large: BoolArray = np.zeros(n, dtype=bool)
+    large[order[:outliers]] = True
+    return large
