@@ -61,3 +61,8 @@ def test_blurred_photographs_are_named_where_that_explains_something() -> None:
     assert said.names("photographs") == ("lost", "uneven")
     assert said.number("blur") == 2.0 and said.number("others") == pytest.approx(0.8, rel=0.05)
     assert sharpness_remarks(replace(result, failed=()), edges, Consistency((), None)) == ()
+    seen = network.image_points
+    hidden = adjust(replace(network, image_points=seen.select((seen.image > 0) | (seen.point < 6))), truth)
+    few = replace(result, failed=(), adjustment=hidden)
+    (said,) = sharpness_remarks(few, edges | {"image 1": 1.9}, Consistency((), None))
+    assert said.names("photographs") == ("image 1",)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sfm.adjustment.quality.consistency import FAMILY, Consistency
+from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import t_ppf
 from sfm.remarks.remark import Remark, remark
@@ -34,8 +35,12 @@ def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
 def sharpness_remarks(
     result: SurveyResult, edges: Mapping[str, float], consistency: Consistency
 ) -> tuple[Remark, ...]:
-    """Return that photographs are blurred where that explains their residuals, or that they are left out."""
-    suspected = {one.image for one in result.failed}
+    """Return that photographs are blurred where that explains their residuals, few points or absence."""
+    a = result.adjustment
+    m, n = len(a.network.images), len(a.network.points)
+    unseen = n - np.bincount(a.network.image_points.image[~a.rejected], minlength=m)
+    few = np.flatnonzero(more_than_chance(unseen, np.full(m, n), FAMILY))
+    suspected = {one.image for one in result.failed} | {a.network.images[i] for i in few}
     if consistency.uneven is not None:
         suspected.add(consistency.uneven.worst)
     names = list(edges)
