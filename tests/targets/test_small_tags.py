@@ -11,6 +11,7 @@ from sfm.targets.codes.tags import DICTIONARIES, find_tags, tag_family, tag_modu
 from sfm.targets.detect import find_targets
 from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.flags import Flag
+from tests.synthetic import seed_of
 
 TILE, ACROSS, FINE, TEXTURE = 64, 6, 12, 16
 BLUR_PX, NOISE = 0.7, 2.0
@@ -87,7 +88,7 @@ def test_a_wrong_id_is_not_confirmed() -> None:
     misfit = []
     for shift in (0, 1):
         clear = np.array([~tag_modules(family, int(one) + shift) for one in number])
-        fits = fit_whole_tags(grey, corners, H, clear, 255.0)
+        fits = fit_whole_tags(grey, corners, H, clear, 255.0, NOISE)
         failed = fits.flag != 0
         misfit.append(np.where(failed, np.inf, fits.noise / np.maximum(np.abs(fits.theta[..., 5]), 1e-9)))
     assert misfit[0].max() < 0.05 < 0.1 < misfit[1].min()
@@ -99,8 +100,49 @@ def test_a_tag_that_the_border_cuts_is_refused() -> None:
     square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
     H = cv2.getPerspectiveTransform(quad[0].astype(np.float32), square)[None]
     clear = ~tag_modules(tag_family("aruco4x4_50"), 3)[None]
-    fits = fit_whole_tags(np.full((30, 30), 90, np.float32), quad, H, clear, 255.0)
+    fits = fit_whole_tags(np.full((30, 30), 90, np.float32), quad, H, clear, 255.0, NOISE)
     assert (fits.flag == Flag.CUT_BY_BORDER).all() and np.isnan(fits.noise).all()
+
+
+def shaded(name: str, half: float) -> AnyArray:
+    """Return a tag of this half side on paper, px, in a light that falls by 30 % over it, uint8."""
+    modules = np.pad(~tag_modules(tag_family(name), 17), 1, constant_values=True)
+    side = round(2 * half * len(modules) / (len(modules) - 2))
+    fine = np.kron(np.where(modules, 200.0, 40.0), np.ones((48, 48)))
+    tag = cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA)
+    picture = np.pad(tag, 40, constant_values=200.0)
+    light = 1 + 0.3 * (np.arange(len(picture)) - len(picture) / 2) / (2 * half)
+    noisy = cv2.GaussianBlur(picture * light, (0, 0), 0.8) + seed_of(f"shaded {half}").normal(
+        0, 2, picture.shape
+    )
+    return np.rint(noisy).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("half", [10.0, 15.0, 40.0, 120.0])
+@pytest.mark.parametrize("name", ["apriltag36h11", "aruco4x4_1000"])
+def test_codes_are_confirmed_in_uneven_light(name: str, half: float) -> None:
+    tags = find_tags(shaded(name, half), tag_family(name), polarity="dark", scale=255.0)
+    assert len(tags.quads) == 1 and tags.code.tolist() == [68, 69, 70, 71]
+
+
+@pytest.mark.parametrize("side", [40, 80, 160, 300])
+def test_a_dark_plate_with_a_coded_ring_is_no_tag(side: int) -> None:
+    """OpenCV reads a tag; the plate shows a dot and the arcs of its code."""
+    plate = np.full((300, 300), 40, np.uint8)
+    cv2.circle(plate, (161, 146), 42, 225, -1)
+    for outline in (
+        [(40, 145), (54, 86), (96, 48), (124, 78), (99, 101), (87, 145)],
+        [(196, 81), (219, 48), (264, 88), (232, 108)],
+    ):
+        cv2.fillPoly(plate, [np.array(outline)], 225)
+    picture = np.full((side + 60, side + 60), 190, np.uint8)
+    picture[30 : 30 + side, 30 : 30 + side] = cv2.resize(plate, (side, side), interpolation=cv2.INTER_AREA)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.8)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    read = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]
+    assert read is not None and len(read) == 1
+    tags = find_tags(picture, tag_family("aruco4x4_1000"), polarity="auto", scale=255.0)
+    assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) == 4
 
 
 @pytest.mark.parametrize("seed", [100, 103])

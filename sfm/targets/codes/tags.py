@@ -17,7 +17,7 @@ from sfm.kernels.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.flags import Flag
-from sfm.targets.outlines import as_bytes
+from sfm.targets.outlines import as_bytes, estimate_noise
 
 # OpenCV's dictionary behind each name that a survey file uses.
 DICTIONARIES = {
@@ -29,7 +29,8 @@ DICTIONARIES = {
 # Without those that are the first tags of a larger one.
 LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
-# A black module narrower than this is not told apart from the code behind it: the whole tag is fitted.
+# A black module narrower than this is not told apart from the code behind it: the whole tag is fitted. Codes
+# of larger tags are confirmed by the same fit, in a picture reduced to modules of this width.
 MIN_MODULE_PX = 3.0
 # Such tags are looked for in the picture enlarged by this, down to this side.
 ENLARGED, MIN_SIDE_PX = 2, 6.0
@@ -80,8 +81,8 @@ class TagCorners:
     rejected_flag: IntArray
     """their reasons, shape (m,)"""
     quads: FloatArray
-    """outlines of the tags that were read, without small ones that the fit did not confirm, corners a to d as
-    OpenCV gives them, px, shape (t, 4, 2)"""
+    """outlines of the tags whose code the fit of all modules confirmed, corners a to d as OpenCV gives them,
+    px, shape (t, 4, 2)"""
 
 
 def tag_family(name: str) -> TagFamily:
@@ -128,7 +129,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     number = np.concatenate([ids for _, ids in found])
     order = np.argsort(number, kind="stable")
     quads, number = quads[order], number[order]
-    fits, small = _fitted(photograph, quads, number, family, float(scale))
+    fits, small, confirmed = _fitted(photograph, quads, number, family, float(scale))
     flag, noise = fits.flag, fits.noise
     contrast, blur = fits.theta[..., CONTRAST], fits.theta[..., BLUR]
     module = np.repeat(_modules_px(quads, family)[:, None], 4, axis=1)
@@ -161,7 +162,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
         flag[good] | Flag.CORNER.value,
         quads[~good],
         reason[~good],
-        quads[~small | good.any(axis=1)],
+        quads[confirmed & (~small | good.any(axis=1))],
     )
 
 
@@ -173,30 +174,60 @@ def _modules_px(quads: FloatArray, family: TagFamily) -> FloatArray:
 
 def _fitted(
     photograph: AnyArray, quads: FloatArray, number: IntArray, family: TagFamily, scale: float
-) -> tuple[CornerFits, BoolArray]:
+) -> tuple[CornerFits, BoolArray, BoolArray]:
     """Fit the corners of tags twice, the second time with their codes where the first corners place them.
 
     Returns:
-        The fits, and which tags are so small that all their modules were fitted at once, shape (t,).
+        The fits, which tags are so small that all their modules were fitted at once, and of which the fit of
+        all modules confirms the code, shape (t,); corners of the others are flagged as a poor fit.
     """
-    m, grey = family.modules, as_grey(photograph)
+    m, grey, noise = family.modules, as_grey(photograph), estimate_noise(photograph)
     clear = np.array([~tag_modules(family, int(one)) for one in number], dtype=bool).reshape(-1, m, m)
-    square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
     small = _modules_px(quads, family) < MIN_MODULE_PX
 
     def fit(quads: FloatArray) -> CornerFits:
-        H = [cv2.getPerspectiveTransform(quad.astype(np.float32), square) for quad in quads]
-        tag_from_pixel = np.array(H, dtype=float).reshape(-1, 3, 3)
         parts = [
-            method(grey, quads[some], tag_from_pixel[some], clear[some], scale)
-            for method, some in ((fit_corners, ~small), (fit_whole_tags, small))
+            method(grey, quads[some], _tag_from_pixel(quads[some], m), clear[some], scale, *args)
+            for method, some, args in ((fit_corners, ~small, ()), (fit_whole_tags, small, (noise,)))
         ]
         back = np.argsort(np.concatenate([np.flatnonzero(~small), np.flatnonzero(small)]))
         return CornerFits(*(np.concatenate(part)[back] for part in zip(*parts, strict=True)))
 
     fits = fit(quads)
     found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
-    return fit(np.where(found[..., None], fits.theta[..., :2], quads)), small
+    corners = np.where(found[..., None], fits.theta[..., :2], quads)
+    fits, confirmed = fit(corners), np.ones(len(quads), dtype=bool)
+    for k in np.flatnonzero(~small):
+        reduced, quad, share = _reduced(grey, corners[k], family)
+        one = fit_whole_tags(
+            reduced, quad[None], _tag_from_pixel(quad[None], m), clear[k : k + 1], scale, noise * share
+        )
+        confirmed[k] = not (one.flag & NO_CORNER).any()
+    fits.flag[~confirmed] |= Flag.POOR_FIT.value
+    return fits, small, confirmed
+
+
+def _tag_from_pixel(quads: FloatArray, modules: int) -> FloatArray:
+    """Return the homographies from px to modules, (t, 3, 3)."""
+    square = np.array([[0, 0], [modules, 0], [modules, modules], [0, modules]], dtype=np.float32)
+    H = [cv2.getPerspectiveTransform(quad.astype(np.float32), square) for quad in quads]
+    return np.array(H, dtype=float).reshape(-1, 3, 3)
+
+
+def _reduced(grey: AnyArray, quad: FloatArray, family: TagFamily) -> tuple[AnyArray, FloatArray, float]:
+    """Return the picture of a tag reduced to modules of MIN_MODULE_PX, and its corners there, px, (4, 2).
+
+    Beyond the border of the photograph its last pixels are repeated.
+    """
+    scale = MIN_MODULE_PX / float(_modules_px(quad[None], family)[0])
+    margin = np.ptp(quad, axis=0).max() / family.modules + 2 / scale
+    low, high = np.floor(quad.min(axis=0) - margin), np.ceil(quad.max(axis=0) + margin)
+    x, y = (np.arange(low[k], high[k] + 1).clip(0, grey.shape[1 - k] - 1).astype(int) for k in range(2))
+    window = grey[np.ix_(y, x)]
+    size = tuple(max(round(n * scale), 1) for n in window.shape[::-1])
+    factor = np.array(size) / window.shape[::-1]
+    reduced = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(reduced), (quad - low + 0.5) * factor - 0.5, float(np.sqrt(factor.prod()))
 
 
 def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatArray]]:
