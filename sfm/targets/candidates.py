@@ -26,8 +26,9 @@ CONCENTRIC = 0.5
 ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
 # Parts of an unreadable code are smaller than this share of its dot.
 PART_OF_DOT = 0.75
-# Softest edge: this share of the minor semi-axis, or this blur in px where that is more, and so many sigmas.
-SOFTEST_EDGE, SOFTEST_EDGE_PX, BLUR_SIGMAS = 0.35, 1.3, 3.0
+# Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
+SOFTEST_EDGE, SOFTEST_EDGE_PX = 0.35, 1.3
+BLUR_SIGMAS = 3.0  # beyond which an edge is certainly softer: one target in 700 that is as soft as that
 # Share of the rays on which a stroke ends, and on which something else begins behind it. No ring of up to 20
 # cells is set on so much of the circumference: even parity leaves at least two of them clear.
 CLOSED, CROWDED = 0.95, 0.08

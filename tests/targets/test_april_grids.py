@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.codes.april_grids import name_corners, read_april_tags
+from sfm.targets.codes.april_grids import MIN_MODULE_PX, _outlines, _unique, name_corners, read_april_tags
 from sfm.targets.codes.plate_search import search_april_grid
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import tag_family, tag_modules
@@ -46,6 +46,42 @@ def photographed(sheet: AnyArray, name: str) -> AnyArray:
     seen = cv2.warpPerspective(sheet, H, (640, 520), flags=cv2.INTER_AREA, borderValue=120)
     noisy = cv2.GaussianBlur(seen.astype(float), (0, 0), 1.0) + 2 * seed_of(name).standard_normal(seen.shape)
     return np.rint(noisy).clip(0, 255).astype(np.uint8)
+
+
+def tilted(
+    sheet: AnyArray, name: str, *, degrees: float, contrast: float = 1.0, noise: float = 2.0
+) -> AnyArray:
+    """Return a photograph of a sheet seen at an angle, for a principal distance of 900 px, 1 px a unit."""
+    height, width = sheet.shape
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    plane = np.array([[1, 0, -width / 2], [0, c, -c * height / 2], [0, s, 900 - s * height / 2]])
+    H = np.array([[900.0, 0, 320], [0, 900, 260], [0, 0, 1]]) @ plane
+    seen = cv2.warpPerspective(sheet, H, (640, 520), flags=cv2.INTER_AREA, borderValue=120)
+    soft = contrast * cv2.GaussianBlur(seen.astype(float), (0, 0), 1.0) + 60
+    return np.rint(soft + noise * seed_of(name).standard_normal(seen.shape)).clip(0, 255).astype(np.uint8)
+
+
+# where regions are dark below half of the range 0, below an eighth of it 8 of the oblique grid
+@pytest.mark.parametrize(
+    ("degrees", "contrast", "noise"), [(68.0, 1.0, 2.0), (0.0, 0.15, 4.0), (0.0, 0.1, 1.0)]
+)
+def test_tags_are_read_at_an_angle_and_in_faint_light(degrees: float, contrast: float, noise: float) -> None:
+    picture = tilted(drawn(GRID), f"tilted {degrees}", degrees=degrees, contrast=contrast, noise=noise)
+    number, _ = read_april_tags(picture, GRID.dictionary)
+    assert number.tolist() == list(range(17, 29))
+
+
+def test_outlines_are_as_large_as_tags_that_can_be_read() -> None:
+    """Two px for each module of a tag with a narrow border."""
+    for side, found in ((14, 0), (24, 1)):
+        picture = np.full((300, 300), 200, np.uint8)
+        picture[40 : 40 + side, 40 : 40 + side] = 40
+        assert len(_unique(np.array(list(_outlines(picture, MIN_MODULE_PX * 8))).reshape(-1, 4, 2))) == found
+
+
+def test_noise_has_no_outlines() -> None:
+    picture = seed_of("no outlines").normal(120, 8, (520, 640)).clip(0, 255).astype(np.uint8)
+    assert not list(_outlines(picture, 6.0))
 
 
 def true_corners(plate: PlateFamily, border: int) -> FloatArray:
@@ -85,6 +121,10 @@ def test_tags_of_another_grid_have_no_names() -> None:
     moved[3] += 200.0  # a tag that lies beside the grid
     code = name_corners(number, moved, GRID)[1]
     assert len(code) == GRID.count - 4
+    for off, left_out in ((0.1, 0), (0.2, 4)):  # of the distance of tags, 100 px
+        moved = quads.copy()
+        moved[3] += [100 * off, 0]
+        assert len(name_corners(number, moved, GRID)[1]) == GRID.count - left_out
     assert len(name_corners(number[:1], quads[:1], GRID)[1]) == 0  # one tag does not show its turn
 
 

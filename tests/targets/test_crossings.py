@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from sfm.camera import project
 from sfm.targets.codes.boards import find_crossings
 from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.fits.saddle import MAX_HALF_SPACINGS, measure_saddles
 from tests.plates import NOISE, PITCH, camera, plate_pictures, stations
 from tests.synthetic import seed_of
 
@@ -47,3 +49,27 @@ def test_faint_noise_leaves_crossings_of_a_checkerboard_as_good_as_stated() -> N
     print(f"RMS {rms:.4f} px, {ratio:.2f} of the stated one")
     assert rms < 0.008
     assert 0.8 < ratio < 1.3
+
+
+@pytest.mark.parametrize(("bent", "blur", "rms_px"), [(0.0, 2.0, 0.08), (1 / 300, 0.8, 0.06)])
+def test_windows_see_enough_of_the_edges_and_no_bend_of_them(bent: float, blur: float, rms_px: float) -> None:
+    """Half as large ones have more noise, twice as large ones see how distortion bends the edges."""
+    fine, spacing, n = 4, 24, 10
+    side = 12 * spacing
+    x, y = np.meshgrid(*2 * [(np.arange(side * fine) + 0.5) / fine - side / 2])
+    column, row = (np.floor((u + bent * v * v / 2) / spacing + 40) for u, v in ((x, y), (y, x)))
+    sharp = np.where((column + row) % 2, 220.0, 40.0)
+    soft = cv2.GaussianBlur(sharp, (0, 0), blur * fine)
+    rng = seed_of(f"windows {bent}")
+    picture = cv2.resize(soft, (side, side), interpolation=cv2.INTER_AREA)
+    picture += 4 * rng.standard_normal(picture.shape)
+    at = spacing * np.arange(-n // 2 + 2, n // 2 - 1)
+    edges = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2).astype(float)
+    true = edges.copy()
+    for _ in range(30):  # x + bent y^2 / 2 and y + bent x^2 / 2 are those of the edges
+        true = edges - bent * true[:, ::-1] ** 2 / 2
+    true += side / 2 - 0.5
+    found = measure_saddles(picture, true, np.full(len(true), MAX_HALF_SPACINGS * spacing), noise=4.0)
+    rms = np.sqrt(((found.xy - true) ** 2).mean())
+    print(f"bent {bent:.4f} / px, blur {blur:g} px: RMS {rms:.3f} px")
+    assert rms < rms_px

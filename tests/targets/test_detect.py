@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,9 +11,12 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.photographs.reading import read_photograph
+from sfm.targets.candidates import SOFTEST_EDGE, judge_fits
 from sfm.targets.codes.families import code_family
 from sfm.targets.detect import find_targets
+from sfm.targets.fits.blurred_ellipse import BLUR
 from sfm.targets.flags import Flag, count_flags
+from sfm.targets.measure import axes_from_shape, fit_ellipse_model
 from sfm.targets.outlines import estimate_noise
 from tests.places import SHARED
 
@@ -212,3 +217,23 @@ def test_retro_panel_codes_are_read() -> None:
     assert sorted(others) == [20, 21, 63]  # on the panel, seen in the photographs, absent from the reference
     d = np.concatenate(difference)
     assert np.sqrt((d**2).mean(axis=0)).max() < 0.025
+
+
+@pytest.mark.parametrize(("sigmas", "reason"), [(2.0, 0), (4.0, Flag.BLURRED)])
+def test_an_edge_is_too_soft_where_it_certainly_is(sigmas: float, reason: int) -> None:
+    y, x = np.mgrid[:60, :80]
+    disc = np.clip(12.5 - np.hypot(x - 40.3, y - 29.8), 0, 1)
+    picture = cv2.GaussianBlur(200 - 160 * disc, (0, 0), 1.0).astype(np.uint8)
+    fit = fit_ellipse_model(
+        picture,
+        np.array([[40.3, 29.8]]),
+        np.array([[1 / 12, 0, 1 / 12]]),
+        np.array([-1]),
+        noise=1.0,
+        saturation=255,
+    )
+    sigma = np.sqrt(fit.full_covariance[:, BLUR, BLUR])
+    minor = axes_from_shape(fit.shape)[0][:, 1]
+    soft = replace(fit, blur=SOFTEST_EDGE * minor + sigmas * sigma)
+    judged = judge_fits(soft, noise=1.0, scale=255.0, min_diameter_px=4.0, max_diameter_px=80.0)
+    assert judged.tolist() == [reason]

@@ -17,6 +17,7 @@ from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes import dot_plates
+from sfm.targets.codes.boards import FLAGS, REDUCED_PX, reduced
 from sfm.targets.codes.dot_plates import name_dots, placements
 from sfm.targets.codes.lattice import Lattice
 from sfm.targets.codes.plates import PlateFamily
@@ -192,6 +193,18 @@ def test_boards_are_found_in_large_photographs(square_px: int) -> None:
     row, column = np.divmod(np.arange(54), 9)
     true = np.stack([90 + square_px * (column + 2), 40 + square_px * (row + 2)], axis=1) - 0.5
     assert np.abs(found.xy[np.argsort(found.code)] - true).max() < 0.02
+
+
+def test_small_squares_are_found_in_the_reduced_photograph() -> None:
+    """Squares of 9 px there, in a sixteenth of the pixels; those of half the width are not."""
+    squares = np.pad(np.add.outer(np.arange(7), np.arange(10)) % 2, 1, constant_values=1)
+    photograph = np.full((2400, 3200), 220, dtype=np.uint8)
+    board = np.where(squares, 220, 30).astype(np.uint8).repeat(36, 0).repeat(36, 1)
+    photograph[700 : 700 + len(board), 900 : 900 + board.shape[1]] = board
+    for largest_px, is_found in ((REDUCED_PX, True), (REDUCED_PX // 2, False)):
+        small, _ = reduced(cv2.GaussianBlur(photograph, (0, 0), 1.5), largest_px)
+        assert cv2.findChessboardCornersSB(small, (9, 6), flags=FLAGS)[0] == is_found
+        assert small.size <= photograph.size / 16
 
 
 def measured_crossing(drawn: FloatArray) -> FloatArray:

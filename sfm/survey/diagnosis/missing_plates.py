@@ -6,7 +6,7 @@ import statistics
 
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
-from sfm.targets.codes.dot_plates import LEAST_DOTS
+from sfm.targets.codes.dot_plates import MIN_DOTS
 from sfm.targets.codes.families import TargetFamily
 from sfm.targets.codes.plates import BOARDS, PlateFamily
 from sfm.targets.flags import Flag
@@ -24,8 +24,8 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
     found = zip(photographs.names, photographs.targets, strict=True)
     without = [(name, targets) for name, targets in found if not (targets.code >= 0).any()]
     dots = {name: int((targets.rejected_flag == Flag.NOT_ON_PLATE.value).sum()) for name, targets in without}
-    strange = [name for name in dots if dots[name] >= LEAST_DOTS]
-    missing = [name for name in dots if dots[name] < LEAST_DOTS]
+    strange = [name for name in dots if dots[name] >= MIN_DOTS]
+    missing = [name for name in dots if dots[name] < MIN_DOTS]
     size = f"{family.rows} x {family.columns}"
     kind = "board_not_found" if family.name in BOARDS else "plate_not_found"
     remarks = [remark(kind, photographs=missing, size=size)] if missing else []

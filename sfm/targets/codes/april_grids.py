@@ -17,20 +17,19 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.codes.plates import APRIL_BORDERS, PlateFamily
+from sfm.targets.codes.plates import APRIL_BORDERS, MAX_OFF_PLACE, PlateFamily
 from sfm.targets.codes.tags import CORRECTED, WRONG_IN_BORDER, opencv_dictionary
-from sfm.targets.fits.saddle import WINDOW, measure_saddles
+from sfm.targets.fits.saddle import MAX_HALF_SPACINGS, measure_saddles
+from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, estimate_noise
 
 OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
 WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
-# Of the range of intensities in the window, what is dark; where squares touch there is half of it.
-DARK, MIN_CONTRAST = 0.35, 30
-MIN_SIDE_PX = 20.0  # of a tag of ten modules of 2 px
-STRAIGHT = 0.06  # of the perimeter, by which the outline of a tag may be off its four sides
+# Of the range of intensities in the window, below which it is dark: midway to the half where squares touch.
+DARK = 0.25
+MIN_MODULE_PX = 2.0  # of a tag that is read: no less tells one black module and one clear one apart (Nyquist)
 SPACING = 0.2  # of the side of a tag, between crossings at first
 CELL_PX = 8  # side of a module where a tag is read
-OFF_PLACE = 0.15  # of the distance of tags, between the corner of a tag and its place on the plate
-LEAST_TAGS = 2  # that show how tags are turned
+MIN_TAGS = 2  # that show how tags are turned
 
 
 def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArray]:
@@ -43,9 +42,12 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
     Returns:
         Tags that were read once; their corners from any one on, the same of all tags.
     """
-    quads = _unique(np.array(list(_outlines(grey))).reshape(-1, 4, 2))
+    modules = opencv_dictionary(dictionary).markerSize + 2 * min(APRIL_BORDERS)
+    quads = _unique(np.array(list(_outlines(grey, MIN_MODULE_PX * modules))).reshape(-1, 4, 2))
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
-    xy = measure_saddles(grey, quads.reshape(-1, 2), np.repeat(WINDOW * SPACING * side, 4), noise=1.0).xy
+    xy = measure_saddles(
+        grey, quads.reshape(-1, 2), np.repeat(MAX_HALF_SPACINGS * SPACING * side, 4), noise=1.0
+    ).xy
     quads = np.where(np.isfinite(xy), xy, quads.reshape(-1, 2)).reshape(-1, 4, 2)
     best: list[tuple[int, FloatArray]] = []
     for border in APRIL_BORDERS:
@@ -59,9 +61,14 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
     return values[times == 1], corners[first[times == 1]]
 
 
-def _outlines(grey: AnyArray) -> Iterator[FloatArray]:
-    """Return the corners of dark regions of four sides, clockwise, px, each (4, 2)."""
+def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
+    """Return the corners of dark regions of four sides, clockwise, px, each (4, 2).
+
+    How straight sides are is judged as OpenCV does where it looks for tags.
+    """
     smooth = cv2.GaussianBlur(grey, (3, 3), 0)
+    min_range = max(STEP_SIGMAS * estimate_noise(grey), 255 * MIN_STEP)
+    straight = cv2.aruco.DetectorParameters().polygonalApproxAccuracyRate
     for part in WINDOWS:
         window = max(grey.shape) // part | 1
         around = np.ones((window, window), np.uint8)
@@ -69,15 +76,15 @@ def _outlines(grey: AnyArray) -> Iterator[FloatArray]:
             cv2.erode(smooth, around).astype(np.float32),
             cv2.dilate(smooth, around).astype(np.float32),
         )
-        dark = ((smooth < low + DARK * (high - low)) & (high - low > MIN_CONTRAST)).astype(np.uint8)
+        dark = ((smooth < low + DARK * (high - low)) & (high - low > min_range)).astype(np.uint8)
         for side in OPENED_PX:
             opened = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
             for outline in cv2.findContours(opened, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
                 length = cv2.arcLength(outline, True)
-                if length < 4 * MIN_SIDE_PX:
+                if length < 4 * min_side_px:
                     continue
-                quad = cv2.approxPolyDP(outline, STRAIGHT * length, True).reshape(-1, 2)
-                if len(quad) == 4 and cv2.isContourConvex(quad) and cv2.contourArea(quad) > MIN_SIDE_PX**2:
+                quad = cv2.approxPolyDP(outline, straight * length, True).reshape(-1, 2)
+                if len(quad) == 4 and cv2.isContourConvex(quad) and cv2.contourArea(quad) > min_side_px**2:
                     clockwise = cv2.contourArea(quad, True) > 0  # y runs down
                     yield (quad if clockwise else quad[::-1]).astype(float)
 
@@ -125,7 +132,7 @@ def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tup
     on_plate = (number >= plate.first_tag) & (number < plate.first_tag + count)
     number, quads = number[on_plate] - plate.first_tag, quads[on_plate]
     none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-    if len(number) < LEAST_TAGS:
+    if len(number) < MIN_TAGS:
         return none
     across = plate.columns // 2
     row, column = plate.rows // 2 - 1 - number // across, number % across
@@ -133,7 +140,7 @@ def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tup
     corner = 2 * np.stack([row, column], axis=1)[:, None] + np.array([[0, 0], [0, 1], [1, 1], [1, 0]])
     code = corner[..., 0] * plate.columns + corner[..., 1]
     plane = plate.plane(1.0)[:, :2]
-    best, named = OFF_PLACE, none
+    best, named = MAX_OFF_PLACE, none
     for turn in range(4):
         xy, true = np.roll(quads, turn, axis=1).reshape(-1, 2), plane[code.ravel()]
         H, _ = cv2.findHomography(xy, true, cv2.LMEDS)
@@ -141,7 +148,7 @@ def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tup
             continue
         off = np.hypot(*(cv2.perspectiveTransform(xy[None], H)[0] - true).T)
         if float(np.median(off)) < best:
-            near = (off.reshape(-1, 4) < OFF_PLACE).all(axis=1).repeat(4)
+            near = (off.reshape(-1, 4) < MAX_OFF_PLACE).all(axis=1).repeat(4)
             best, named = float(np.median(off)), (xy[near], code.ravel()[near])
     return named
 
@@ -154,5 +161,5 @@ def windows_beside(xy: FloatArray, plate: PlateFamily) -> FloatArray:
     quads = xy.reshape(-1, 4, 2)
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)
     module = 1 / (opencv_dictionary(plate.dictionary).markerSize + 2 * min(APRIL_BORDERS))
-    part = min(WINDOW * (1 / plate.tag_share - 1), min(APRIL_BORDERS) * module)
+    part = min(MAX_HALF_SPACINGS * (1 / plate.tag_share - 1), min(APRIL_BORDERS) * module)
     return np.asarray(part * np.minimum(side, np.roll(side, -1, axis=1)).ravel())

@@ -17,11 +17,13 @@ from sfm.targets.codes.april_grids import name_corners, read_april_tags, windows
 from sfm.targets.codes.cut_boards import name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
-from sfm.targets.fits.saddle import WINDOW, Saddles, measure_saddles
+from sfm.targets.fits.saddle import MAX_HALF_SPACINGS, Saddles, measure_saddles
 from sfm.targets.outlines import as_bytes
 
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-REDUCED_PX = 800  # larger side of the photograph in which a checkerboard is sought first
+# Larger side of the photograph in which a checkerboard is sought first. Squares of 9 px are found there, in a
+# tenth of the time that a photograph of 8 million px takes.
+REDUCED_PX = 800
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
@@ -48,10 +50,10 @@ def find_crossings(
         half = windows_beside(xy, plate)
     elif plate.name == "charuco":
         xy, code = _charuco(grey, plate)
-        half = min(WINDOW, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
+        half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
     else:
         xy, code = _checkerboard(grey, plate)
-        half = WINDOW * _spacing(xy)
+        half = MAX_HALF_SPACINGS * _spacing(xy)
     saddles = measure_saddles(photograph, xy, half, noise=noise)
     good = np.isfinite(saddles.xy[:, 0])
     return saddles.select(good), code[good]

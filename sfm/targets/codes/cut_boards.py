@@ -19,13 +19,13 @@ from sfm.targets.codes.plates import quarter_turn
 
 SMOOTHING_PX = 2.0
 # Saddles below this share of the strong ones are none; the strong ones are those of this rank.
-LEAST_SADDLE, STRONG_RANK = 0.15, 20
+MIN_SADDLE, STRONG_RANK = 0.15, 20
 APART_PX = 9  # side of the window in which a saddle is the strongest
 RADIUS_PX, DIRECTIONS = 5.0, 32  # of the circle on which the four sectors are counted
-LEAST_CROSSINGS = 12
+MIN_CROSSINGS = 12
 BORDER_PX = 8.0  # what is nearer to the border than this need not be found
 SHARE_INSIDE = 0.6  # of the next crossings are in the photograph where the board ends
-LEAST_CONTRAST = 0.15  # between dark and bright squares, of the range of the photograph
+MIN_CONTRAST_SHARE = 0.15  # between dark and bright squares, of the range of the photograph
 
 
 def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray, IntArray]:
@@ -41,8 +41,8 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
     """
     none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
     xy = find_saddles(grey)
-    lattice = find_lattice(xy, np.ones(len(xy), dtype=bool)) if len(xy) >= LEAST_CROSSINGS else None
-    if lattice is None or len(lattice.rows) < LEAST_CROSSINGS:
+    lattice = find_lattice(xy, np.ones(len(xy), dtype=bool)) if len(xy) >= MIN_CROSSINGS else None
+    if lattice is None or len(lattice.rows) < MIN_CROSSINGS:
         return none
     dark = _dark_squares(grey, lattice)
     if dark is None:
@@ -75,7 +75,7 @@ def find_saddles(grey: AnyArray) -> FloatArray:
     value = saddle[row, column]
     if len(value) < STRONG_RANK:
         return np.zeros((0, 2))
-    strong = value > LEAST_SADDLE * np.sort(value)[-STRONG_RANK]
+    strong = value > MIN_SADDLE * np.sort(value)[-STRONG_RANK]
     places = np.stack([column, row], axis=1)[strong].astype(np.float64)
     return np.asarray(places[_has_four_sectors(smooth, places)])
 
@@ -104,7 +104,7 @@ def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
     if not value[0] or not value[1]:
         return None
     even, odd = (float(np.median(one)) for one in value)
-    return None if abs(even - odd) < LEAST_CONTRAST * np.ptp(grey) else np.array(squares[int(even > odd)])
+    return None if abs(even - odd) < MIN_CONTRAST_SHARE * np.ptp(grey) else np.array(squares[int(even > odd)])
 
 
 def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[tuple[bool, bool]]:

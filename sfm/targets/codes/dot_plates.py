@@ -19,8 +19,8 @@ from sfm.targets.codes.lattice import Lattice, find_lattice
 from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
 from sfm.targets.fits.damage import BIWEIGHT, MAD, ROUNDS
 
-LEAST_DOTS, LEAST_BENT = 9, 20  # that show a plate, and the bend of the trend of their sizes
-LEAST_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
+MIN_DOTS, MIN_BENT_DOTS = 9, 20  # that show a plate, and the bend of the trend of their sizes
+MIN_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
 # A dot is anything with this probability at least, spread over so many standard deviations, and where more of
 # them lie so far off, with theirs. A plate is larger than its table with the same probability.
 STRANGE, RANGE, OUTLYING = 0.01, 50.0, 5.0
@@ -39,7 +39,7 @@ def name_dots(xy: FloatArray, radius: FloatArray, is_ring: BoolArray, plate: Pla
     """
     code = np.full(len(xy), UNCODED)
     lattice = find_lattice(xy, ~is_ring)
-    if lattice is None or len(lattice.rows) < LEAST_DOTS:
+    if lattice is None or len(lattice.rows) < MIN_DOTS:
         return code
     if plate.marks:
         placed = _placed_by_marks(lattice, size_of_marks(lattice, radius, is_ring), plate)
@@ -64,15 +64,15 @@ def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> F
     place = lattice.place - lattice.place.mean(axis=0)
     row, column = (place / np.maximum(np.abs(place).max(axis=0), 1)).T
     trend = [np.ones(len(row)), row, column]
-    if len(row) >= LEAST_BENT:
+    if len(row) >= MIN_BENT_DOTS:
         trend += [row * row, row * column, column * column]
     design, weight = np.stack(trend, axis=1), (~ring).astype(float)
     for k in range(2 * ROUNDS):
         root = np.sqrt(weight)[:, None]
         larger = log - design @ np.linalg.lstsq(root * design, root[:, 0] * log, rcond=None)[0]
-        scatter = max(MAD * float(np.median(np.abs(larger[~ring]))), LEAST_SCATTER)
+        scatter = max(MAD * float(np.median(np.abs(larger[~ring]))), MIN_SCATTER)
         if k < ROUNDS:
-            weight = ~ring / np.maximum(np.abs(larger), LEAST_SCATTER)
+            weight = ~ring / np.maximum(np.abs(larger), MIN_SCATTER)
         else:
             weight = ~ring * np.maximum(1 - (larger / (BIWEIGHT * scatter)) ** 2, 0.0) ** 2
     return np.where(ring, RING, np.clip(larger / scatter, -RANGE / 2, RANGE / 2))
@@ -108,7 +108,7 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
         for offset in itertools.product(*(range(-high[k], table.shape[k] - low[k]) for k in range(2))):
             code = _codes(place + np.array(offset), table)
             here = marked[code]
-            if not here.any() or (code != UNCODED).sum() < max(LEAST_DOTS, len(code) / 2):
+            if not here.any() or (code != UNCODED).sum() < max(MIN_DOTS, len(code) / 2):
                 continue
             larger = max(float(np.median(size[here])), 0.0)
             gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())

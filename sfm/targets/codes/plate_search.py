@@ -18,21 +18,21 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.targets.codes.april_grids import name_corners, read_april_tags
 from sfm.targets.codes.boards import charuco_patterns, find_crossings, reduced
-from sfm.targets.codes.cut_boards import board_ends
+from sfm.targets.codes.cut_boards import MIN_CROSSINGS, board_ends
 from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
 from sfm.targets.codes.lattice import find_lattice
-from sfm.targets.codes.plates import GRIDS, PlateFamily, quarter_turn, refuse_unusable_plate
+from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
 
-LEAST_SIDE, LEAST_DOTS, LEAST_CROSSINGS = 3, 20, 12
+MIN_SIDE, MIN_DOTS_OF_PLATE = 3, 20  # dots or crossings along a side, and dots of a plate
 FILLED = 0.8  # of the places of a plate hold dots
 # A dot so many standard deviations larger than those around it in two photographs is a mark.
 MARK_SIGMAS = 5.0
 # Boards are sought in photographs of at most this size, px.
 SEARCHED_PX = 1600
 SMALLEST = (3, 3)  # board that OpenCV is asked for, and for any larger one
-KALIBR_TAGS, LEAST_TAGS = "apriltag36h11", 4
+KALIBR_TAGS = "apriltag36h11"
+MIN_TAGS_OF_BOARD = 4  # that determine the homography from a photograph to a board
 MAX_SQUARES = 40  # along a side of a ChArUco board
-OFF_PLACE = 0.15  # of a square, between a tag and its place on the board
 _LARGER = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
@@ -45,7 +45,7 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     for grey in photographs:
         small, _ = reduced(grey, SEARCHED_PX)
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
-        if not found or meta is None or min(meta.shape[:2]) < LEAST_SIDE:
+        if not found or meta is None or min(meta.shape[:2]) < MIN_SIDE:
             continue
         place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
         ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
@@ -56,18 +56,14 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     for (rows, columns), _ in whole.most_common():
         plate = PlateFamily("checkerboard", rows, columns)
         showing = sum(_is_part(*part, plate) for part in parts)
-        if (
-            showing > 1
-            and plate.count >= LEAST_CROSSINGS
-            and _named(photographs, plate, whole[rows, columns])
-        ):
+        if showing > 1 and plate.count >= MIN_CROSSINGS and _named(photographs, plate, whole[rows, columns]):
             return plate
     return None
 
 
 def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
     """Return whether crossings of this size, cut along these directions, are half of a board or more."""
-    if size[0] * size[1] < max(plate.count / 2, LEAST_CROSSINGS):
+    if size[0] * size[1] < max(plate.count / 2, MIN_CROSSINGS):
         return False
     return any(
         all(n == all_ or (cut and n < all_) for n, all_, cut in zip(size, sides, is_cut, strict=True))
@@ -113,7 +109,7 @@ def search_april_grid(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()
     lowest numbers.
     """
     seen = [read_april_tags(grey, KALIBR_TAGS) for grey in tried]
-    if not any(len(number) >= LEAST_TAGS for number, _ in seen):
+    if not any(len(number) >= MIN_TAGS_OF_BOARD for number, _ in seen):
         return None
     photographs = [*tried, *others]
     seen += [read_april_tags(grey, KALIBR_TAGS) for grey in others]
@@ -145,7 +141,7 @@ def search_april_grid(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()
 
 def _shows_squares(grey: AnyArray, xy: FloatArray, code: IntArray, plate: PlateFamily) -> bool:
     """Return whether squares between the corners of tags are as dark as the border of the tags."""
-    if len(code) < 4 * LEAST_TAGS:
+    if len(code) < 4 * MIN_TAGS_OF_BOARD:
         return False
     H, _ = cv2.findHomography(plate.plane(1.0)[code, :2], xy, cv2.LMEDS)
     if H is None:
@@ -176,7 +172,7 @@ def search_dots(
     for xy, radius, polarity in photographs:
         is_ring = rings_among(polarity)
         lattice = find_lattice(xy, ~is_ring)
-        if lattice is None or len(lattice.rows) < LEAST_DOTS:
+        if lattice is None or len(lattice.rows) < MIN_DOTS_OF_PLATE:
             continue
         size = size_of_marks(lattice, radius, is_ring)
         for name in GRIDS:
@@ -197,7 +193,7 @@ def search_dots(
 def shows_a_lattice(xy: FloatArray) -> bool:
     """Return whether most of the circles of a photograph (px, (k, 2)) are in rows and columns."""
     lattice = find_lattice(xy, np.ones(len(xy), dtype=bool))
-    return lattice is not None and len(lattice.rows) > max(LEAST_DOTS, len(xy) / 2)
+    return lattice is not None and len(lattice.rows) > max(MIN_DOTS_OF_PLATE, len(xy) / 2)
 
 
 def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2) -> bool:
@@ -206,7 +202,7 @@ def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2)
     for grey in photographs:
         # the noise is of no consequence for what is found
         saddles, _ = find_crossings(grey, plate, scale=255.0, noise=1.0)
-        found += len(saddles.xy) >= max(plate.count / 2, LEAST_CROSSINGS / 2)
+        found += len(saddles.xy) >= max(plate.count / 2, MIN_CROSSINGS / 2)
         if found >= min(needed, 2):
             return True
     return False
@@ -214,13 +210,13 @@ def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2)
 
 def _tag_share(number: IntArray, quads: FloatArray, middle: FloatArray) -> float | None:
     """Return the side of tags in squares if they are at their places on a board, whose middles are given."""
-    if len(number) < 4:
+    if len(number) < MIN_TAGS_OF_BOARD:
         return None
     H, _ = cv2.findHomography(quads.mean(axis=1), middle[number])
     if H is None:
         return None
     placed = cv2.perspectiveTransform(quads.reshape(1, -1, 2), H).reshape(-1, 4, 2)
-    if np.hypot(*(placed.mean(axis=1) - middle[number]).T).max() > OFF_PLACE:
+    if np.hypot(*(placed.mean(axis=1) - middle[number]).T).max() > MAX_OFF_PLACE:
         return None
     share = float(np.median(np.linalg.norm(placed - np.roll(placed, 1, axis=1), axis=2)))
     return share if 0 < share < 1 else None
@@ -232,7 +228,7 @@ def _whole_plate(name: str, place: IntArray) -> PlateFamily | None:
     rows, steps = (int(n) for n in place.max(axis=0) + 1)
     shifted = PlateFamily(name, rows, 1).is_shifted
     plate = PlateFamily(name, rows, steps // 2 if shifted else steps)
-    if min(plate.rows, plate.columns) < LEAST_SIDE or len(place) < FILLED * plate.count:
+    if min(plate.rows, plate.columns) < MIN_SIDE or len(place) < FILLED * plate.count:
         return None
     if shifted and (steps % 2 or ((place[:, 0] + place[:, 1]) % 2).any()):
         return None

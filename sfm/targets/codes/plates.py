@@ -41,6 +41,9 @@ APRIL_BORDERS = (2, 1)  # modules of the black border of the tags of an AprilGri
 PLATES = (*GRIDS, *BOARDS)
 UNCODED = -1
 ALIKE = 1e-6  # pitches, of rounding
+# How far a tag may be off its place behind the homography of its board, in the distance of tags or squares.
+# Distortion of 5 % at the corners of a photograph that 8 x 8 tags fill leaves 0.1; a misread tag is off by 1.
+MAX_OFF_PLACE = 0.15
 
 
 @dataclass(frozen=True)

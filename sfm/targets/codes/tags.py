@@ -38,7 +38,7 @@ ENLARGED, MIN_SIDE_PX = 2, 6.0
 CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
 # A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
 # share of a module, or if its contrast is less than this share of the tag's.
-POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST = 0.1, 0.4, 0.3
+POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST_SHARE = 0.1, 0.4, 0.3
 NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE | Flag.POOR_FIT)
 # Radius of the circle that stands for a corner where outlines are drawn, px.
 DRAWN_PX = 4.0
@@ -138,7 +138,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
         tests = (
             (Flag.CUT_BY_BORDER, (flag & Flag.CUT_BY_BORDER) != 0),
             (Flag.NO_CONVERGENCE, (flag & Flag.NO_CONVERGENCE) != 0),
-            (Flag.LOW_CONTRAST, contrast / typical < MIN_CONTRAST),
+            (Flag.LOW_CONTRAST, contrast / typical < MIN_CONTRAST_SHARE),
             (Flag.BLURRED, (blur > SOFTEST_EDGE * module) & ~small[:, None]),
             (Flag.POOR_FIT, ((flag & Flag.POOR_FIT) != 0) | (noise / np.abs(contrast) > POOR_FIT)),
         )

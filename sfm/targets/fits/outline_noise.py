@@ -19,7 +19,7 @@ from sfm.targets.fits.damage import LEVEL, MAD, MIN_POPULATION, harmonics
 from sfm.targets.fits.goodness import SHAPES
 
 # The spectrum of outlines is that of harmonics 3 to this one, of which blur leaves this share at least.
-MAX_HARMONIC, LEAST_DAMPED = 12, 0.2
+MAX_HARMONIC, MIN_DAMPED = 12, 0.2
 # Its exponent is used where it is so many sigmas above 0, and up to this.
 EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
 # Larger than any degree of freedom that a population can show.
@@ -130,7 +130,7 @@ def rise_to_first(h: FloatArray, weight: FloatArray, softness: float) -> float:
     """
     k = np.arange(3, MAX_HARMONIC + 1)
     damped = np.exp(-((k * softness) ** 2)) * np.sinc(k / RAYS) ** 2
-    k = k[damped > LEAST_DAMPED]
+    k = k[damped > MIN_DAMPED]
     if len(h) < MIN_POPULATION or len(k) < 3:
         return 1.0
     design = harmonics(3, int(k[-1]))

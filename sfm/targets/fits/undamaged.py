@@ -27,7 +27,7 @@ from sfm.targets.flags import Flag
 
 # Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
 # share of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.
-UNEVEN_EDGE, MIN_CONTRAST = 0.18, 0.2
+UNEVEN_EDGE, MIN_CONTRAST_SHARE = 0.18, 0.2
 # Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
 # only half of it where the background is a thin stroke, as in letters, on this share of the circumference.
 LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
@@ -41,7 +41,7 @@ SKIRT_BLURS = 1.5
 MAX_INSIDE = 8.0
 # What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike
 # the others. Their scatter is that of the variance of 200 pixels at least.
-POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.1
+POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
 MIN_CURVATURE_BLURS = 2.0
 # Smaller targets have too few pixels to tell damage from another shape.
@@ -241,7 +241,7 @@ def _deviations(
         )
     sound = fitted & keep.all(axis=1) & ~np.any([unlike for _, unlike in against], axis=0)
     if fitted.any():
-        sound &= contrast > MIN_CONTRAST * np.percentile(contrast[fitted], 90)
+        sound &= contrast > MIN_CONTRAST_SHARE * np.percentile(contrast[fitted], 90)
     if sound.sum() >= MIN_POPULATION:
         variance = np.minimum(variance, np.median(variance[sound] / contrast[sound] ** 2) * contrast**2)
     variance = np.maximum(variance, variance_of_noise)
@@ -258,7 +258,7 @@ def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
         return np.ones(len(value), bool)
     z = np.log(np.maximum(value, 1e-12))
     z -= np.median(z[sound])
-    return np.asarray(z > POPULATION_SIGMAS * np.maximum(MAD * np.median(np.abs(z[sound])), LEAST_SCATTER))
+    return np.asarray(z > POPULATION_SIGMAS * np.maximum(MAD * np.median(np.abs(z[sound])), MIN_SCATTER))
 
 
 def _radii(theta: FloatArray) -> FloatArray:

@@ -47,8 +47,6 @@ STEPS, LAST_STEP_PX = 40, 1e-3
 # up at the nodes of Gauss and Hermite (Abramowitz and Stegun 1964, table 25.10, n = 5, for a unit variance).
 NODES = (-2.85697001, -1.35562618, 0.0, 1.35562618, 2.85697001)
 WEIGHTS = (0.01125741, 0.22207592, 0.53333333, 0.22207592, 0.01125741)
-# Least share of the blur that is left to u and v by themselves, so that no edge is a step.
-MIN_REST = 0.05
 _H, _B, _A, _S = slice(0, 8), 8, 9, 10
 
 
@@ -227,7 +225,8 @@ def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
     sigma = blur * np.sqrt((gradient**2).sum(axis=2))
     rho = blur**2 * (gradient[:, 0] * gradient[:, 1]).sum(axis=1) / sigma.prod(axis=1)
     along = np.sqrt(np.abs(rho))[:, None] * sigma * np.column_stack([np.ones(len(rho)), np.sign(rho)])
-    return uv, w, along, sigma * np.sqrt(np.maximum(1 - np.abs(rho), MIN_REST))[:, None]
+    rest = np.maximum(1 - np.abs(rho), np.finfo(float).eps)  # 0 where a tag is seen edge on
+    return uv, w, along, sigma * np.sqrt(rest)[:, None]
 
 
 def _module_rms(
