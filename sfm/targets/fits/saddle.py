@@ -20,9 +20,9 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 
-# Largest half side of the window, in the distance of the nearest crossing. On 14 photographs of a printed board
-# residuals are 0.128, 0.125, 0.128 and 0.134 px RMS with 0.25, 0.35, 0.43 and 0.5: distortion bends edges, print
-# is uneven, and smaller windows have more noise.
+# Largest half side of the window, in the distance of the nearest crossing. On 14 photographs of a printed
+# board residuals are 0.128, 0.125, 0.128 and 0.134 px RMS with 0.25, 0.35, 0.43 and 0.5: distortion bends
+# edges, print is uneven, and smaller windows have more noise.
 MAX_HALF_SPACINGS = 0.35
 MIN_HALF_PX, MAX_HALF_PX = 3, 15
 ROUNDS, LAST_STEP_PX = 20, 1e-3
