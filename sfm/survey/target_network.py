@@ -13,6 +13,7 @@ from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.diagnosis.codes_found import small_codes
 from sfm.survey.diagnosis.missing_plates import missing_plates
+from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
@@ -20,6 +21,7 @@ from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
+from sfm.targets.codes.plates import plates_of
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
 
@@ -100,10 +102,28 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
             np.concatenate(covariance),
         ),
     )
-    bars = scale_bars(survey.scale_bars, naming.names)
+    bars = scale_bars((*survey.scale_bars, *plate_bars(survey, naming)), naming.names)
     if not survey.scale_bars and survey.control is None:
         bars = tag_bars(survey.targets, naming)
     return replace(network, control=control_points(survey.control, naming.names), scale_bars=bars)
+
+
+def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
+    """Return two diagonals of what was seen of each plate but the first, which is control, as scale bars."""
+    bars = []
+    for settings, plate in zip(survey.plates, plates_of(survey.family)[1:], strict=False):
+        seen = naming.code[(naming.code >= plate.first_point) & (naming.code <= plate.last_point)]
+        if len(seen) < MIN_RAYS or settings.pitch is None:
+            continue
+        xyz = plate.plane(settings.pitch)[seen - plate.first_point]
+        for along in (xyz[:, 0] + xyz[:, 1], xyz[:, 0] - xyz[:, 1]):
+            ends = along.argmin(), along.argmax()
+            length = float(np.linalg.norm(xyz[ends[1]] - xyz[ends[0]]))
+            # the print has one scale, which both diagonals share
+            one = TAG_SIGMA * length if settings.plate_sigma is None else np.sqrt(2) * settings.plate_sigma
+            start, end = (str(seen[k]) for k in ends)
+            bars.append(ScaleBar(start, end, length, float(np.sqrt(2) * one)))
+    return bars
 
 
 def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:

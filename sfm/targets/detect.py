@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from sfm.targets.codes.boards import find_crossings
 from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
-from sfm.targets.codes.plates import BOARDS, PlateFamily
+from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
@@ -141,12 +141,27 @@ def find_targets(
         raise KolinearError(
             f"diameters from {min_diameter_px} to {max_diameter_px} px, expected positive ones in order"
         )
-    if not isinstance(codes, str | CodeFamily | TagFamily | ConcentricFamily | PlateFamily):
+    if not isinstance(codes, str | CodeFamily | TagFamily | ConcentricFamily | PlateFamily | PlateGroup):
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
+    if isinstance(codes, PlateGroup):
+        return _joined(
+            [
+                find_targets(
+                    photograph,
+                    polarity=polarity,
+                    codes=plate,
+                    centres=centres,
+                    min_diameter_px=min_diameter_px,
+                    max_diameter_px=max_diameter_px,
+                )
+                for plate in codes.plates
+            ]
+        )
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     if isinstance(family, PlateFamily) and family.name in BOARDS:
-        return _of_crossings(*find_crossings(photograph, family, scale=scale, noise=noise))
+        found, number = find_crossings(photograph, family, scale=scale, noise=noise)
+        return _of_crossings(found, family.first_point + number)
     grey = as_grey(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
@@ -219,12 +234,20 @@ def find_targets(
     return targets if tags is None else _with_corners(targets, tags)
 
 
+def _joined(parts: list[Targets]) -> Targets:
+    """Return the targets of several plates in one photograph."""
+    return Targets(
+        *(np.concatenate([getattr(one, field.name) for one in parts]) for field in fields(Targets))
+    )
+
+
 def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFamily) -> IntArray:
     """Return which point of a plate each good target is; insides of rings are of the other polarity."""
     if not good.any():
         return np.zeros(0, dtype=np.int64)
     semi_axes, _ = axes_from_shape(fit.shape[good])
-    return name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), rings_among(sign[good]), plate)
+    code = name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), rings_among(sign[good]), plate)
+    return np.where(code == UNCODED, UNCODED, plate.first_point + code)
 
 
 def _measure_centres(

@@ -8,7 +8,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.targets.codes.dot_plates import MIN_DOTS
 from sfm.targets.codes.families import TargetFamily
-from sfm.targets.codes.plates import BOARDS, PlateFamily
+from sfm.targets.codes.plates import BOARDS, plates_of
 from sfm.targets.flags import Flag
 
 
@@ -19,17 +19,26 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         family: codes of the survey.
         photographs: with the points of the plate as their codes.
     """
-    if not isinstance(family, PlateFamily):
-        return ()
-    found = zip(photographs.names, photographs.targets, strict=True)
-    without = [(name, targets) for name, targets in found if not (targets.code >= 0).any()]
-    dots = {name: int((targets.rejected_flag == Flag.NOT_ON_PLATE.value).sum()) for name, targets in without}
-    strange = [name for name in dots if dots[name] >= MIN_DOTS]
-    missing = [name for name in dots if dots[name] < MIN_DOTS]
-    size = f"{family.rows} x {family.columns}"
-    kind = "board_not_found" if family.name in BOARDS else "plate_not_found"
-    remarks = [remark(kind, photographs=missing, size=size)] if missing else []
-    if strange:
-        many = round(statistics.median(dots[name] for name in strange))
-        remarks.append(remark("plate_not_recognised", photographs=strange, dots=many, size=size))
+    remarks, plates = [], plates_of(family)
+    found = list(zip(photographs.names, photographs.targets, strict=True))
+    nothing = [one for one in found if not (one[1].code >= 0).any()]
+    for plate in plates:
+        is_seen = any(
+            ((targets.code >= plate.first_point) & (targets.code <= plate.last_point)).any()
+            for _, targets in found
+        )
+        # photographs in which no plate is found are named with the first; a plate that none shows, with all
+        without = (nothing if plate is plates[0] else []) if is_seen else found
+        dots = {
+            name: int((targets.rejected_flag == Flag.NOT_ON_PLATE.value).sum()) for name, targets in without
+        }
+        strange = [name for name in dots if dots[name] >= MIN_DOTS]
+        missing = [name for name in dots if dots[name] < MIN_DOTS]
+        size = f"{plate.rows} x {plate.columns}"
+        kind = "board_not_found" if plate.name in BOARDS else "plate_not_found"
+        if missing:
+            remarks.append(remark(kind, photographs=missing, size=size))
+        if strange:
+            many = round(statistics.median(dots[name] for name in strange))
+            remarks.append(remark("plate_not_recognised", photographs=strange, dots=many, size=size))
     return tuple(remarks)

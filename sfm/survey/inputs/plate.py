@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import KnownPoints
-from sfm.survey.inputs.settings import TargetSettings
-from sfm.targets.codes.plates import GRIDS, PLATES, TAGGED, PlateFamily, refuse_unusable_plate
+from sfm.survey.inputs.settings import PlateSettings, TargetSettings
+from sfm.targets.codes.plates import (
+    GRIDS,
+    PLATES,
+    TAGGED,
+    PlateFamily,
+    PlateGroup,
+    group_plates,
+    refuse_unusable_plate,
+)
 from sfm.targets.codes.tags import DICTIONARIES, tag_family
 
 OF_PLATES = (
@@ -16,7 +26,7 @@ OF_PLATES = (
 MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
 
 
-def plate_family(targets: TargetSettings) -> PlateFamily | None:
+def plate_family(targets: TargetSettings | PlateSettings) -> PlateFamily | None:
     """Return the plate that the targets are on; None where they are on none."""
     if targets.codes not in PLATES or targets.rows is None or targets.columns is None:
         return None
@@ -47,6 +57,36 @@ def plate_control(targets: TargetSettings) -> KnownPoints | None:
     return KnownPoints(names, xyz, np.full_like(xyz, targets.plate_sigma or 0.0))
 
 
+def plate_group(targets: TargetSettings, others: Sequence[PlateSettings]) -> PlateGroup:
+    """Return the plates of a survey, that of the targets first.
+
+    Raises:
+        GeometryError: they cannot be used side by side, see `group_plates`.
+    """
+    plates = [plate_family(targets), *(plate_family(one) for one in others)]
+    return group_plates([plate for plate in plates if plate is not None])
+
+
+def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateSettings], where: str) -> None:
+    """Raise SurveyFileError where plates beside another are incomplete, or cannot be told apart."""
+    if not others:
+        return
+    if targets.codes not in PLATES:
+        raise SurveyFileError(
+            f"{where}: plate beside targets of codes = '{targets.codes}', needed a first plate in [targets]"
+        )
+    for k, one in enumerate(others, 2):
+        if one.codes not in PLATES:
+            raise SurveyFileError(
+                f"{where}: plate {k}: codes = '{one.codes}' is no plate; plates are {', '.join(PLATES)}"
+            )
+        refuse_contradicting_plates(one, f"{where}: plate {k}")
+    try:
+        plate_group(targets, others)
+    except GeometryError as error:
+        raise SurveyFileError(f"{where}: plates: {error}") from error
+
+
 def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> bool:
     """Return whether the control is that of the plate."""
     if control is None or plate is None or control.names != plate.names:
@@ -54,7 +94,7 @@ def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> 
     return bool(np.array_equal(control.xyz, plate.xyz) and np.array_equal(control.sigma, plate.sigma))
 
 
-def refuse_contradicting_plates(targets: TargetSettings, where: str) -> None:
+def refuse_contradicting_plates(targets: TargetSettings | PlateSettings, where: str) -> None:
     """Raise SurveyFileError where what is said of a plate is incomplete, or belongs to none."""
     given = [name for name in OF_PLATES if name in targets.model_fields_set]
     if targets.codes not in PLATES:

@@ -163,6 +163,20 @@ class TargetSettings(Section):
     first_tag: TagNumber = 0  # of the first of these
 
 
+class PlateSettings(Section):
+    """[[plate]]: another calibration plate, fixed to that of [targets]; its points are numbered on."""
+
+    codes: Name  # as of [targets], a plate or board of another kind or with other tags
+    rows: PlateSide | None = None  # of its dots, crossings or corners
+    columns: PlateSide | None = None  # of the same
+    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
+    plate_sigma: Length | None = None  # standard deviation of its coordinates, object unit; 0.2 % without
+    dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid
+    tag_size: Length | None = None  # side of the black square of these, object unit
+    first_tag: TagNumber = 0  # of the first of these
+
+
 class TiePointSettings(Section):
     """[tie_points]: natural texture in place of targets."""
 

@@ -36,6 +36,8 @@ from sfm.survey.inputs.plate import (
     is_plate_control,
     plate_control,
     plate_family,
+    plate_group,
+    refuse_contradicting_groups,
     refuse_contradicting_plates,
 )
 from sfm.survey.inputs.settings import (
@@ -44,6 +46,7 @@ from sfm.survey.inputs.settings import (
     CompareSettings,
     DatumSettings,
     Head,
+    PlateSettings,
     Section,
     TargetSettings,
     TiePointSettings,
@@ -92,6 +95,7 @@ class Survey:
     cameras: tuple[CameraSettings, ...]  # a CameraSetup each
     unit: str = "m"  # object unit, for people and reports
     targets: TargetSettings = field(default_factory=TargetSettings)
+    plates: tuple[PlateSettings, ...] = ()  # calibration plates beside that of the targets
     tie_points: TiePointSettings | None = None  # natural texture in place of targets
     datum: DatumSettings = field(default_factory=DatumSettings)  # or a Datum with points by name
     adjust: AdjustSettings = field(default_factory=AdjustSettings)  # the stochastic model
@@ -132,6 +136,7 @@ class Survey:
             "folder": Path(self.folder),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
             "targets": _section(TargetSettings, self.targets, f"{where}: targets"),
+            "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
             "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
         }
@@ -145,6 +150,7 @@ class Survey:
     def _place_plate(self, where: str) -> None:
         """Take the points of a calibration plate as control and, where there are none, as start values."""
         refuse_contradicting_plates(self.targets, where)
+        refuse_contradicting_groups(self.targets, self.plates, where)
         plate = plate_control(self.targets)
         if plate is None:
             return
@@ -172,6 +178,8 @@ class Survey:
         Raises:
             SurveyFileError: the code table is unreadable.
         """
+        if self.plates:
+            return plate_group(self.targets, self.plates)
         return survey_family(self.targets, self.codes)
 
     def __repr__(self) -> str:
@@ -225,6 +233,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         unit=file.unit,
         cameras=tuple(_calibrated_as_named(one, file) for one in file.cameras),
         targets=file.targets,
+        plates=file.plates,
         tie_points=file.tie_points,
         datum=file.datum,
         adjust=file.adjust,

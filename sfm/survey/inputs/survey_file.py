@@ -24,6 +24,7 @@ from sfm.survey.inputs.settings import (
     ExteriorSettings,
     Head,
     ObservationSettings,
+    PlateSettings,
     ScaleBarSettings,
     Section,
     TargetSettings,
@@ -40,6 +41,7 @@ class SurveyFile(Section):
         tuple[CameraSettings, ...], Field(strict=False, min_length=1, max_length=MAX_CAMERAS, alias="camera")
     ]
     targets: TargetSettings = TargetSettings()
+    plates: Annotated[tuple[PlateSettings, ...], Field(strict=False, alias="plate")] = ()
     tie_points: TiePointSettings | None = None
     datum: DatumSettings = DatumSettings()
     control: ControlSettings | None = None

@@ -21,7 +21,7 @@ from sfm.survey.measuring.measured_store import TARGETS, MeasuredStore, measured
 from sfm.survey.measuring.photographs import each_photograph
 from sfm.targets.codes.concentric import ConcentricFamily
 from sfm.targets.codes.families import TargetFamily
-from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.plates import PlateFamily, PlateGroup
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets, find_targets
 
@@ -120,7 +120,7 @@ def target_settings(settings: TargetSettings, family: TargetFamily | None) -> st
     codes = "none"
     if isinstance(family, TagFamily | ConcentricFamily):
         codes = family.name
-    elif isinstance(family, PlateFamily):
+    elif isinstance(family, PlateFamily | PlateGroup):
         codes = repr(family)
     elif family is not None:
         table = family.number.tobytes() + family.pattern.tobytes()

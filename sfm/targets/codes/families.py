@@ -16,12 +16,12 @@ from pathlib import Path
 
 from sfm.errors import SurveyFileError
 from sfm.targets.codes.concentric import WIDTHS, ConcentricFamily, concentric_family
-from sfm.targets.codes.plates import PLATES, PlateFamily
+from sfm.targets.codes.plates import PLATES, PlateFamily, PlateGroup
 from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, ring_family
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
 
 Family = CodeFamily | TagFamily | ConcentricFamily
-TargetFamily = Family | PlateFamily  # a plate has no name that says all of it
+TargetFamily = Family | PlateFamily | PlateGroup  # a plate has no name that says all of it
 FAMILIES: dict[str, Callable[[], Family | None]] = {
     **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,

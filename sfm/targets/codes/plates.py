@@ -8,7 +8,8 @@ table of the points, if there is one, are counted from it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -64,6 +65,8 @@ class PlateFamily:
     """side of these tags, in squares, or in the distance from a tag to the next one"""
     first_tag: int = 0
     """number of the first of them"""
+    first_point: int = 0
+    """number of the first point, of a plate beside others"""
 
     @property
     def count(self) -> int:
@@ -75,6 +78,11 @@ class PlateFamily:
         """Number of the last tag of a ChArUco board or AprilGrid."""
         size = (self.rows + 1) * (self.columns + 1) // 2
         return self.first_tag - 1 + (self.count // 4 if self.name == "aprilgrid" else size)
+
+    @property
+    def last_point(self) -> int:
+        """Number of the last point."""
+        return self.first_point + self.count - 1
 
     @property
     def is_shifted(self) -> bool:
@@ -129,6 +137,54 @@ class PlateFamily:
         grid = GRIDS.get(self.name, GRIDS["grid"])
         x, y = pitch * (column + grid.shift * (row % 2)), -pitch * grid.apart * row
         return np.stack([x, y, np.zeros(self.count)], axis=1)
+
+
+@dataclass(frozen=True)
+class PlateGroup:
+    """Several plates that are fixed to one another, the points of each numbered on behind those before it."""
+
+    plates: tuple[PlateFamily, ...]
+
+
+def plates_of(family: object) -> tuple[PlateFamily, ...]:
+    """Return the plates that targets are on, none where they are others."""
+    if isinstance(family, PlateGroup):
+        return family.plates
+    return (family,) if isinstance(family, PlateFamily) else ()
+
+
+def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
+    """Return plates as a group, with the numbers that their points then have.
+
+    Raises:
+        GeometryError: one looks alike when it is turned, so that it has no place among the others, or two
+            cannot be told apart.
+    """
+    first, grouped = 0, list[PlateFamily]()
+    for plate in plates:
+        if plate.is_ambiguous:
+            raise GeometryError(
+                f"a {plate.name} of {plate.rows} x {plate.columns} looks alike when it is turned, and has no "
+                "place beside other plates: needed marks, tags, or an odd sum of rows and columns"
+            )
+        for other in grouped:
+            if _look_alike(plate, other):
+                raise GeometryError(
+                    f"{other.name} of {other.rows} x {other.columns} and {plate.name} of {plate.rows} x "
+                    f"{plate.columns} are not told apart: needed other tags, or a plate of another kind"
+                )
+        grouped.append(replace(plate, first_point=first))
+        first += plate.count
+    return PlateGroup(tuple(grouped))
+
+
+def _look_alike(one: PlateFamily, other: PlateFamily) -> bool:
+    """Return whether a finder may take one plate for the other."""
+    if one.name in TAGGED and other.name in TAGGED:
+        apart = one.first_tag > other.last_tag or other.first_tag > one.last_tag
+        return one.dictionary == other.dictionary and not apart
+    crossings = ("checkerboard", "charuco")
+    return (one.name in GRIDS and other.name in GRIDS) or (one.name in crossings and other.name in crossings)
 
 
 def refuse_unusable_plate(plate: PlateFamily) -> None:
