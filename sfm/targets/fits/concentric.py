@@ -12,7 +12,8 @@ the step to the ink, s the blur and c_i the curvature of the edges (1/px), the i
     z_i = (r_i + (-1)^i e - rho) / (s |grad rho|) - s c_i / 2
 
 with dx and dy of the gain in units of L, the mean radius. The last term is the shift of a bent edge by the
-blur, to first order. The box of the pixel is part of s.
+blur, to first order. The box of the pixel is part of s. A camera that sharpens adds a times what a mask of
+standard deviation h takes away: Phi(z_i) becomes (1 + a) Phi(z_i) - a Phi(z_i'), with s' = sqrt(s^2 + h^2).
 
 Source: Kim, Gurdjos and Kweon (2005), "Geometric and algebraic constraints of projected concentric circles
 and their applications to camera calibration", IEEE PAMI 27(4), for the pencil of conics; motion of edges by
@@ -28,12 +29,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.fits.corner import MASK_PX, SHARPENING_SIGMA
 from sfm.targets.flags import Flag
 from sfm.targets.measure import QUANTISATION
 
-# Unknowns in their order: x0, y0, p, q, r, two of l, B, A, s, e, gx, gy.
-UNKNOWNS, GEOMETRY = 13, 7
-BACKGROUND, CONTRAST, BLUR, SPREAD, GAIN_X, GAIN_Y = range(7, 13)
+# Unknowns in their order: x0, y0, p, q, r, two of l, B, A, s, e, gx, gy, a.
+UNKNOWNS, GEOMETRY = 14, 7
+BACKGROUND, CONTRAST, BLUR, SPREAD, GAIN_X, GAIN_Y, SHARPENING = range(7, 14)
 # Paper about the rings is fitted up to this radius; nothing else may be there.
 SURROUNDINGS = 1.15
 # A priori sigma of the spread of the ink in outer radii: 0.1 mm on a tag of 40 mm. It only matters where the
@@ -50,9 +52,9 @@ class ConcentricFit:
     """Rings of known radii fitted to a part of a photograph."""
 
     theta: FloatArray
-    """unknowns, shape (13,)"""
+    """unknowns, shape (14,)"""
     covariance: FloatArray
-    """their covariance from the residuals, shape (13, 13)"""
+    """their covariance from the residuals, shape (14, 14)"""
     noise: float
     """standard deviation of the intensities about the fit"""
     radius_information: FloatArray
@@ -159,7 +161,7 @@ def fit_concentric(
         geometry: approximate x0, y0, p, q, r and two of l, shape (7,).
         radii: of the edges from the outside inwards, the first is 1, shape (n + 1,).
         blur: approximate standard deviation of the edges, px.
-        noise: approximate standard deviation of the intensities; weights the spread of the ink.
+        noise: approximate standard deviation of the intensities; weights spread of the ink and sharpening.
         saturation: intensities from here on are censored.
 
     Returns:
@@ -174,7 +176,8 @@ def fit_concentric(
     xy, value = found
     prior = np.zeros(UNKNOWNS)
     prior[SPREAD] = (max(noise, math.sqrt(QUANTISATION)) / SPREAD_SIGMA) ** 2
-    theta = np.concatenate([geometry, [0.0, 1.0, blur, 0.0, 0.0, 0.0]])
+    prior[SHARPENING] = (max(noise, math.sqrt(QUANTISATION)) / SHARPENING_SIGMA) ** 2
+    theta = np.concatenate([geometry, [0.0, 1.0, blur, 0.0, 0.0, 0.0, 0.0]])
     J, _, _, _ = _linearise(theta, xy, value, radii, length, math.inf)
     levels = J[[BACKGROUND, CONTRAST]]
     theta[[BACKGROUND, CONTRAST]] = np.linalg.lstsq(levels.T, value, rcond=None)[0]
@@ -252,12 +255,13 @@ def _linearise(
     length: float,
     saturation: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
-    """Return derivatives by the unknowns (13, n), residuals (n,), which count, and derivatives by radii.
+    """Return derivatives by the unknowns (14, n), residuals (n,), which count, and derivatives by radii.
 
     The scale of the blur, |grad rho|, is taken as constant: its change is felt away from the edges only.
     """
     _, _, p, q, r = theta[:5]
-    B, A, s, e, gx, gy = theta[GEOMETRY:]
+    B, A, s, e, gx, gy, a = theta[GEOMETRY:]
+    masked = math.hypot(s, MASK_PX)
     dx, dy = (xy - theta[:2]).T
     rho, by = rho_at(theta[:GEOMETRY], xy)
     slope = np.hypot(by[0], by[1]) + 1e-12
@@ -266,18 +270,24 @@ def _linearise(
     w = np.hypot(wx, wy) + 1e-12
     # An edge through this direction has the curvature |S t|^2 / |S S dx| where its radius is rho, t along it.
     bent = ((p * wy - q * wx) ** 2 + (q * wy - r * wx) ** 2) / w**3 * rho
-    ink, by_rho, by_blur, by_spread = (np.zeros(len(xy)) for _ in range(4))
-    edges = np.empty((len(radii), len(xy)))
+    ink, by_rho, by_blur, by_spread, by_sharpening = (np.zeros(len(xy)) for _ in range(5))
+    edges = np.zeros((len(radii), len(xy)))
     for i, radius in enumerate(radii):
         sign = 1 - 2 * (i % 2)
         curvature = bent / radius
-        z = (radius + sign * e - rho) / (s * slope) - s * curvature / 2
-        density = _DENSITY_0 * np.exp(-z * z / 2)
-        ink += sign * ndtr(z)
-        edges[i] = sign * density / (s * slope)
+        for part, way, blur in (
+            (1 + a, 1.0, s),
+            (-a, -1.0, masked),
+        ):  # sharpened; taken away
+            z = (radius + sign * e - rho) / (blur * slope) - blur * curvature / 2
+            density = part * _DENSITY_0 * np.exp(-z * z / 2)
+            smooth = sign * ndtr(z)
+            ink += part * smooth
+            by_sharpening += way * smooth
+            edges[i] += sign * density / (blur * slope)
+            by_blur -= sign * density * (z / blur + curvature) * s / blur
         by_rho -= edges[i]
         by_spread += sign * edges[i]
-        by_blur -= sign * density * (z / s + curvature)
     gain = 1 + (gx * dx + gy * dy) / length
     level = B + A * ink
     model = level * gain
@@ -290,5 +300,6 @@ def _linearise(
     J[1] -= level * gy / length
     J[BACKGROUND], J[CONTRAST] = gain, ink * gain
     J[BLUR], J[SPREAD] = step * by_blur, step * by_spread
+    J[SHARPENING] = step * by_sharpening
     J[GAIN_X], J[GAIN_Y] = level * dx / length, level * dy / length
     return J * weight, (value - model) * weight, weight, edges * step * weight
