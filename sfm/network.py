@@ -6,9 +6,10 @@ function that changes something returns a new object.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
 
 MAX_NAMES = 10  # in a message
+MAX_PAIRS = 4_000_000  # of photographs that are compared at a time
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -265,24 +267,33 @@ class Network:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
-    def common_points(self, usable: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+    def common_points(self, usable: BoolArray) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
         """Return the pairs of photographs that share points, and how many, among usable image points.
+
+        In parts of some millions of pairs: where many photographs see the same points, all pairs would take
+        gigabytes.
 
         Args:
             usable: of the image points, (k,).
 
-        Returns:
-            Index of the first and of the second photograph, which is larger, and the number of points, (p,).
+        Yields:
+            Index of the first and of the second photograph, which is larger, and the number of points, (p,);
+            in the order of the first and then of the second one.
         """
         seen = self.image_points.select(usable)
         shape = (len(self.images), len(self.points))
         sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
         sees.sum_duplicates()
         sees.data[:] = 1
-        common = triu(sees @ sees.T, 1).tocsr()  # a table of all pairs would take gigabytes
-        common.sort_indices()
-        pairs = common.tocoo()
-        return pairs.row.astype(np.int64), pairs.col.astype(np.int64), pairs.data.astype(np.int64)
+        seen_by = sees.T.tocsr()
+        rays = np.diff(seen_by.indptr)
+        most = np.minimum(sees @ rays, shape[0])  # pairs of each photograph, at most
+        part = np.cumsum(most) // MAX_PAIRS
+        for start, end in pairwise([*np.flatnonzero(np.diff(part, prepend=-1)), shape[0]]):
+            common = triu(sees[start:end] @ seen_by, int(start) + 1).tocsr()
+            common.sort_indices()
+            pairs = common.tocoo()
+            yield pairs.row.astype(np.int64) + start, pairs.col.astype(np.int64), pairs.data.astype(np.int64)
 
     def __repr__(self) -> str:
         parts = (

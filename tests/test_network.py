@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
 from sfm.reduced_network import reduce_network
@@ -66,10 +67,15 @@ def test_undetermined_parts_of_an_estimate_are_nan() -> None:
     assert list(np.flatnonzero(~estimate.determined)) == [3]
 
 
-def test_pairs_of_photographs_that_share_points_are_counted_without_a_table_of_all() -> None:
+def test_pairs_of_photographs_that_share_points_are_counted_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     network, _ = make_network(seed_of("pairs"), images=7, points=30, visibility=0.4)
     seen = network.image_points
     usable = seed_of("usable").random(len(seen)) < 0.7
     sees = [set(seen.point[usable & (seen.image == i)].tolist()) for i in range(7)]
     true = [(i, j, len(sees[i] & sees[j])) for i in range(7) for j in range(i + 1, 7) if sees[i] & sees[j]]
-    assert list(zip(*(part.tolist() for part in network.common_points(usable)), strict=True)) == true
+    for most, parts in ((10**6, 1), (8, 3)):
+        monkeypatch.setattr("sfm.network.MAX_PAIRS", most)
+        found = list(network.common_points(usable))
+        assert len(found) >= parts
+        joined = [np.concatenate(part).tolist() for part in zip(*found, strict=True)]
+        assert list(zip(*joined, strict=True)) == true

@@ -211,5 +211,5 @@ def _strongest(network: Network) -> BoolArray:
 
 def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
-    common = network.common_points(np.ones(len(network.image_points), dtype=bool))[2]
-    return int(common.max(initial=0))
+    every = np.ones(len(network.image_points), dtype=bool)
+    return max(int(common.max(initial=0)) for _, _, common in network.common_points(every))

@@ -20,6 +20,7 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.runtime.progress import report_step
 from sfm.similarity import fit_similarity
 
+MAX_TIED = 1_000_000  # pairs with equally many common points of which the best spread ones are chosen
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 BARREN_PAIRS = 20  # pairs most of whose points fit no orientation, after which no more are tried
 PAIR_TRIALS = 500  # samples of five points in a pair: enough where 45 % of its points fit, at 99.99 %
@@ -196,20 +197,22 @@ def _words_of_common(network: Network, own: list[IntArray]) -> str:
     """Say for each photograph with which other it has most points in common."""
     usable = np.zeros(len(network.image_points), dtype=bool)
     usable[np.concatenate(own)] = True
-    first, second, count = network.common_points(usable)
+    most, partner = np.zeros(len(own), dtype=np.int64), np.zeros(len(own), dtype=np.int64)
+    for first, second, count in network.common_points(usable):
+        for one, other in ((first, second), (second, first)):
+            order = np.lexsort((-other, count, one))  # of each photograph the last one has most
+            last = order[np.flatnonzero(np.diff(one[order], append=-1))]
+            better = last[count[last] > most[one[last]]]
+            most[one[better]], partner[one[better]] = count[better], other[better]
     words = []
-    for i in range(len(own)):
-        pairs = np.flatnonzero((first == i) | (second == i))
+    for i, name in enumerate(network.images):
         if not len(own[i]):
-            words.append(f"{network.images[i]}: no points")
-        elif not len(pairs):
-            words.append(
-                f"{network.images[i]}: none of its {counted(len(own[i]), 'point')} is in another photograph"
-            )
+            words.append(f"{name}: no points")
+        elif not most[i]:
+            words.append(f"{name}: none of its {counted(len(own[i]), 'point')} is in another photograph")
         else:
-            p = int(pairs[np.argmax(count[pairs])])
-            other = network.images[int(second[p] if first[p] == i else first[p])]
-            words.append(f"{network.images[i]}: {counted(count[p], 'point')} in common with {other}")
+            shared = counted(int(most[i]), "point")
+            words.append(f"{name}: {shared} in common with {network.images[partner[i]]}")
     return listed(words, most=10, separator="; ")
 
 
@@ -218,9 +221,22 @@ def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, i
     m = len(own)
     usable = np.zeros(len(network.image_points), dtype=bool)
     usable[np.concatenate(own)] = True
-    first, second, count = network.common_points(usable)
-    enough = count >= PLANAR_POINTS
-    first, second, count = first[enough], second[enough], count[enough]
+    pairs = np.zeros(1, dtype=np.int64)  # by the number of common points
+    for _, _, count in network.common_points(usable):
+        now = np.bincount(count, minlength=len(pairs))
+        now[: len(pairs)] += pairs
+        pairs = now
+    pairs[:PLANAR_POINTS] = 0
+    fewest = int(np.flatnonzero(np.cumsum(pairs[::-1])[::-1] >= min(MAX_PAIRS, pairs.sum()))[-1])
+    kept, passed = [], 0
+    every = 1 + int(pairs[fewest]) // MAX_TIED  # of pairs that have as many points in common as others
+    for first, second, count in network.common_points(usable):
+        number = passed + np.cumsum(count == fewest)
+        take = (count > fewest) | ((count == fewest) & (number % every == 0))
+        take &= count >= PLANAR_POINTS
+        passed = int(number[-1]) if len(number) else passed
+        kept.append(np.stack([first[take], second[take], count[take]]))
+    first, second, count = np.concatenate(kept, axis=1)
     # equal counts in the order of j - i, so that a cut takes pairs from all over the survey
     order = np.lexsort((second, first, (second - first) % max(2, m // 3), -count))
     if len(order) > MAX_PAIRS:

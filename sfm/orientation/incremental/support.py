@@ -67,11 +67,12 @@ def photograph_support(
 
 def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
     """Return the conditions that the pairs of each photograph have beyond a relative orientation, (m,)."""
-    first, second, count = network.common_points(two_rays)
-    surplus = np.maximum(count - RELATIVE_UNKNOWNS, 0)
     m = len(network.images)
-    both = np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
-    return np.asarray(both, dtype=np.int64)
+    both = np.zeros(m)
+    for first, second, count in network.common_points(two_rays):
+        surplus = np.maximum(count - RELATIVE_UNKNOWNS, 0)
+        both += np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
+    return both.astype(np.int64)
 
 
 def _amidst(network: Network, estimate: Estimate) -> BoolArray:

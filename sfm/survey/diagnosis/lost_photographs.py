@@ -64,11 +64,11 @@ def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
     lost = np.flatnonzero(~oriented)
     in_network = np.zeros(len(network.points), dtype=bool)
     in_network[seen.point[oriented[seen.image]]] = True
-    first, second, common = network.common_points(np.ones(len(seen), dtype=bool))
-    linked = (common >= MIN_POINTS) & ~oriented[first] & ~oriented[second]
-    m = len(network.images)
-    links = csr_matrix((np.ones(int(linked.sum())), (first[linked], second[linked])), shape=(m, m))
-    label = connected_components(links, directed=False)[1]
+    label = np.arange(len(network.images))  # the group of each photograph
+    for first, second, common in network.common_points(~oriented[seen.image]):
+        linked = label[first[common >= MIN_POINTS]], label[second[common >= MIN_POINTS]]
+        links = csr_matrix((np.ones(len(linked[0])), linked), shape=(len(label), len(label)))
+        label = connected_components(links, directed=False)[1][label]
     groups = []
     for number in np.unique(label[lost]):
         images = lost[label[lost] == number]
