@@ -22,7 +22,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.conventions import angles_from_rotation
+from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.files.manifest import refuse_foreign_folder
@@ -30,7 +30,7 @@ from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
-from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.figures.plots import SHADES, all_plots, plan_axes
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
@@ -319,6 +319,37 @@ def test_plots_are_on_the_paper_of_the_page_light_and_dark(
         assert np.abs(image[4, 4, ::-1].astype(int) - paper).max() <= 1
         assert (np.abs(image.astype(int) - ink).max(axis=2) < 40).any()
         tab.close()
+
+
+def test_colours_of_values_are_visible_on_light_and_on_dark_pages() -> None:
+    """Contrast by WCAG 2.1; the large values have more of it. Dark pages turn the intensities over."""
+
+    def luminance(rgb: FloatArray) -> FloatArray:
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        return np.asarray(linear @ [0.2126, 0.7152, 0.0722])
+
+    small, large = SHADES([0.0, 1.0])[:, :3]
+    for paper, shown in (
+        (np.ones(3), (small, large)),
+        (np.array([23, 29, 37]) / 255, (1 - small, 1 - large)),
+    ):
+        light = luminance(paper)
+        pairs = [sorted((luminance(one) + 0.05, light + 0.05)) for one in shown]
+        low, high = (b / a for a, b in pairs)
+        assert 1.5 < low < high and high > 7
+
+
+def test_wide_tables_show_that_there_is_more(browser: Any, result: SurveyResult, tmp_path: Path) -> None:
+    """The edge is shaded beyond which columns are hidden, and not where they all are seen."""
+    (tmp_path / "report.html").write_text(report_page(findings_of(result), (), ()), "utf-8")
+    place = "(all) => all.findIndex((one) => one.clientWidth && one.scrollWidth - one.clientWidth SIGN)"
+    tab = Tab(browser, tmp_path / "report.html", width=390)
+    tables = tab.page.locator(".scroll")
+    for sign, shaded in (("> 50", True), ("== 0", False)):
+        table = tables.nth(tables.evaluate_all(place.replace("SIGN", sign)))
+        seen = cv2.imdecode(np.frombuffer(table.screenshot(), np.uint8), 0)
+        assert (int(np.median(seen[:, -2])) < 200) is shaded
+    tab.close()
 
 
 def test_pictures_are_cut_into_panels_that_show_something(result: SurveyResult) -> None:

@@ -6,10 +6,11 @@ import io
 from collections.abc import Callable
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm
+from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -24,6 +25,8 @@ ALONE_IN = 6.0  # of pictures of one
 LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.9, 0.15, 0.55, 0.35, 1.05  # margins
 BAR_FRACTION = 0.2  # of a panel, for the scale of its colours with its labels
 LETTER_IN = 0.065  # width of a letter of the names of photographs
+# Large values are far from the paper, small ones not too near, on light pages and turned over on dark ones.
+SHADES = ListedColormap(colormaps["viridis"](np.linspace(0.8, 0.0, 256)))
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
@@ -181,7 +184,7 @@ def precision_figure(shown: PlotData) -> Figure:
             *points[worst_last][:, [across, up]].T,
             c=shown.sigma[worst_last],
             s=14,
-            cmap="viridis",
+            cmap=SHADES,
         )
         figure.colorbar(
             drawn, ax=panel, label=f"sigma [{_plain(shown.sigma_unit)}]", shrink=0.85, fraction=BAR_FRACTION
@@ -208,10 +211,10 @@ def projection_figure(shown: PlotData) -> Figure:
         known = found.sigma[found.sigma > 0]
         levels = np.geomspace(np.quantile(known, OUTSIDE), known.max() * (1 + 1e-9), LEVELS)
         drawn = panel.contourf(
-            found.x, found.y, found.sigma, levels=levels, norm=LogNorm(), cmap="viridis", extend="min"
+            found.x, found.y, found.sigma, levels=levels, norm=LogNorm(), cmap=SHADES, extend="min"
         )
         xy = shown.xy[owner == k]
-        panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="white", markersize=1, alpha=0.6)
+        panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="black", markersize=1, alpha=0.5)
         figure.colorbar(
             drawn,
             ax=panel,
