@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm.display import MAX_LISTED, counted, program_name
+from sfm.display import MAX_LISTED, counted, listed, program_name
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
@@ -45,8 +45,8 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
         table.add_row(Text(name, style="dim"), Text(value))
     console.print(table)
     tell_remarks(console, verdict.lines)
-    for failed in result.failed:
-        console.print(Text(f"  {failed.image}: {failed.reason.text}"), soft_wrap=True)
+    for line in _failures(findings):
+        console.print(Text(f"  {line}"), soft_wrap=True)
     if verbose:
         console.print(_photograph_table(result))
         for camera in a.estimate.cameras:
@@ -75,6 +75,21 @@ def tell_remarks(console: Console, lines: Iterable[Line]) -> None:
         is_note = line.severity == "note"
         text = f"  {line.text}" if is_note else f"! {line.text} {line.remedy}".rstrip()
         console.print(Text(text, style=STYLES[line.severity]), soft_wrap=True)
+
+
+def _failures(findings: Findings) -> list[str]:
+    """Return why photographs are not in the result: once for those alike, and not what a remark explains."""
+    said = {
+        (image, kind)
+        for one in findings.verdict.remarks
+        for image in one.names("photographs")
+        for kind in one.row.explains
+    }
+    images: dict[str, list[str]] = {}
+    for failed in findings.result.failed:
+        if (failed.image, failed.reason.kind) not in said:
+            images.setdefault(failed.reason.text, []).append(failed.image)
+    return [f"{listed(ones)}{', each' if len(ones) > 1 else ''}: {text}" for text, ones in images.items()]
 
 
 def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:

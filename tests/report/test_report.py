@@ -662,3 +662,24 @@ def test_the_comparison_says_what_of_the_survey_it_leaves_out(
     tell_result(fixed, Path("page"), seconds=1.0, verbose=False)
     for shown in (" ".join(capsys.readouterr().out.split()), report_page(fixed, (), ())):
         assert told in shown
+
+
+def test_the_terminal_says_once_why_photographs_are_lost(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Reasons that are alike are one line, and those that a remark of these photographs explains none."""
+    few, apart = (remark(kind, **{what: 0}, needed=4) for kind, what in REASONS)
+    lost = (FailedImage("lost 1", few), FailedImage("lost 2", few), FailedImage("lost 3", apart))
+    for explained in ((), ("lost 2", "lost 3")):
+        group = remark("not_connected", photographs=explained, oriented=8, needed=4)
+        board = remark("board_not_found", photographs=explained, size="7 x 9")
+        said = replace(result, failed=lost, remarks=(group, board) if explained else ())
+        tell_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
+        told = [line.strip() for line in capsys.readouterr().out.splitlines()]
+        reasons = [line for line in told if line.startswith("lost") and line.endswith((few.text, apart.text))]
+        assert [line.split(":")[0] for line in reasons] == (
+            ["lost 1"] if explained else ["lost 1, lost 2, each", "lost 3"]
+        )
+
+
+REASONS = (("photograph_with_few_points", "seen"), ("photograph_not_connected", "shared"))

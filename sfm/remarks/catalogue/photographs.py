@@ -20,6 +20,7 @@ ROWS = (
         "shows {needed} of points {points} and {needed} of {others} connects them.]]",
         "groups of photographs with too few common points",
         "Add a photograph that shows points of both groups.",
+        explains=("photograph_not_connected",),
     ),
     Kind(
         "two_photographs",
@@ -66,6 +67,7 @@ ROWS = (
         "The calibration plate of {size} dots was not found in {photographs:photograph}: {photographs}.",
         "a plate without marks must be seen whole, one with marks with enough of them",
         "Show all of it; check the polarity of the dots.",
+        explains=("photograph_with_few_points",),
     ),
     Kind(
         "plate_not_recognised",
@@ -90,6 +92,7 @@ ROWS = (
         "The board of {size} crossings was not found in {photographs:photograph}: {photographs}.",
         "a checkerboard must be seen whole with a white rim; rows and columns count crossings, not squares",
         "Show all of it with its rim; check rows, columns, tag_size and dictionary.",
+        explains=("photograph_with_few_points",),
     ),
     Kind(
         "plane_ambiguous",
