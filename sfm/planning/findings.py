@@ -32,8 +32,9 @@ def verdict_of_plan(plan: Plan) -> Verdict:
 
 def _remarks(plan: Plan) -> Iterator[Remark]:
     p = plan.prediction
-    if p.adjustment.undetermined:
-        yield remark("plan_undetermined", unknown=p.adjustment.undetermined)
+    unknown = p.adjustment.undetermined
+    if unknown:
+        yield remark("plan_undetermined", unknown=unknown[:1], more=len(unknown) - 1 or None)
     if not p.determined.all():
         lost = [name for name, known in zip(p.planned.names, p.determined, strict=True) if not known]
         yield remark("plan_points_undetermined", lost=len(lost), total=len(p.planned.names), points=lost)
@@ -44,10 +45,8 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
         yield remark("plan_points_with_few_rays", few=few, needed=MIN_RAYS)
     c = plan.calibration
     if c is not None and not c.good:
-        yield remark(
-            "plan_does_not_calibrate",
-            reasons=(*c.reasons, *c.undetermined) or ("too few image points over the photograph",),
-        )
+        reasons = c.reasons or ("too few image points over the photograph",)
+        yield remark("plan_does_not_calibrate", reasons=reasons)
     if plan.unusable:
         yield remark("plan_photographs_apart", photographs=plan.unusable, needed=MIN_POINTS)
     if plan.design is not None and plan.design.limit:

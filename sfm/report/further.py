@@ -64,6 +64,7 @@ def write_further(found: Further, result: StoredResult, out: Path) -> Path:
         headline=headline(found, result),
         remarks=["What hides a point from a new station is not known: look before you photograph."],
         found=found,
+        size=float(np.abs([s.position for s in found.shots]).max(initial=0.0)),
         unit=result.unit or "object units",
         weakest=weakest(found, result),
     )

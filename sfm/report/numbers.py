@@ -5,6 +5,8 @@ Every report writes its numbers with these; the templates know them as filters o
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sfm.conventions import METRES, FloatArray
@@ -25,8 +27,8 @@ def probability(value: float) -> str:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Write a number with so many decimals."""
-    return f"{value:.{decimals}f}"
+    """Write a number with so many decimals, and no sign before zero."""
+    return f"{float(value):z.{decimals}f}"
 
 
 def plus(value: float, decimals: int) -> str:
@@ -42,6 +44,16 @@ def scientific(value: float, decimals: int) -> str:
 def general(value: float, digits: int) -> str:
     """Write a number with at most so many digits, with an exponent where that is shorter."""
     return f"{value:.{digits}g}"
+
+
+def placed(value: float, size: float) -> str:
+    """Write a coordinate with the decimals that leave six digits of the largest one.
+
+    Args:
+        value: a coordinate, in any unit.
+        size: the largest of all that are written beside it, in that unit.
+    """
+    return fixed(value, max(0, 5 - math.floor(math.log10(size)))) if size > 0 else general(value, 6)
 
 
 def signed(value: float) -> str:
@@ -140,6 +152,7 @@ FILTERS = {
         plus,
         scientific,
         general,
+        placed,
         significant,
         signed,
         or_unlimited,

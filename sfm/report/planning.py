@@ -17,7 +17,7 @@ from sfm.planning.plan import Plan
 from sfm.planning.target_size import MIN_PIXELS
 from sfm.planning.wanted import ALPHA, found_displacement
 from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, or_unlimited, significant
+from sfm.report.numbers import finer_unit, or_unlimited, raised, significant
 from sfm.report.page_files import write_files
 from sfm.report.phrases import NORMAL_95
 from sfm.report.viewer.embedded import viewer_of
@@ -163,6 +163,7 @@ def plan_page(plan: Plan) -> str:
         fine=fine,
         factor=factor,
         camera_rows=_camera_rows(plan),
+        size=float(np.abs([*plan.prediction.planned.xyz, *(s.position for s in plan.shots)]).max()),
         named=NAMED,
     )
 
@@ -253,7 +254,7 @@ def _camera_rows(plan: Plan) -> list[tuple[str, ...]]:
             if one.parameter.startswith(f"{name} ")
         ]
         shown = significant(sigma) if np.isfinite(sigma) else "not determined"
-        rows.append((name, shown, units[name], "; ".join((*others, *outer))))
+        rows.append((name, shown, raised(units[name]), "; ".join((*others, *outer))))
     return rows
 
 

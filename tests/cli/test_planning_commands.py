@@ -84,6 +84,10 @@ def test_what_is_not_determined_comes_first_and_without_precision(
     found = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "bad" and found["remarks"][0]["kind"] == "plan_undetermined"
     assert "sigma of points, what is not determined left out: " in printed
+    kinds_found = {one["kind"] for one in found["remarks"]}
+    assert "plan_does_not_calibrate" not in kinds_found  # nothing is calibrated by what is not determined
+    unknown = found["remarks"][0]
+    assert len(unknown["subjects"]["unknown"]) == 1 and unknown["numbers"]["more"]["value"] >= 1
 
 
 def kinds(out: Path) -> set[str]:

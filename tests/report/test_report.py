@@ -37,7 +37,7 @@ from sfm.report.findings.geometry import geometry_of
 from sfm.report.findings.other_adjuster import comparison_of
 from sfm.report.html.page import environment
 from sfm.report.html.report_page import report_page
-from sfm.report.numbers import finer_unit, probability, significant, to_precision, with_exponent
+from sfm.report.numbers import finer_unit, placed, probability, significant, to_precision, with_exponent
 from sfm.report.output import WRITTEN, write_result
 from sfm.report.phrases import words_left_out
 from sfm.report.tables.csv_files import write_tables
@@ -111,6 +111,19 @@ def test_small_probabilities_are_written_as_such() -> None:
     assert [probability(p) for p in (0.0, 0.00099, 0.0012, 0.25)] == [
         *("p < 0.001", "p < 0.001", "p = 0.001", "p = 0.250")
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "size", "written"),
+    [
+        (6.56e-14, 1252.71, "0.00"),
+        (-2e-13, 1252.71, "0.00"),
+        (1252.714, 1252.714, "1252.71"),
+        (3.0, 4e7, "3"),
+    ],
+)
+def test_coordinates_have_the_decimals_of_the_largest(value: float, size: float, written: str) -> None:
+    assert placed(value, size) == written
 
 
 def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ ROWS = (
     Kind(
         "plan_undetermined",
         "error",
-        "The photographs do not determine the network: {unknown}.",
+        "The photographs do not determine the network: {unknown}[[; and {more} more]].",
         "too few photographs, or all from one direction",
         "Add stations from other directions and distances, rolled about the axis.",
+        explains=("plan_does_not_calibrate",),
     ),
     Kind(
         "plan_points_undetermined",
