@@ -510,6 +510,9 @@ def test_narrow_screens_need_no_sideways_scrolling(browser: Any, page_file: Path
     for chosen in (["point", 5], ["photograph", 1]):
         page.evaluate(SELECT, chosen)
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    rows = page.locator(".v-rows:visible").first
+    edges = "(one) => [one.scrollWidth > one.clientWidth, getComputedStyle(one).backgroundAttachment]"
+    assert rows.evaluate(edges) == [True, "local, local, scroll, scroll"]  # shaded where columns are hidden
     assert tab.complaints == []
     tab.close()
 
