@@ -97,9 +97,10 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     others = _others(a, pa), _others(b, pb)
     pa, pb = pairs.T
     if len(pa) < 4:
+        of_these = f" that are not fixed and have a covariance, here {len(pa)}" if untested else ""
         raise GeometryError(
-            f"{first.name} and {second.name} have {counted(len(pa), 'point')} in common, a "
-            "test needs 4 or more"
+            f"{first.name} and {second.name} have {counted(len(kept), 'point')} in common, a "
+            f"test needs 4 or more{of_these}"
         )
     scale = known_scale(a, b)
     if scale is None and a.has_scale and b.has_scale:

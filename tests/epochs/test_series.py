@@ -85,6 +85,12 @@ def test_refusals_are_one_line() -> None:
     )
     with pytest.raises(GeometryError, match="point of reference 1 cannot be tested in epoch 70 and epoch 71"):
         analyse_epochs([first, replace(second, result=some)], reference=["1"])
+    kept = np.arange(3)
+    some = replace(
+        second.result, covariance=np.asarray(second.result.covariance)[:9, :9], covariance_points=kept
+    )
+    with pytest.raises(GeometryError, match=f"have {POINTS} points in common, .* here 3$"):
+        analyse_epochs([first, replace(second, result=some)])
     with pytest.raises(GeometryError, match=r"group pier: no point .* is called 'P\*'"):
         analyse_epochs([first, second], groups={"pier": ["P*"]})
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
