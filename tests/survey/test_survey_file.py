@@ -328,11 +328,9 @@ def test_start_values_come_from_the_file_then_from_the_photographs(tmp_path: Pat
     assert camera.value("c") == 8.0
     assert camera.free.tolist() == [True] * 5 + [False] * 5  # as far as the photographs determine them
     np.testing.assert_array_equal(camera.pixel_mm, [0.004, 0.004])
-    with pytest.raises(
-        SurveyFileError, match="EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
-    ):
+    with pytest.raises(SurveyFileError, match="state the pixel size; needed pixel_mm or sensor_mm"):
         start_cameras(survey.cameras, survey.source, (metadata((600, 400), 8.0),), index, names)
-    with pytest.raises(SurveyFileError, match="EXIF data tell the focal length, c_mm is needed"):
+    with pytest.raises(SurveyFileError, match="state the focal length; needed c_mm"):
         start_cameras(survey.cameras, survey.source, (metadata((600, 400), None, 0.004),), index, names)
     with pytest.raises(SurveyFileError, match=r"size_px = .* is needed"):
         start_cameras(survey.cameras, survey.source)

@@ -89,7 +89,8 @@ def start_cameras(
             focal = known.get("c") or next((metadata[k].focal_mm for k in own if metadata[k].focal_mm), None)
         if pixel is None:
             raise SurveyFileError(
-                f"{where}: no photograph's EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
+                f"{where}: EXIF data of the photographs do not state the pixel size; "
+                "needed pixel_mm or sensor_mm"
             )
         if max(pixel) > min(MAX_PIXEL_MM, MAX_PIXEL_RATIO * min(pixel)):
             raise SurveyFileError(
@@ -99,7 +100,9 @@ def start_cameras(
         if focal is None:
             focal = next((known[name] * pixel[0] for name in ("fx", "f") if name in known), None)
         if focal is None:
-            raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
+            raise SurveyFileError(
+                f"{where}: EXIF data of the photographs do not state the focal length; needed c_mm"
+            )
         _refuse_implausible_view(where, size, pixel, focal)
         cameras.append(
             camera_from_values(

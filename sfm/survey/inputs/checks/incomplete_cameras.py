@@ -39,7 +39,7 @@ def refuse_incomplete_cameras(
             lines.append(f"camera {one.name}: {' and '.join(missing)}")
     if lines:
         raise SurveyFileError(
-            f"{source}: no photograph's EXIF data tell what is needed of {'; '.join(lines)}"
+            f"{source}: EXIF data of the photographs do not state what is needed of {'; '.join(lines)}"
         )
 
 
