@@ -13,6 +13,7 @@ import pytest
 from adapters.formats.result_tables import write_tables
 from sfm import cli
 from sfm.stored_result import StoredResult
+from tests.places import ROOT
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 
@@ -88,6 +89,14 @@ def test_what_is_not_determined_comes_first_and_without_precision(
     assert "plan_does_not_calibrate" not in kinds_found  # nothing is calibrated by what is not determined
     unknown = found["remarks"][0]
     assert len(unknown["subjects"]["unknown"]) == 1 and unknown["numbers"]["more"]["value"] >= 1
+
+
+def test_the_first_command_of_the_guide_determines_its_network(tmp_path: Path) -> None:
+    guide = (ROOT / "docs/planning.md").read_text(encoding="utf-8")
+    words = next(line for line in guide.splitlines() if line.startswith("kolinear plan network")).split()[3:]
+    assert plan(*words, "--out", tmp_path / "plan") == 0
+    found = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "good"
 
 
 def kinds(out: Path) -> set[str]:
