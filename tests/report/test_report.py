@@ -29,7 +29,7 @@ from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
-from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
+from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, plan_axes
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
@@ -363,6 +363,15 @@ def test_wide_tables_show_that_there_is_more(browser: Any, result: SurveyResult,
         seen = cv2.imdecode(np.frombuffer(table.screenshot(), np.uint8), 0)
         assert (int(np.median(seen[:, -2])) < 200) is shaded
     tab.close()
+
+
+def test_edges_are_explained_only_where_they_are_stated(result: SurveyResult) -> None:
+    overlays = [Overlay(one, f"{one}.jpg", b"", b"") for one in result.adjustment.network.images]
+    first, *others = result.photographs
+    soft = replace(first, blur=np.full(len(first.xy), 0.87))
+    for shown, stated in (((first, *others), 0), ((soft, *others), 1)):
+        page = report_page(findings_of(replace(result, photographs=shown)), (), overlays)
+        assert page.count("edges 0.87 px") == page.count("Edges: ") == stated
 
 
 def test_pictures_are_cut_into_panels_that_show_something(result: SurveyResult) -> None:
