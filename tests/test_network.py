@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.reduced_network import reduce_network
 from tests.synthetic import make_network, seed_of
 
@@ -79,3 +80,21 @@ def test_pairs_of_photographs_that_share_points_are_counted_in_parts(monkeypatch
         assert len(found) >= parts
         joined = [np.concatenate(part).tolist() for part in zip(*found, strict=True)]
         assert list(zip(*joined, strict=True)) == true
+
+
+def test_photographs_that_all_see_the_same_points_are_paired_in_bounded_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """2,000 photographs of 10 points: 2 million pairs, of which 200,000 are counted at a time."""
+    monkeypatch.setattr("sfm.network.MAX_PAIRS", 200_000)
+    m, n = 2_000, 10
+    image, point = np.repeat(np.arange(m), n), np.tile(np.arange(n), m)
+    seen = ImagePoints(image, point, np.zeros((m * n, 2)), np.tile(np.eye(2), (m * n, 1, 1)))
+    names = tuple(str(k) for k in range(m))
+    network = Network(names, np.zeros(m, dtype=np.int64), names[:n], seen)
+    tracemalloc.start()
+    pairs = sum(int((count == n).sum()) for _, _, count in network.common_points(np.ones(m * n, dtype=bool)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert pairs == m * (m - 1) // 2
+    assert peak < 24e6  # 78 MB with all at once
