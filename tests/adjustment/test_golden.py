@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapters.formats.bundle_text import read_bundle_csharp
 from adapters.formats.photomodeler import read_photomodeler
 from adapters.formats.sba_text import read_sba_text
 from sfm.adjustment.datum import Datum
@@ -87,6 +88,19 @@ def test_flyover_as_a_free_network() -> None:
         np.diagonal(a.covariance.points_limiting, axis1=1, axis2=2)
     )
     assert np.median(ratio) > 3  # what was published as the precision of the points is far too good
+
+
+def test_pair8_as_a_free_network() -> None:
+    """Figure 4.1 of document 000; truth by scipy, see datasets/pair8/README.md."""
+    network, start = read_bundle_csharp(ROOT / "datasets/pair8/pair8.txt")
+    a = adjust(network, start, datum=Datum("free"), reject="none")
+    assert (a.converged, a.defect, a.redundancy) == (True, 7, 3)
+    assert a.sigma0**2 * a.redundancy == pytest.approx(0.0016292397, rel=1e-6)
+    assert a.sigma0 == pytest.approx(0.0233040751, rel=1e-6)
+    assert a.rms_px * a.estimate.cameras[0].pixel_mm[0] * 1000 == pytest.approx(0.240769, rel=1e-5)
+    X = a.estimate.points
+    ratio = np.linalg.norm(X[0] - X[6]) / np.linalg.norm(X[3] - X[7])
+    assert ratio == pytest.approx(1.2719356187, rel=1e-7)
 
 
 def test_flyover_corrections_added_to_degrees_do_not_adjust() -> None:
