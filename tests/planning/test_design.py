@@ -1,14 +1,16 @@
 """Planning: the size of targets by the formula of document 000 and as a renderer sees it."""
 
+import re
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.planning.target_size import target_size
+from sfm.planning.target_size import DIAGRAM_PIXELS, design_diagram, target_size
 
 
 def test_formula_of_document_000() -> None:
@@ -71,3 +73,21 @@ def test_command() -> None:
         done.stderr.strip()
         == "kolinear: --unit furlong: expected one of km, m, dm, cm, mm, um, µm, nm, in, ft"
     )
+
+
+def test_the_design_diagram_ends_at_the_diameters_of_the_farthest_distance() -> None:
+    """Document 000, fig. 2.11: 7 px of a Nikon D60 at 18 mm; 23.6 mm x 7 / (18 mm x 3872) = 2.37 mm per m."""
+    given = {"w_mm": 23.6, "d": 10.0, "c_mm": 18.0, "n": 3872}
+    assert 1000 * target_size(p=7, **given).diameter == pytest.approx(23.703, abs=5e-4)
+    root = ElementTree.fromstring(design_diagram(unit="m", **given))
+    path = "{http://www.w3.org/2000/svg}path"
+    ends = {}
+    for pixels in DIAGRAM_PIXELS:
+        (line,) = root.findall(f".//*[@id='{pixels:g} px']/{path}")
+        x0, y0, x1, y1 = map(float, re.findall(r"[\d.]+", line.attrib["d"]))
+        ends[pixels] = x0, y0, x1, y0 - y1
+    assert len({one[:3] for one in ends.values()}) == 1
+    for pixels, end in ends.items():  # lengths in the picture are in proportion to the diameters
+        assert end[3] / ends[7.0][3] == pytest.approx(pixels / 7, rel=1e-4)
+    with pytest.raises(GeometryError):
+        design_diagram(unit="m", w_mm=23.6, d=-1.0, c_mm=18.0, n=3872)

@@ -10,7 +10,7 @@ import typer
 from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.target_size import MIN_PIXELS, target_size
+from sfm.planning.target_size import DIAGRAM_PIXELS, MIN_PIXELS, design_diagram, target_size
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
@@ -51,6 +51,12 @@ def target_size_command(
     unit: Annotated[
         str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, nm, in or ft.")
     ] = "mm",
+    diagram: Annotated[
+        Path | None,
+        typer.Option(
+            "--diagram", metavar="FILE.svg", help="Diameter over the distance as a diagram, up to --distance."
+        ),
+    ] = None,
 ) -> None:
     """Compute how large targets must be for a camera and a distance.
 
@@ -58,9 +64,14 @@ def target_size_command(
     """
     with loading():
         from sfm.conventions import METRES
+        from sfm.files.whole_files import refuse_existing, whole_file
         from sfm.targets.codes.families import code_family
         from sfm.targets.codes.rings import CodeFamily
 
+    if diagram is not None:
+        if diagram.suffix.lower() != ".svg":
+            raise SurveyFileError(f"--diagram {diagram}: expected a file .svg")
+        refuse_existing(diagram)
     if unit not in METRES:
         raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
     if METRES[unit] * distance <= c / 1000:
@@ -77,6 +88,14 @@ def target_size_command(
     print(f"diameter of the dot   {size.diameter:.4g} {unit}, {pixels:g} px across at {tilt:g} deg tilt")
     print(f"ring of the code      {size.ring:.4g} {unit} outer diameter ({codes.name})")
     print(f"a pixel at the object {size.pixel:.4g} {unit}")
+    if diagram is not None:
+        drawn = design_diagram(
+            lines=sorted({*DIAGRAM_PIXELS, pixels}),
+            w_mm=width, d=distance, c_mm=c, n=columns, unit=unit, tilt_deg=tilt,
+        )  # fmt: skip
+        with whole_file(diagram) as part:
+            part.write_bytes(drawn)
+        print(f"diagram               {diagram}")
 
 
 @plan.command("network")
