@@ -6,6 +6,7 @@
 - `lsm`: least squares matching of two photographs, and of many tied together by their orientation.
 - `tracks`: points of many photographs: unnamed targets, and natural texture.
 - `epipolar.epipolar_paths`: the lines, bent by distortion, on which a point may be in another photograph.
+- `normal_images.normal_images`: two photographs resampled so that these lines are their rows.
 - `radiometry`: mean, contrast and histogram of patches, equalisation, brightness of one brought to another.
 - `match_flags`: why matching gives no position.
 """

@@ -1,0 +1,164 @@
+"""Normal images of two oriented photographs: free of distortion, with epipolar lines along their rows.
+
+Both images have one rotation, whose x axis is the base, and one principal distance; conjugate points have
+the same y, and differ in x by the parallax c b / depth. Matching along a row is then matching along an
+epipolar line.
+
+Source: document 002, sec. II.1.2.1 (normalisation); Kraus (2007), Photogrammetry, sec. 4.3 and 6.8.4 (normal
+images); the rotation as Fusiello, Trucco and Verri (2000), Machine Vision and Applications 12, 16-22.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.kernels.sampling import resample
+from sfm.network import Estimate, Network
+
+BORDER_POINTS = 40  # on each side of a photograph, from which the format of its normal image is taken
+MAX_LARGER = 4.0  # area of a normal image over that of its photograph; beyond, the base is along the rays
+
+
+@dataclass(frozen=True)
+class NormalImages:
+    """The normal images of a pair, the photograph whose centre is on the left first."""
+
+    images: tuple[str, str]
+    """names of the photographs"""
+    cameras: tuple[Camera, Camera]
+    """of the normal images: without distortion; principal distance, format and y0 are those of both"""
+    position: FloatArray
+    """projection centres, object unit, (2, 3)"""
+    rotation: FloatArray
+    """R of both, image to object axes, (3, 3)"""
+    source: Estimate
+    """interior and exterior orientation of the two photographs"""
+
+    def normal_xy(self, side: int, xy: FloatArray) -> FloatArray:
+        """Return the places in a normal image of points of its photograph, px, (k, 2); NaN without one.
+
+        Args:
+            side: 0 or 1.
+            xy: points in the photograph, px, (k, 2).
+        """
+        ray = _rays(tangents_from_pixel(self.source.cameras[side], xy))
+        return pixel_from_tangents(
+            self.cameras[side], _tangents(ray @ self.source.rotation[side].T @ self.rotation)
+        )
+
+    def photograph_xy(self, side: int, xy: FloatArray) -> FloatArray:
+        """Return the places in a photograph of points of its normal image, px, (k, 2); NaN without one.
+
+        Args:
+            side: 0 or 1.
+            xy: points in the normal image, px, (k, 2).
+        """
+        ray = _rays(tangents_from_pixel(self.cameras[side], xy))
+        return pixel_from_tangents(
+            self.source.cameras[side], _tangents(ray @ self.rotation.T @ self.source.rotation[side])
+        )
+
+    def resample(self, side: int, photograph: AnyArray) -> FloatArray:
+        """Return the normal image of a photograph, intensities, (H, W); NaN outside the photograph.
+
+        Args:
+            side: 0 or 1.
+            photograph: intensities, (h, w).
+        """
+        width, height = self.cameras[side].size_px
+        y, x = np.mgrid[:height, :width]
+        xy = self.photograph_xy(side, np.stack([x, y], axis=-1).reshape(-1, 2).astype(float))
+        return resample(photograph, xy.reshape(height, width, 2), interpolation="bicubic")
+
+
+def normal_images(network: Network, estimate: Estimate, first: str, second: str) -> NormalImages:
+    """Return the normal images of two oriented photographs, large enough to show both of them whole.
+
+    Args:
+        network: has the photographs.
+        estimate: their orientation.
+        first: name of one photograph.
+        second: name of the other.
+
+    Raises:
+        UnknownNameError: no photograph of that name.
+        GeometryError: a photograph without orientation, no base, or a base along the rays, by which a normal
+            image would have no end.
+    """
+    rows = [network.image_index(name) for name in (first, second)]
+    position, rotation = estimate.position[rows], estimate.rotation[rows]
+    if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
+        raise GeometryError(f"normal images: {first} or {second} is not oriented")
+    base = position[1] - position[0]
+    if not np.linalg.norm(base) > 0:
+        raise GeometryError(f"normal images: {first} and {second} have one projection centre, needed a base")
+    if base @ (rotation[0] + rotation[1])[:, 0] < 0:  # x of the images points the other way
+        rows, position, rotation, base = rows[::-1], position[::-1], rotation[::-1], -base
+    cameras = tuple(estimate.cameras[network.camera[i]] for i in rows)
+    x = base / np.linalg.norm(base)
+    y = np.cross((rotation[0] + rotation[1])[:, 2], x)
+    if not np.linalg.norm(y) > 0:
+        raise GeometryError(f"normal images: the base of {first} and {second} is along their axes")
+    y /= np.linalg.norm(y)
+    R = np.column_stack([x, y, np.cross(x, y)])
+    names = network.images[rows[0]], network.images[rows[1]]
+    source = replace(estimate, cameras=cameras, position=position, rotation=rotation)
+    c_px = float(np.mean([camera.c_px for camera in cameras]))
+    seen = [
+        c_px * _tangents(_rays(tangents_from_pixel(camera, _border(camera))) @ own.T @ R)
+        for camera, own in zip(cameras, rotation, strict=True)
+    ]
+    if not all(np.isfinite(part).all() for part in seen):
+        raise GeometryError(f"normal images: {first} or {second} looks along the base, or behind it")
+    low, high = (np.array([edge(part, axis=0) for part in seen]) for edge in (np.min, np.max))
+    size = np.ceil([(high - low)[:, 0].max(), high[:, 1].max() - low[:, 1].min()]).astype(int) + 1
+    area = max(float(np.prod(camera.size_px)) for camera in cameras)
+    if size[0] * size[1] > MAX_LARGER * area:
+        raise GeometryError(
+            f"normal images: {size[0]} x {size[1]} px for {first} and {second}, at most {MAX_LARGER:g} "
+            "times the photographs are made; the base is too nearly along the rays"
+        )
+    normal = []
+    for k in range(2):
+        x0 = 0.5 - low[k, 0] - size[0] / 2  # the leftmost point of each image is in column 0
+        y0 = size[1] / 2 - 0.5 - high[:, 1].max()  # and the highest point of both in row 0
+        normal.append(
+            camera_from_values(
+                f"{names[k]}, normal",
+                "brown",
+                (int(size[0]), int(size[1])),
+                (1.0, 1.0),
+                c_mm=c_px,
+                values=(("x0", x0), ("y0", y0)),
+            )
+        )
+    return NormalImages(names, (normal[0], normal[1]), position, R, source)
+
+
+def _border(camera: Camera) -> FloatArray:
+    """Return points on the border of a photograph, px, (4 BORDER_POINTS, 2)."""
+    width, height = camera.size_px
+    along, zero = np.linspace(0, 1, BORDER_POINTS), np.zeros(BORDER_POINTS)
+    unit = np.vstack(
+        [
+            np.column_stack(pair)
+            for pair in ((along, zero), (along, zero + 1), (zero, along), (zero + 1, along))
+        ]
+    )
+    return unit * (width - 1, height - 1)
+
+
+def _rays(uv: FloatArray) -> FloatArray:
+    """Return the directions of tangents, image axes, (k, 3)."""
+    return np.column_stack([uv, -np.ones(len(uv))])
+
+
+def _tangents(ray: FloatArray) -> FloatArray:
+    """Return the tangents of directions, image axes, (k, 2); NaN behind the camera."""
+    in_front = ray[:, 2] < 0
+    return np.where(in_front[:, None], -ray[:, :2] / np.where(in_front, ray[:, 2], -1.0)[:, None], np.nan)
