@@ -89,6 +89,8 @@ def normal_images(network: Network, estimate: Estimate, first: str, second: str)
         UnknownNameError: no photograph of that name.
         GeometryError: a photograph without orientation, no base, or a base along the rays, by which a normal
             image would have no end.
+
+    Source: document 002, sec. II.1.2.1; Kraus (2007), sec. 6.8.4.
     """
     rows = [network.image_index(name) for name in (first, second)]
     position, rotation = estimate.position[rows], estimate.rotation[rows]

@@ -10,7 +10,8 @@ import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.planning.target_size import DIAGRAM_PIXELS, design_diagram, target_size
+from sfm.planning.target_size import target_size
+from sfm.report.figures.design_diagram import DIAGRAM_PIXELS, design_diagram
 
 
 def test_formula_of_document_000() -> None:

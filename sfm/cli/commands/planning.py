@@ -10,7 +10,7 @@ import typer
 from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.target_size import DIAGRAM_PIXELS, MIN_PIXELS, design_diagram, target_size
+from sfm.planning.target_size import MIN_PIXELS, target_size
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
@@ -89,6 +89,8 @@ def target_size_command(
     print(f"ring of the code      {size.ring:.4g} {unit} outer diameter ({codes.name})")
     print(f"a pixel at the object {size.pixel:.4g} {unit}")
     if diagram is not None:
+        from sfm.report.figures.design_diagram import DIAGRAM_PIXELS, design_diagram
+
         drawn = design_diagram(
             lines=sorted({*DIAGRAM_PIXELS, pixels}),
             w_mm=width, d=distance, c_mm=c, n=columns, unit=unit, tilt_deg=tilt,
