@@ -6,6 +6,7 @@ A sentence is a text with fields in braces, one for each part of the remark:
     {points:point}          "3 points"             {count:point}         the same of a number
     {points:is|are}         by the count           {count:is|are}        the same of a number
     {change:+}              with its sign          {share:%}             100 times, with %
+    {p:p}                   "p = 0.012"
     {of:@}                  nouns by their keys    {given:@bar}          of others "bar 1 - 2"
 
 What stands in [[ ]] appears only if the remark has all parts in it.
@@ -25,6 +26,7 @@ from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
 # coordinates, and where it is the root mean square of all, nothing of a result is right.
 WRONG_SIGMAS = 5.0
+MIN_PROBABILITY = 1e-3  # smaller ones are written as less than it
 EXPECTED_SIGMAS = 3.0  # below them a shifted result stays within the limits that anybody expects
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
@@ -104,7 +106,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     count = part.value if isinstance(part, Quantity) else len(part)
     if "|" in spec:
         return spec.split("|")[0 if count == 1 else 1]
-    if spec and spec[0].isalpha():
+    if spec and spec[0].isalpha() and spec != "p":
         return f"{count:,.0f} {plural(spec, count)}"
     if not isinstance(part, Quantity):
         return listed(_nouns(part, spec[1:]) if spec else part)
@@ -120,6 +122,8 @@ def _number(one: Quantity, spec: str) -> str:
     """Write a number with three significant digits, or as the format says, and its unit."""
     if not np.isfinite(one.value):
         return "not known"
+    if spec == "p":
+        return probability(one.value)
     if spec == "%":
         return f"{significant(100 * one.value)} %"
     if spec == "+":
@@ -144,3 +148,8 @@ def significant(value: float, digits: int = 3) -> str:
     if -6 <= exponent < 7:
         return f"{value:.{max(0, digits - 1 - exponent)}f}"
     return f"{value:.{digits - 1}e}"
+
+
+def probability(value: float) -> str:
+    """Write a probability with "p" before it and three decimals, smaller ones as such."""
+    return f"p < {MIN_PROBABILITY:g}" if value < MIN_PROBABILITY else f"p = {value:.3f}"

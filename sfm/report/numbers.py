@@ -11,19 +11,15 @@ import numpy as np
 
 from sfm.conventions import METRES, FloatArray
 from sfm.display import counted
+from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
 IMPERIAL = ("in", "ft")
-SMALL = 1e-3  # below it parameters are written with an exponent, and probabilities as less than it
+SMALL = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def probability(value: float) -> str:
-    """Write a probability with "p" before it and three decimals, smaller ones as such."""
-    return f"p < {SMALL:g}" if value < SMALL else f"p = {value:.3f}"
 
 
 def fixed(value: float, decimals: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -277,3 +278,10 @@ def test_another_kind_has_its_short_name_in_a_sentence() -> None:
     assert short and short in one.text and "points_moved" not in one.text
     assert not KINDS["two_places"].short and "two_places" in one.text
     assert one.names("instead") == ("points_moved", "two_places")
+
+
+def test_probabilities_are_written_as_numbers_that_say_something() -> None:
+    row = KINDS["sigma0_high"]
+    for value, text in ((4.92e-31, "p < 0.001"), (0.0124, "p = 0.012"), (0.5, "p = 0.500")):
+        one = Remark("sigma0_high", numbers={"p": Quantity(value)})
+        assert replace(row, sentence="{p:p}").sentence_of(one) == text
