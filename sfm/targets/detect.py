@@ -275,7 +275,7 @@ def _of_crossings(found: Saddles, code: IntArray) -> Targets:
         polarity=np.ones(k, dtype=np.int64),
         contrast=found.contrast,
         background=np.full(k, np.nan),
-        blur=np.full(k, np.nan),
+        blur=found.blur,
         noise=np.full(k, np.nan),
         flag=np.full(k, Flag.CROSSING.value),
         rejected_xy=np.zeros((0, 2)),

@@ -111,7 +111,7 @@ def upright(xy: FloatArray, plate: PlateFamily) -> Targets:
     ways = [np.arange(plate.count), *plate.turns]
     code = max(ways, key=lambda way: float(xy[way.argsort()][plate.columns - 1, 0] - xy[way.argsort()][0, 0]))
     k = len(xy)
-    return _of_crossings(Saddles(xy, np.tile(1e-3 * np.eye(2), (k, 1, 1)), np.ones(k)), code)
+    return _of_crossings(Saddles(xy, np.tile(1e-3 * np.eye(2), (k, 1, 1)), np.ones(k), np.ones(k)), code)
 
 
 def bases(measured: Measurements, start: Orientation, count: int) -> FloatArray:

@@ -73,3 +73,20 @@ def test_windows_see_enough_of_the_edges_and_no_bend_of_them(bent: float, blur: 
     rms = np.sqrt(((found.xy - true) ** 2).mean())
     print(f"bent {bent:.4f} / px, blur {blur:g} px: RMS {rms:.3f} px")
     assert rms < rms_px
+
+
+@pytest.mark.parametrize("between_deg", [90, 65])
+def test_the_blur_of_edges_is_measured(between_deg: float) -> None:
+    """To 15 % from 0.8 px to a fifth of the window, whatever the directions of the two edges."""
+    rng, n, fine = seed_of("blur of crossings"), 60, 8
+    y, x = (np.mgrid[: n * fine, : n * fine] + 0.5) / fine - 0.5
+    for turn in (0.0, 25.0):
+        a, b = np.radians([turn, turn + between_deg])
+        u, v = (-np.sin(t) * (x - 30.3) + np.cos(t) * (y - 29.6) for t in (a, b))
+        for blur in (0.8, 1.2, 2.0):
+            soft = cv2.GaussianBlur(np.where(u * v > 0, 200.0, 40.0), (0, 0), blur * fine)
+            seen = cv2.resize(soft, (n, n), interpolation=cv2.INTER_AREA) + rng.normal(0, 3.0, (n, n))
+            found = measure_saddles(
+                np.rint(seen).astype(np.uint8), np.array([[30.3, 29.6]]), np.array([12.0]), noise=3.0
+            )
+            assert found.blur[0] == pytest.approx(np.hypot(blur, 12**-0.5), rel=0.15), (turn, blur)
