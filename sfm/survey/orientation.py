@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.engine.solvers.choice import refuse_too_large
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars, rows_of
@@ -47,8 +48,9 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         measured: all image points that have a name.
 
     Raises:
-        GeometryError: no two photographs could be oriented.
+        GeometryError: no two photographs could be oriented, or what is connected could not be adjusted.
     """
+    refuse_too_large(measured.network)
     network = replace(measured.network, scale_bars=ScaleBars())  # they are judged by the adjustment first
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None

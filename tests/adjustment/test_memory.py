@@ -7,6 +7,7 @@ import sys
 import tracemalloc
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
@@ -21,8 +22,9 @@ from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ImagePoints, Network
 from tests.adjustment.test_null_space import halves, in_fronts, together
+from tests.synthetic import make_network, seed_of
 from tests.synthetic_blocks import FREE, aerial, run
 
 NEAR = 0.2  # of what is measured; one thread has rows of half of the points at a time, two have all
@@ -107,3 +109,23 @@ def test_what_does_not_fit_is_refused(strips: int, unknowns: str, monkeypatch: p
     monkeypatch.setattr(memory, "available_bytes", lambda: 1e4)
     with pytest.raises(GeometryError, match=f"{unknowns} need .* GB"):
         run(network, truth)
+
+
+def test_what_is_too_large_is_refused_before_its_orientation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """20,000 photographs that all see 10 points; not those of strips, of which fronts are small."""
+    m, n = 20_000, 10
+    image, point = np.repeat(np.arange(m), n), np.tile(np.arange(n), m)
+    seen = ImagePoints(image, point, np.zeros((m * n, 2)), np.tile(np.eye(2), (m * n, 1, 1)))
+    names = tuple(str(k) for k in range(m))
+    network = Network(names, np.zeros(m, dtype=np.int64), names[:n], seen)
+    monkeypatch.setattr(choice, "available_bytes", lambda: 20e9)
+    with pytest.raises(GeometryError, match="120000 unknowns that are all connected need 346 GB"):
+        choice.refuse_too_large(network)
+    strips, _ = aerial("too large", 6, 14, 1700)
+    monkeypatch.setattr(choice, "available_bytes", lambda: 1e6)
+    choice.refuse_too_large(strips)
+    joined, _ = make_network(seed_of("too large"), images=40, points=20)
+    with pytest.raises(GeometryError, match="240 unknowns"):
+        choice.refuse_too_large(joined)
+    monkeypatch.setattr(choice, "available_bytes", lambda: 3 * 8 * 240.0**2)
+    choice.refuse_too_large(joined)

@@ -15,15 +15,16 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.dense import BYTES, DenseSolver
 from sfm.adjustment.engine.solvers.fronts import fronts_of
-from sfm.adjustment.engine.solvers.memory import available_bytes
+from sfm.adjustment.engine.solvers.memory import available_bytes, refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, IntArray
 from sfm.kernels.options import compiled
+from sfm.network import Network
 
 # Operations in a second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
 PRODUCT_RATE = 80e9  # symmetric product of full rows, most of them in single precision
@@ -33,6 +34,7 @@ PAIR_RATE = 25e9  # product of two rays of a point, compiled
 PAIR_OPERATIONS = 216  # of a 6 x 6 x 3 product
 SMALL = 64  # photographs up to which the product of full rows costs so little that nothing else is sought
 SAMPLED = 2  # pairs of rays for each pair of photographs, from which it is told whether most share points
+TRIED_PAIRS = 1000  # of photographs; a share of 0.5 is then known to 0.016
 MOSTLY = 0.5  # share of the pairs of photographs with a common point above which fronts save nothing
 
 
@@ -72,6 +74,28 @@ def choose_solver(layout: Unknowns) -> Solver:
     if summed + fronts.operations / FRONT_RATE > full and fits:
         return dense()
     return MultifrontalSolver(layout, fronts)
+
+
+def refuse_too_large(network: Network) -> None:
+    """Refuse a network that no solver could adjust, before hours go into its orientation.
+
+    Args:
+        network: most of whose photographs share points, by a sample of pairs.
+
+    Raises:
+        GeometryError: it is so, and the unknowns of so many photographs do not fit in memory.
+    """
+    m = len(network.images)
+    size, limit = 3 * BYTES * (6.0 * m) ** 2, available_bytes()  # factor, its inverse, their product
+    if size <= limit:
+        return
+    seen = network.image_points
+    sees = csr_matrix((np.ones(len(seen)), (seen.image, seen.point)), shape=(m, len(network.points)))
+    step = np.arange(TRIED_PAIRS)
+    first = step * m // TRIED_PAIRS
+    second = (first + 1 + step * 7919 % (m - 1)) % m  # from next to it to far off in the sequence
+    if (sees[first].multiply(sees[second]).sum(axis=1) > 0).mean() > MOSTLY:
+        refuse_what_does_not_fit(size, f"{6 * m} unknowns that are all connected", limit=limit)
 
 
 @compiled
