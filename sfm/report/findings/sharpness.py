@@ -21,8 +21,8 @@ def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
         photographs: with their targets.
 
     Returns:
-        Standard deviation of an edge, px, by name; photographs without measured edges, as those of crossings
-        of a board, are left out.
+        Standard deviation of an edge, px, by name; photographs without measured edges are
+        left out.
     """
     found = {}
     for one in photographs:
