@@ -223,7 +223,7 @@ KINDS = (
     Kind("interior sigmas", "standard deviations of interior parameters", _interior_sigmas),
     Kind("joint covariance", "rows of the covariance of all coordinates", _joint),
     Kind("covariances", "covariances of exterior and interior orientation", _full),
-    Kind("statistics", "redundancy and sigma0", _statistics),
+    Kind("statistics", "values of redundancy and sigma0", _statistics),
     Kind("datum", "kind of datum", lambda content: _word(content.result.datum)),
     Kind("unit", "unit of lengths", lambda content: _word(content.result.unit)),
     Kind("point names", "names of points", lambda c: _names(c.result.network.points, c.result.points_named)),
