@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -266,6 +266,13 @@ class Network:
     def rays(self) -> IntArray:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
+
+    def correlated_control(self) -> Iterator[tuple[str, str, float]]:
+        """Yield name, pair of coordinates (XY, XZ, YZ) and covariance of control that is correlated."""
+        for j, C in zip(self.control.point, self.control.covariance, strict=True):
+            for row, column in combinations(range(3), 2):
+                if np.isfinite(C[row, column]) and C[row, column] != 0:
+                    yield self.points[j], "XYZ"[row] + "XYZ"[column], float(C[row, column])
 
     def common_points(self, usable: BoolArray) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
         """Return the pairs of photographs that share points, and how many, among usable image points.

@@ -13,6 +13,7 @@ from sfm.point_table import Point, PointTable
 
 NO_SCALE = "network units"
 """unit of lengths in a network whose scale is undefined"""
+CONTROL_COVARIANCE = "control covariance"  # kind of a row of given.csv
 MEASURED = "measured"
 """what targets.csv says of a target in the place of a reason for its rejection"""
 

@@ -8,6 +8,7 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -19,8 +20,10 @@ from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, read_json
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.stored_result import CONTROL_COVARIANCE
 
 ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates
 HEADER = ("kind", "name", "coordinate", "unit", "given", "difference", "sigma", "r", "w")
 
 
@@ -67,6 +70,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     index = {name: j for j, name in enumerate(network.points)}
     bars: list[tuple[int, int, float, float]] = []
     control: dict[int, tuple[FloatArray, FloatArray]] = {}
+    between: dict[int, FloatArray] = {}  # covariances of XY, XZ, YZ of control
     interior = []
     image = {name: i for i, name in enumerate(network.images)}
     exterior: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -79,6 +83,8 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             xyz, variance = control.setdefault(index[name], (np.zeros(3), np.full(3, np.inf)))
             k = "XYZ".index(coordinate)
             xyz[k], variance[k] = given, sigma**2 if np.isfinite(sigma) else np.inf
+        elif kind == CONTROL_COVARIANCE and name in index and coordinate in PAIRS:
+            between.setdefault(index[name], np.zeros(3))[PAIRS.index(coordinate)] = given
         elif kind == "interior orientation":
             parameter, _, camera = name.partition(" of camera ")
             interior.append((camera, parameter, given, sigma))
@@ -93,7 +99,9 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         ObjectPoints(
             np.array(list(control), dtype=np.int64),
             np.array([xyz for xyz, _ in control.values()]).reshape(-1, 3),
-            np.array([np.diag(variance) for _, variance in control.values()]).reshape(-1, 3, 3),
+            np.array(
+                [_matrix(variance, between.get(j, np.zeros(3))) for j, (_, variance) in control.items()]
+            ).reshape(-1, 3, 3),
         ),
         tuple(interior),
         ExteriorObservations(
@@ -124,6 +132,10 @@ def write_given(path: Path, network: Network, estimate: Estimate) -> None:
     for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
         for axis, value, sigma in zip("XYZ", xyz, np.sqrt(np.diagonal(C)), strict=True):
             add("control point", network.points[j], axis, value, sigma)
+    rows += [
+        (CONTROL_COVARIANCE, name, pair, "", value, np.nan, np.nan, np.nan, np.nan)
+        for name, pair, value in network.correlated_control()
+    ]
     for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
         add("scale bar", f"{network.points[start]} - {network.points[end]}", "length", length, sigma)
     for camera, s, value, sigma in zip(
@@ -139,6 +151,14 @@ def write_given(path: Path, network: Network, estimate: Estimate) -> None:
             add(kind, network.images[i], ORIENTATION[k], value, sigma)
     if rows:
         path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
+
+
+def _matrix(variance: FloatArray, between: FloatArray) -> FloatArray:
+    """Return a covariance matrix from variances and the covariances of XY, XZ and YZ, (3, 3)."""
+    C = np.diag(variance)
+    for (row, column), value in zip(combinations(range(3), 2), between, strict=True):
+        C[row, column] = C[column, row] = value
+    return C
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

@@ -8,6 +8,7 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,11 @@ def read_known_points(
             xyz, variance = found[use].setdefault(index[name], (np.zeros(3), np.full(3, np.inf)))
             k = AXES.index(axis)
             xyz[k], variance[k] = given, sigma**2 if np.isfinite(sigma) else 0.0
-    return _points(found["control"]), _points(found["check"])
+    points = _points(found["control"])
+    covariance = points.covariance.copy()
+    for j, C in zip(control.point, control.covariance, strict=True):  # of what took part
+        covariance[points.point == j] += np.where(np.eye(3, dtype=bool), 0.0, C)
+    return replace(points, covariance=covariance), _points(found["check"])
 
 
 def _points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:

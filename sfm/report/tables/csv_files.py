@@ -22,7 +22,8 @@ from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
-from sfm.stored_result import MEASURED
+from sfm.result import SurveyResult
+from sfm.stored_result import CONTROL_COVARIANCE, MEASURED
 
 USUAL_R0 = 2 / 3  # of the largest image radius
 
@@ -50,7 +51,11 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ("cameras_balanced", "camera,parameter,value,sigma,unit", balanced_rows(findings)),
         ("targets", "image,x_px,y_px,a_px,b_px,angle_deg,reason", target_rows(findings)),
         ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
-        ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
+        (
+            "given",
+            "kind,name,coordinate,unit,given,difference,sigma,r,w",
+            given_rows(findings.given, findings.result),
+        ),
         (
             "reliability",
             "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected,"
@@ -155,12 +160,18 @@ def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
         yield ("point", one.point, one.image_points, one.reason.text)
 
 
-def given_rows(given: Given) -> Iterable[Sequence[object]]:
-    """Return kind, name, coordinate, unit, given value, difference, sigma, r and w of every given value."""
+def given_rows(given: Given, result: SurveyResult) -> Iterable[Sequence[object]]:
+    """Return kind, name, coordinate, unit, given value, difference, sigma, r and w of every given value.
+
+    Of control with correlated coordinates their covariances follow as values.
+    """
     for kind in given.kinds:
         for one in kind.values:
             row = (one.name, one.coordinate, one.unit, one.given, one.difference, one.sigma, one.r, one.w)
             yield (kind.kind, *row)
+    if result.adjustment.datum == "control":
+        for name, pair, value in result.network.correlated_control():
+            yield (CONTROL_COVARIANCE, name, pair, f"{result.unit}^2", value, None, None, None, None)
 
 
 def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:

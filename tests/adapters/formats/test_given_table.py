@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from adapters.formats.given_table import read_given
+from adapters.formats.registry import read_content, write_content
 from sfm.errors import SurveyFileError
 from sfm.network import ImagePoints, Network
+from sfm.pipeline import run_survey
+from sfm.survey.inputs.given import KnownPoints
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
 
 HEADER = "kind,name,coordinate,unit,given,difference,sigma,r,w\n"
 ROWS = (
@@ -52,3 +57,19 @@ def test_a_damaged_table_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "given.csv").write_text(HEADER + ROWS.replace("0.002", "-1"), encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"given.csv, line 2"):
         read_given(tmp_path, network())
+
+
+def test_correlated_control_of_a_run_comes_back(tmp_path: Path) -> None:
+    seen, truth = make_network(seed_of("correlated control"), images=6, points=20, free=("c",))
+    covariances = np.array([[2e-7, 0.0, -1e-7], [0.0, 0.0, 0.0], [3e-7, 1e-7, 0.0], [0.0, 1e-7, 0.0]])
+    known = KnownPoints(seen.points[:4], truth.points[:4], np.full((4, 3), 1e-3), covariances=covariances)
+    survey = survey_of(seen, truth, control=known, datum={"kind": "control"})
+    result = run_survey(survey)
+    result.write(tmp_path / "run")
+    for folder in (tmp_path / "run", tmp_path / "converted"):
+        content = read_content(folder, "tables")
+        control = content.result.network.control
+        expected = result.network.control.covariance
+        np.testing.assert_allclose(control.covariance, expected, rtol=1e-12, atol=0)
+        if folder.name == "run":
+            write_content(tmp_path / "converted", "tables", content)
