@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
-from sfm.adjustment.engine.cofactors import Cofactors, cofactors, marginal_covariance, without_held
+from sfm.adjustment.engine.cofactors import ZERO, Cofactors, cofactors, marginal_covariance, without_held
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
@@ -91,7 +91,12 @@ class Marginal:
             ]
         )
         half = H @ F
-        return np.asarray(self.adjustment.sigma0**2 * (cofactor - half - half.T + H @ Q.G @ H.T))
+        cofactor = cofactor - half - half.T + H @ Q.G @ H.T
+        limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
+        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= ZERO * limiting)  # by the datum
+        cofactor[fixed] = 0.0
+        cofactor[:, fixed] = 0.0
+        return np.asarray(self.adjustment.sigma0**2 * cofactor)
 
 
 def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:

@@ -73,3 +73,14 @@ def test_correlated_control_of_a_run_comes_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(control.covariance, expected, rtol=1e-12, atol=0)
         if folder.name == "run":
             write_content(tmp_path / "converted", "tables", content)
+
+
+def test_a_result_in_a_minimal_datum_is_read_back(tmp_path: Path) -> None:
+    """The seven coordinates that it fixes have no variance, in the covariance of all points neither."""
+    seen, truth = make_network(seed_of("minimal read"), images=6, points=20, free=("c",))
+    result = run_survey(survey_of(seen, truth, datum={"kind": "minimal"}))
+    result.write(tmp_path / "run")
+    joint = read_content(tmp_path / "run", "tables").result.covariance
+    assert joint is not None and int((np.diagonal(joint) == 0).sum()) == 7
+    fixed = np.diagonal(joint) == 0
+    assert not joint[fixed].any() and np.linalg.eigvalsh(joint[~fixed][:, ~fixed]).min() > 0
