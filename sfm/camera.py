@@ -137,6 +137,11 @@ class Camera:
         """Return whose a parameter is, given by its index: of the cameras that share it, or of this one."""
         return self.group_of(parameter) or self.name
 
+    @property
+    def shared_name(self) -> str:
+        """Name of the cameras that share parameters with this one; its own where none does."""
+        return next(filter(None, self.shared), self.name)
+
     def with_parameters(self, parameters: FloatArray) -> Camera:
         """Return the same camera with other parameter values, shape (n,)."""
         return replace(self, parameters=np.array(parameters, dtype=float))
@@ -261,6 +266,18 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
     """
     rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
     return _pixels(camera.index, camera.linear_frame, camera.parameters, rays)
+
+
+def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return directions of rays, object axes, one unit along the axis of the camera, shape (k, 3).
+
+    Args:
+        uv: tangents u = -U/W and v = -V/W, shape (k, 2).
+        rotation: R, image to object axes, shape (3, 3).
+
+    Source: collinearity, Kraus (2007), sec. 4.2.1.
+    """
+    return np.asarray(np.column_stack([uv, -np.ones(len(uv))]) @ rotation.T)
 
 
 def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:

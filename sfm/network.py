@@ -21,7 +21,7 @@ from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
 
 MAX_NAMES = 10  # in a message
-MAX_PAIRS = 4_000_000  # of photographs that are compared at a time
+MAX_PAIRS_AT_ONCE = 4_000_000  # of photographs that are compared
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -267,6 +267,15 @@ class Network:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
+    def incidence(self, usable: BoolArray) -> csr_matrix:
+        """Return 1 where a photograph shows a point, among usable image points (k,), sparse, (m, n)."""
+        seen = self.image_points.select(usable)
+        shape = (len(self.images), len(self.points))
+        sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
+        sees.sum_duplicates()
+        sees.data[:] = 1
+        return sees
+
     def correlated_control(self) -> Iterator[tuple[str, str, float]]:
         """Yield name, pair of coordinates (XY, XZ, YZ) and covariance of control that is correlated."""
         for j, C in zip(self.control.point, self.control.covariance, strict=True):
@@ -287,16 +296,12 @@ class Network:
             Index of the first and of the second photograph, which is larger, and the number of points, (p,);
             in the order of the first and then of the second one.
         """
-        seen = self.image_points.select(usable)
-        shape = (len(self.images), len(self.points))
-        sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
-        sees.sum_duplicates()
-        sees.data[:] = 1
+        sees = self.incidence(usable)
         seen_by = sees.T.tocsr()
         rays = np.diff(seen_by.indptr)
-        most = np.minimum(sees @ rays, shape[0])  # pairs of each photograph, at most
-        part = np.cumsum(most) // MAX_PAIRS
-        for start, end in pairwise([*np.flatnonzero(np.diff(part, prepend=-1)), shape[0]]):
+        most = np.minimum(sees @ rays, len(self.images))  # pairs of each photograph, at most
+        part = np.cumsum(most) // MAX_PAIRS_AT_ONCE
+        for start, end in pairwise([*np.flatnonzero(np.diff(part, prepend=-1)), len(self.images)]):
             common = triu(sees[start:end] @ seen_by, int(start) + 1).tocsr()
             common.sort_indices()
             pairs = common.tocoo()

@@ -75,7 +75,7 @@ def test_pairs_of_photographs_that_share_points_are_counted_in_parts(monkeypatch
     sees = [set(seen.point[usable & (seen.image == i)].tolist()) for i in range(7)]
     true = [(i, j, len(sees[i] & sees[j])) for i in range(7) for j in range(i + 1, 7) if sees[i] & sees[j]]
     for most, parts in ((10**6, 1), (8, 3)):
-        monkeypatch.setattr("sfm.network.MAX_PAIRS", most)
+        monkeypatch.setattr("sfm.network.MAX_PAIRS_AT_ONCE", most)
         found = list(network.common_points(usable))
         assert len(found) >= parts
         joined = [np.concatenate(part).tolist() for part in zip(*found, strict=True)]
@@ -86,7 +86,7 @@ def test_photographs_that_all_see_the_same_points_are_paired_in_bounded_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """2,000 photographs of 10 points: 2 million pairs, of which 200,000 are counted at a time."""
-    monkeypatch.setattr("sfm.network.MAX_PAIRS", 200_000)
+    monkeypatch.setattr("sfm.network.MAX_PAIRS_AT_ONCE", 200_000)
     m, n = 2_000, 10
     image, point = np.repeat(np.arange(m), n), np.tile(np.arange(n), m)
     seen = ImagePoints(image, point, np.zeros((m * n, 2)), np.tile(np.eye(2), (m * n, 1, 1)))

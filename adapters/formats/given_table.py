@@ -8,7 +8,6 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -70,7 +69,6 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     index = {name: j for j, name in enumerate(network.points)}
     bars: list[tuple[int, int, float, float]] = []
     control: dict[int, tuple[FloatArray, FloatArray]] = {}
-    between: dict[int, FloatArray] = {}  # covariances of XY, XZ, YZ of control
     interior = []
     image = {name: i for i, name in enumerate(network.images)}
     exterior: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -80,11 +78,12 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             if ends is not None:
                 bars.append((*ends, given, sigma))
         elif kind == "control point" and name in index and coordinate in ("X", "Y", "Z"):
-            xyz, variance = control.setdefault(index[name], (np.zeros(3), np.full(3, np.inf)))
+            xyz, C = control.setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
             k = "XYZ".index(coordinate)
-            xyz[k], variance[k] = given, sigma**2 if np.isfinite(sigma) else np.inf
-        elif kind == CONTROL_COVARIANCE and name in index and coordinate in PAIRS:
-            between.setdefault(index[name], np.zeros(3))[PAIRS.index(coordinate)] = given
+            xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else np.inf
+        elif kind == CONTROL_COVARIANCE and index.get(name) in control and coordinate in PAIRS:
+            C, (row, column) = control[index[name]][1], map("XYZ".index, coordinate)
+            C[row, column] = C[column, row] = given
         elif kind == "interior orientation":
             parameter, _, camera = name.partition(" of camera ")
             interior.append((camera, parameter, given, sigma))
@@ -99,9 +98,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         ObjectPoints(
             np.array(list(control), dtype=np.int64),
             np.array([xyz for xyz, _ in control.values()]).reshape(-1, 3),
-            np.array(
-                [_matrix(variance, between.get(j, np.zeros(3))) for j, (_, variance) in control.items()]
-            ).reshape(-1, 3, 3),
+            np.array([C for _, C in control.values()]).reshape(-1, 3, 3),
         ),
         tuple(interior),
         ExteriorObservations(
@@ -151,14 +148,6 @@ def write_given(path: Path, network: Network, estimate: Estimate) -> None:
             add(kind, network.images[i], ORIENTATION[k], value, sigma)
     if rows:
         path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
-
-
-def _matrix(variance: FloatArray, between: FloatArray) -> FloatArray:
-    """Return a covariance matrix from variances and the covariances of XY, XZ and YZ, (3, 3)."""
-    C = np.diag(variance)
-    for (row, column), value in zip(combinations(range(3), 2), between, strict=True):
-        C[row, column] = C[column, row] = value
-    return C
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

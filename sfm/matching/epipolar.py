@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.camera import project, tangents_from_pixel
+from sfm.camera import project, ray_directions, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, skew
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
@@ -61,7 +61,7 @@ def epipolar_paths(
     Source: Kraus (2007), sec. 4.3: an epipolar line is the picture of the other photograph's ray.
     """
     uv = tangents_from_pixel(estimate.cameras[camera[left]], xy)
-    direction = np.column_stack([uv, -np.ones(len(uv))]) @ estimate.rotation[left].T
+    direction = ray_directions(uv, estimate.rotation[left])
     # equal steps in 1 / depth are about equal steps in the picture
     depth = 1.0 / np.linspace(1.0 / nearest, 1.0 / farthest, VERTICES)
     paths = []

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.sampling import resample
@@ -46,10 +46,8 @@ class NormalImages:
             side: 0 or 1.
             xy: points in the photograph, px, (k, 2).
         """
-        ray = _rays(tangents_from_pixel(self.source.cameras[side], xy))
-        return pixel_from_tangents(
-            self.cameras[side], _tangents(ray @ self.source.rotation[side].T @ self.rotation)
-        )
+        here = self.source
+        return _seen_by(self.cameras[side], self.rotation, here.cameras[side], here.rotation[side], xy)
 
     def photograph_xy(self, side: int, xy: FloatArray) -> FloatArray:
         """Return the places in a photograph of points of its normal image, px, (k, 2); NaN without one.
@@ -58,10 +56,8 @@ class NormalImages:
             side: 0 or 1.
             xy: points in the normal image, px, (k, 2).
         """
-        ray = _rays(tangents_from_pixel(self.cameras[side], xy))
-        return pixel_from_tangents(
-            self.source.cameras[side], _tangents(ray @ self.rotation.T @ self.source.rotation[side])
-        )
+        here = self.source
+        return _seen_by(here.cameras[side], here.rotation[side], self.cameras[side], self.rotation, xy)
 
     def resample(self, side: int, photograph: AnyArray) -> FloatArray:
         """Return the normal image of a photograph, intensities, (H, W); NaN outside the photograph.
@@ -111,8 +107,9 @@ def normal_images(network: Network, estimate: Estimate, first: str, second: str)
     names = network.images[rows[0]], network.images[rows[1]]
     source = replace(estimate, cameras=cameras, position=position, rotation=rotation)
     c_px = float(np.mean([camera.c_px for camera in cameras]))
+    centred = camera_from_values("centred", "brown", (1, 1), (1.0, 1.0), c_mm=c_px)
     seen = [
-        c_px * _tangents(_rays(tangents_from_pixel(camera, _border(camera))) @ own.T @ R)
+        _seen_by(centred, R, camera, own, _border(camera))
         for camera, own in zip(cameras, rotation, strict=True)
     ]
     if not all(np.isfinite(part).all() for part in seen):
@@ -128,7 +125,7 @@ def normal_images(network: Network, estimate: Estimate, first: str, second: str)
     normal = []
     for k in range(2):
         x0 = 0.5 - low[k, 0] - size[0] / 2  # the leftmost point of each image is in column 0
-        y0 = size[1] / 2 - 0.5 - high[:, 1].max()  # and the highest point of both in row 0
+        y0 = size[1] / 2 - 0.5 + low[:, 1].min()  # and the highest point of both in row 0
         normal.append(
             camera_from_values(
                 f"{names[k]}, normal",
@@ -155,12 +152,9 @@ def _border(camera: Camera) -> FloatArray:
     return unit * (width - 1, height - 1)
 
 
-def _rays(uv: FloatArray) -> FloatArray:
-    """Return the directions of tangents, image axes, (k, 3)."""
-    return np.column_stack([uv, -np.ones(len(uv))])
-
-
-def _tangents(ray: FloatArray) -> FloatArray:
-    """Return the tangents of directions, image axes, (k, 2); NaN behind the camera."""
-    in_front = ray[:, 2] < 0
-    return np.where(in_front[:, None], -ray[:, :2] / np.where(in_front, ray[:, 2], -1.0)[:, None], np.nan)
+def _seen_by(
+    camera: Camera, rotation: FloatArray, source: Camera, source_rotation: FloatArray, xy: FloatArray
+) -> FloatArray:
+    """Return where a camera sees the rays of another one from the same place, px, (k, 2); NaN behind it."""
+    ray = ray_directions(tangents_from_pixel(source, xy), source_rotation)
+    return project(camera, np.zeros(3), rotation, ray)

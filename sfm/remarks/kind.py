@@ -6,7 +6,7 @@ A sentence is a text with fields in braces, one for each part of the remark:
     {points:point}          "3 points"             {count:point}         the same of a number
     {points:is|are}         by the count           {count:is|are}        the same of a number
     {change:+}              with its sign          {share:%}             100 times, with %
-    {p:p}                   "p = 0.012"
+    {p:<}                   "p = 0.012", "p < 0.001"
     {of:@}                  nouns by their keys    {given:@bar}          of others "bar 1 - 2"
 
 What stands in [[ ]] appears only if the remark has all parts in it.
@@ -106,7 +106,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     count = part.value if isinstance(part, Quantity) else len(part)
     if "|" in spec:
         return spec.split("|")[0 if count == 1 else 1]
-    if spec and spec[0].isalpha() and spec != "p":
+    if spec and spec[0].isalpha():
         return f"{count:,.0f} {plural(spec, count)}"
     if not isinstance(part, Quantity):
         return listed(_nouns(part, spec[1:]) if spec else part)
@@ -122,7 +122,7 @@ def _number(one: Quantity, spec: str) -> str:
     """Write a number with three significant digits, or as the format says, and its unit."""
     if not np.isfinite(one.value):
         return "not known"
-    if spec == "p":
+    if spec == "<":
         return probability(one.value)
     if spec == "%":
         return f"{significant(100 * one.value)} %"

@@ -111,7 +111,7 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
 def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
     """Return two diagonals of what was seen of each plate but the first, which is control, as scale bars."""
     bars = []
-    for settings, plate in zip(survey.plates, plates_of(survey.family)[1:], strict=False):
+    for settings, plate in zip(survey.plates, plates_of(survey.family)[1:], strict=True):
         seen = naming.code[(naming.code >= plate.first_point) & (naming.code <= plate.last_point)]
         if len(seen) < MIN_RAYS or settings.pitch is None:
             continue

@@ -25,8 +25,10 @@ from sfm.adjustment.hypotheses.families import (
     OF_PHOTOGRAPHS,
     SHIFTED,
     Alternative,
+    CameraFamily,
     Family,
     InteriorFamily,
+    ObjectFamily,
     format_columns,
 )
 from sfm.adjustment.hypotheses.score import (
@@ -206,11 +208,9 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     m = int(run.max()) + 1
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
     yield from _each(reduced, H, g, squares, run)
-    every = np.ones(photographs, dtype=bool)
-    of_cameras = [camera == k for k in range(int(camera.max()) + 1)]
     for family in OF_PHOTOGRAPHS:
         some = np.array(family.places)
-        for among in of_cameras if family.of_camera else [every]:
+        for among in photographs_among(family, camera):
             runs = np.unique(run[among])
             part = _Part(
                 H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)]
@@ -239,9 +239,21 @@ def cameras_of_photographs(a: Adjustment) -> IntArray:
 
     More than MAX_RUNS cameras count as one.
     """
-    names = [next(filter(None, camera.shared), camera.name) for camera in a.estimate.cameras]
+    names = [camera.shared_name for camera in a.estimate.cameras]
     _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
     return np.where(number.max() < MAX_RUNS, number, 0)
+
+
+def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> list[BoolArray]:
+    """Return the photographs among which some may differ, (m,) each: of each camera, or all of the object.
+
+    Args:
+        family: what differs.
+        camera: `cameras_of_photographs`, (m,).
+    """
+    if not family.of_camera:
+        return [np.ones(len(camera), dtype=bool)]
+    return [camera == k for k in range(int(camera.max()) + 1)]
 
 
 def _runs(camera: IntArray) -> IntArray:

@@ -156,7 +156,7 @@ class CameraFamily(OfPhotographs):
         }
         if one.among is not None and not one.among.all():
             camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
-            parts["camera"] = next(filter(None, camera.shared), camera.name)
+            parts["camera"] = camera.shared_name
         if len(beta) > 2 and not linear:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
         return parts

@@ -21,6 +21,7 @@ from sfm.adjustment.hypotheses.alternatives import (
     cameras_of_photographs,
     interior_parameters,
     needed_gain,
+    photographs_among,
 )
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import (
@@ -84,10 +85,9 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
                 *(HELD, "all", np.ones(reduced.photographs), nothing, NONE, 0.0, 0.0, 0.0, 0.0),
                 parameters=some,
             )
-    camera, every = cameras_of_photographs(a), np.ones(reduced.photographs, dtype=bool)
-    of_cameras = [camera == k for k in range(int(camera.max()) + 1)]
+    camera = cameras_of_photographs(a)
     for family in (*CAMERA_FAMILIES, STRAIN):
-        for among in of_cameras if family.of_camera else [every]:
+        for among in photographs_among(family, camera):
             m = int(among.sum())
             if m < 2 * MIN_GROUP:
                 continue

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.camera import Camera, pixel_from_tangents, ray_directions, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, rows_of
 
@@ -51,7 +51,7 @@ def plane_warps(
 
     def seen(offset: tuple[float, float]) -> FloatArray:
         uv = tangents_from_pixel(lens, xy + np.array(offset))
-        d = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
+        d = ray_directions(uv, R)
         on_plane = X0 + d * (height / np.einsum("kc,kc->k", normal, d))[:, None]
         return pictures_of(estimate, camera, other, on_plane)
 

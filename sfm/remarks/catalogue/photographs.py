@@ -32,7 +32,7 @@ ROWS = (
     Kind(
         "photographs_uneven",
         "warning",
-        "The photographs differ in precision (Bartlett's test, {p:p}): sigma0 of {photograph} is {ratio} "
+        "The photographs differ in precision (Bartlett's test, {p:<}): sigma0 of {photograph} is {ratio} "
         "times the median.",
         "a photograph that is not sharp or of a camera that moved, or wrong names in it",
         "Look at this photograph; leave it out if you do not trust it.",

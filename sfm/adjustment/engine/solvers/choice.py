@@ -89,8 +89,7 @@ def refuse_too_large(network: Network) -> None:
     size, limit = 3 * BYTES * (6.0 * m) ** 2, available_bytes()  # factor, its inverse, their product
     if size <= limit:
         return
-    seen = network.image_points
-    sees = csr_matrix((np.ones(len(seen)), (seen.image, seen.point)), shape=(m, len(network.points)))
+    sees = network.incidence(np.ones(len(network.image_points), dtype=bool))
     step = np.arange(TRIED_PAIRS)
     first = step * m // TRIED_PAIRS
     second = (first + 1 + step * 7919 % (m - 1)) % m  # from next to it to far off in the sequence
