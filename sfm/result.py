@@ -74,6 +74,7 @@ class PhotographTargets:
     flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.flags.Flag, (k,)
     stored: bool = False  # whether the targets were measured in an earlier run
     blur: FloatArray | None = None  # standard deviation of their edges, px; NaN where there is none, (k,)
+    camera: str = ""  # its name, with photographs of one size
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""

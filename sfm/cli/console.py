@@ -70,26 +70,34 @@ def tell_verdict(verdict: Verdict) -> None:
 
 
 def tell_remarks(console: Console, lines: Iterable[Line]) -> None:
-    """Print remarks: errors and warnings behind `!` and with their remedies, then notes."""
+    """Print remarks: errors and warnings behind `!`, then notes; remedies but of notes on nothing lost."""
     for line in lines:
         is_note = line.severity == "note"
-        text = f"  {line.text}" if is_note else f"! {line.text} {line.remedy}".rstrip()
+        remedy = "" if is_note and not line.lost else line.remedy
+        text = f"{' ' if is_note else '!'} {line.text} {remedy}".rstrip()
         console.print(Text(text, style=STYLES[line.severity]), soft_wrap=True)
 
 
 def _failures(findings: Findings) -> list[str]:
-    """Return why photographs are not in the result: once for those alike, and not what a remark explains."""
+    """Return why photographs are not in the result and what helps: once for those alike.
+
+    What a remark explains is left out.
+    """
     said = {
         (image, kind)
         for one in findings.verdict.remarks
         for image in one.names("photographs")
         for kind in one.row.explains
     }
-    images: dict[str, list[str]] = {}
+    images: dict[tuple[str, str], list[str]] = {}
     for failed in findings.result.failed:
         if (failed.image, failed.reason.kind) not in said:
-            images.setdefault(failed.reason.text, []).append(failed.image)
-    return [f"{listed(ones)}{', each' if len(ones) > 1 else ''}: {text}" for text, ones in images.items()]
+            one = failed.reason
+            images.setdefault((one.text, one.row.remedy), []).append(failed.image)
+    return [
+        f"{listed(ones)}{', each' if len(ones) > 1 else ''}: {text} {remedy}"
+        for (text, remedy), ones in images.items()
+    ]
 
 
 def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:

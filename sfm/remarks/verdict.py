@@ -23,6 +23,7 @@ class Line:
     severity: Severity
     text: str
     remedy: str = ""  # with the first of a kind
+    lost: bool = False  # whether a photograph or a point is lost that the remedy brings back
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
     lines = []
     for (severity, _), same in groups.items():
         lines += [
-            Line(severity, one.text, "" if k else one.row.remedy) for k, one in enumerate(same[:MAX_LISTED])
+            Line(severity, one.text, "" if k else one.row.remedy, bool(one.row.explains))
+            for k, one in enumerate(same[:MAX_LISTED])
         ]
         if len(same) > MAX_LISTED:
             lines.append(Line(severity, f"{len(same) - MAX_LISTED} more like these."))

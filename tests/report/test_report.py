@@ -694,11 +694,13 @@ def test_the_terminal_says_once_why_photographs_are_lost(
     lost = (FailedImage("lost 1", few), FailedImage("lost 2", few), FailedImage("lost 3", apart))
     for explained in ((), ("lost 2", "lost 3")):
         group = remark("not_connected", photographs=explained, oriented=8, needed=4)
-        board = remark("board_not_found", photographs=explained, size="7 x 9")
+        board = remark("checkerboard_not_found", photographs=explained, size="7 x 9")
         said = replace(result, failed=lost, remarks=(group, board) if explained else ())
         tell_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
         told = [line.strip() for line in capsys.readouterr().out.splitlines()]
-        reasons = [line for line in told if line.startswith("lost") and line.endswith((few.text, apart.text))]
+        ends = tuple(f"{one.text} {one.row.remedy}" for one in (few, apart))
+        reasons = [line for line in told if line.startswith("lost") and line.endswith(ends)]
+        assert any(line.endswith(board.row.remedy) for line in told) == bool(explained)
         assert [line.split(":")[0] for line in reasons] == (
             ["lost 1"] if explained else ["lost 1, lost 2, each", "lost 3"]
         )

@@ -17,11 +17,19 @@ from sfm.result import FailedImage, PhotographTargets, SurveyResult
 from tests.synthetic import make_network, seed_of
 
 
-def photograph(name: str, blur: FloatArray | None) -> PhotographTargets:
+def photograph(name: str, blur: FloatArray | None, camera: str = "A") -> PhotographTargets:
     k = 0 if blur is None else len(blur)
     none = np.zeros(0, dtype=np.int64)
     return PhotographTargets(
-        name, Path(name), np.zeros((k, 2)), np.ones((k, 2)), np.zeros(k), np.zeros((0, 2)), none, blur=blur
+        name,
+        Path(name),
+        np.zeros((k, 2)),
+        np.ones((k, 2)),
+        np.zeros(k),
+        np.zeros((0, 2)),
+        none,
+        blur=blur,
+        camera=camera,
     )
 
 
@@ -66,3 +74,23 @@ def test_blurred_photographs_are_named_where_that_explains_something() -> None:
     few = replace(result, failed=(), adjustment=hidden)
     (said,) = sharpness_remarks(few, edges | {"image 1": 1.9}, Consistency((), None))
     assert said.names("photographs") == ("image 1",)
+
+
+def test_photographs_are_compared_with_those_of_their_camera() -> None:
+    """Edges of a camera of larger pixels or a longer lens are softer in px, and none of its is blurred."""
+    network, truth = make_network(seed_of("sharpness"), images=6, points=12)
+    rng = seed_of("two cameras")
+    edges = {f"A {k}": 0.8 for k in range(12)} | {f"B {k}": 1.6 for k in range(5)}
+    few = remark("photograph_with_few_points", seen=1, needed=4)
+    lost = tuple(FailedImage(name, few) for name in ("B 0", "B 1"))
+    solved = adjust(network, truth)
+    for blur, named in ((1.6, ()), (4.0, ("B 0",))):
+        edges["B 0"] = blur
+        shown = tuple(
+            photograph(name, one * np.exp(rng.normal(0, 0.03, 12)), name[0]) for name, one in edges.items()
+        )
+        result = SurveyResult("both", "m", 17, lost, solved, np.full(12, -1), None, photographs=shown)
+        said = sharpness_remarks(result, edges_of(shown), Consistency((), None))
+        assert tuple(name for one in said for name in one.names("photographs")) == named
+    assert said[0].names("camera") == ("B",)
+    assert said[0].number("others") == pytest.approx(1.6, rel=0.05)

@@ -12,12 +12,17 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values
 from sfm.network import ObjectPoints
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.survey_remarks import ray_remarks
 from sfm.survey.adjusting.datum_definition import datum_remarks
+from sfm.survey.diagnosis.missing_plates import missing_plates
+from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.plate import plate_control
 from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.targets.codes.plates import BOARDS, TAGGED, PlateFamily
+from sfm.targets.detect import find_targets
 from tests.plates import SURVEY
 from tests.surveys import survey_of
 from tests.synthetic import make_network, perturb, seed_of
@@ -93,3 +98,18 @@ def test_shifts_are_those_of_the_network_without_fixed_control() -> None:
     for sigma, without in ((0.0, ("control",)), (1e-4, ())):
         causes = judge_alternatives(adjusted(8, sigma=sigma, other=1.01)).causes
         assert causes and all(one.names("without") == without for one in causes)
+
+
+@pytest.mark.parametrize("codes", [*BOARDS, "grid"])
+def test_a_board_that_is_not_found_is_sought_by_the_keys_that_it_has(codes: str) -> None:
+    """The remedy names no key that a survey file of this board refuses."""
+    nothing = find_targets(np.full((40, 50), 128, np.uint8), polarity="dark")
+    camera = camera_from_values("A", "brown", (50, 40), (0.01, 0.01), c_mm=1.0)
+    lost = MeasuredPhotographs(("a",), (Path("a"),), np.zeros(1, dtype=np.int64), (camera,), (nothing,), ())
+    board = PlateFamily(codes, 6, 8, (), "aruco4x4_50" if codes in TAGGED else "", 0.5)
+    (one,) = missing_plates(board, lost)
+    assert one.names("photographs") == ("a",) and one.names("size") == ("6 x 8",)
+    words = {word.strip(".,") for word in one.row.remedy.split()}
+    assert {"rows", "columns"} <= words or codes == "grid"
+    assert ({"dictionary", "tag_size", "first_tag"} <= words) == (codes in TAGGED)
+    assert codes in TAGGED or not {"dictionary", "tag_size", "first_tag"} & words

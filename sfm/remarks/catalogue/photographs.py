@@ -41,7 +41,7 @@ ROWS = (
         "photographs_blurred",
         "note",
         "{photographs} {photographs:is|are} blurred: edges of targets are {blur} soft (standard deviation), "
-        "those of the other photographs {others}.",
+        "those of the other photographs[[ of camera {camera}]] {others}.",
         "out of focus, or the camera or the object moved during the exposure",
         "Take the photograph again, or leave it out.",
     ),
@@ -75,6 +75,7 @@ ROWS = (
         "In {photographs:photograph} {dots:dot} do not fit the plate of {size}: {photographs}.",
         "rows, columns or marks are not those of the plate; its marks are hidden; a part of it without marks",
         "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
+        explains=("photograph_with_few_points",),
     ),
     Kind(
         "plate_looks_alike_turned",
@@ -87,11 +88,28 @@ ROWS = (
         "of the other, or take a plate with marks.",
     ),
     Kind(
-        "board_not_found",
+        "checkerboard_not_found",
         "note",
-        "The board of {size} crossings was not found in {photographs:photograph}: {photographs}.",
-        "a checkerboard must be seen whole with a white rim; rows and columns count crossings, not squares",
-        "Show all of it with its rim; check rows, columns, tag_size and dictionary.",
+        "The checkerboard of {size} crossings was not found in {photographs:photograph}: {photographs}.",
+        "two opposite sides of it are cut off, or it has no white rim; rows and columns count "
+        "crossings, not squares",
+        "Show all of it with its rim; check rows and columns.",
+        explains=("photograph_with_few_points",),
+    ),
+    Kind(
+        "charuco_not_found",
+        "note",
+        "The ChArUco board of {size} crossings was not found in {photographs:photograph}: {photographs}.",
+        "its tags are too small, blurred or hidden; rows and columns count crossings, not squares",
+        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
+        explains=("photograph_with_few_points",),
+    ),
+    Kind(
+        "aprilgrid_not_found",
+        "note",
+        "The AprilGrid of {size} corners was not found in {photographs:photograph}: {photographs}.",
+        "its tags are too small, blurred or hidden; rows and columns count two corners for each tag",
+        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
         explains=("photograph_with_few_points",),
     ),
     Kind(

@@ -8,8 +8,14 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.targets.codes.dot_plates import MIN_DOTS
 from sfm.targets.codes.families import TargetFamily
-from sfm.targets.codes.plates import BOARDS, plates_of
+from sfm.targets.codes.plates import plates_of
 from sfm.targets.flags import Flag
+
+NOT_FOUND = {  # kinds of remarks by the codes of a board; that on dots of any grid is another
+    "checkerboard": "checkerboard_not_found",
+    "charuco": "charuco_not_found",
+    "aprilgrid": "aprilgrid_not_found",
+}
 
 
 def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs) -> tuple[Remark, ...]:
@@ -35,8 +41,8 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         strange = [name for name in dots if dots[name] >= MIN_DOTS]
         missing = [name for name in dots if dots[name] < MIN_DOTS]
         size = f"{plate.rows} x {plate.columns}"
-        kind = "board_not_found" if plate.name in BOARDS else "plate_not_found"
         if missing:
+            kind = NOT_FOUND.get(plate.name, "plate_not_found")
             remarks.append(remark(kind, photographs=missing, size=size))
         if strange:
             many = round(statistics.median(dots[name] for name in strange))

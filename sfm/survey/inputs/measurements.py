@@ -43,9 +43,15 @@ class MeasuredPhotographs:
                 found.flag,
                 stored,
                 found.blur,
+                self.cameras[camera].name,
             )
-            for name, path, found, stored in zip(
-                self.names, self.paths, self.targets, self.stored or (False,) * len(self.names), strict=True
+            for name, path, found, stored, camera in zip(
+                self.names,
+                self.paths,
+                self.targets,
+                self.stored or (False,) * len(self.names),
+                self.camera,
+                strict=True,
             )
         )
 
