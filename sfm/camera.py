@@ -55,7 +55,9 @@ class Camera:
                 f"{self.model} has {n}"
             )
         if len(self.shared) not in (0, n):
-            raise SurveyFileError(f"camera {self.name}: {len(self.shared)} groups of {n} parameters")
+            raise SurveyFileError(
+                f"camera {self.name}: {counted(len(self.shared), 'group')} of {n} parameters"
+            )
         if len(self.free) == 0:
             object.__setattr__(self, "free", np.zeros(n, dtype=bool))
 

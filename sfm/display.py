@@ -59,6 +59,20 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {plural(noun, count)}"
 
 
+def agreeing(count: float, forms: str) -> str:
+    """Return the form of a verb or pronoun that agrees with how many there are.
+
+    Args:
+        count: of them.
+        forms: that of one and that of several, as "is|are".
+
+    Examples:
+        >>> agreeing(1, "has|have"), agreeing(2, "its|their")
+        ('has', 'their')
+    """
+    return forms.split("|")[0 if count == 1 else 1]
+
+
 def listed(texts: Iterable[str], *, most: int = MAX_LISTED, separator: str = ", ") -> str:
     """Return texts one after the other, the first few of many, and how many more there are.
 

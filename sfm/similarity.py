@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray, skew
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate
 
@@ -84,7 +85,7 @@ def fit_similarity(
         raise GeometryError("similarity: NaN or infinity among the coordinates, expected finite numbers")
     n = len(source)
     if n < 3:
-        raise GeometryError(f"similarity: {n} common points, at least 3 are needed")
+        raise GeometryError(f"similarity: {counted(n, 'common point')}, at least 3 are needed")
     w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
     w = w / w.sum()
     centre_s, centre_t = w @ source, w @ target

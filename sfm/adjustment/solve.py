@@ -46,6 +46,7 @@ from sfm.adjustment.quality.reliability import (
 )
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
@@ -196,7 +197,7 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
             f"{k} image points"
         )
     if given.all():
-        raise GeometryError(f"rejected: all {k} image points, expected some that are not")
+        raise GeometryError(f"rejected: all {counted(k, 'image point')}, expected some that are not")
     return given
 
 

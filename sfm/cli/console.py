@@ -93,7 +93,7 @@ def _failures(findings: Findings) -> list[str]:
     for failed in findings.result.failed:
         if (failed.image, failed.reason.kind) not in said:
             one = failed.reason
-            images.setdefault((one.text, one.row.remedy), []).append(failed.image)
+            images.setdefault((one.text, one.remedy), []).append(failed.image)
     return [
         f"{listed(ones)}{', each' if len(ones) > 1 else ''}: {text} {remedy}"
         for (text, remedy), ones in images.items()
@@ -175,8 +175,8 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     rows = [
         ("observations", f"{counts.total}: {counted(counts.image, 'image coordinate')}, "
         f"{counts.control} of control, "
-         f"{counted(counts.scale_bars, 'scale bar')}; {counts.constraints} constraints, "
-         f"{a.unknowns} unknowns"),
+         f"{counted(counts.scale_bars, 'scale bar')}; {counted(counts.constraints, 'constraint')}, "
+         f"{counted(a.unknowns, 'unknown')}"),
         *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity

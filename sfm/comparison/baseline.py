@@ -14,6 +14,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.image_rays import image_tangents
@@ -125,7 +126,7 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
     both = np.isfinite(points).all(axis=1) & adjustment.estimate.determined
     if both.sum() < 3:
         raise GeometryError(
-            f"baseline {baseline.name}: its photographs determine {both.sum()} targets of the "
+            f"baseline {baseline.name}: its photographs determine {counted(both.sum(), 'target')} of the "
             "survey, 3 are needed"
         )
     transform = fit_similarity(points[both], adjustment.estimate.points[both])

@@ -33,6 +33,7 @@ from sfm.comparison.stable_points import (
     tests_in_datum,
 )
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.similarity import extended_axes, mean_distance, similarity_motions
 
@@ -106,7 +107,9 @@ def congruency(
     reference = np.ones(n, dtype=bool) if reference is None else reference
     first = int(reference.sum())
     if first < MIN_STABLE:
-        raise GeometryError(f"congruency: {first} points of reference, expected {MIN_STABLE} or more")
+        raise GeometryError(
+            f"congruency: {counted(first, 'point')} of reference, expected {MIN_STABLE} or more"
+        )
     G = motions(xyz)[:, : MOTIONS[motion]]
     sizes = np.linalg.svd(G[np.repeat(reference, 3)], compute_uv=False)
     if (sizes < RANK * np.linalg.svd(G, compute_uv=False).max(initial=0.0)).any():

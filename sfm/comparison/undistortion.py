@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
 from sfm.comparison.camera_conversion import corresponding_free
+from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
@@ -44,7 +45,8 @@ def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> 
         if lost.any():
             row = rows[np.argmax(lost)]
             raise GeometryError(
-                f"camera {camera.name}: its distortion cannot be inverted at {int(lost.sum())} image points, "
+                f"camera {camera.name}: its distortion cannot be inverted at "
+                f"{counted(int(lost.sum()), 'image point')}, "
                 f"the first is point {network.points[seen.point[row]]} in {network.images[seen.image[row]]}"
             )
         xy[rows] = pixel_from_tangents(ideal[k], uv)

@@ -102,7 +102,8 @@ def block_motion(
     outside = found.stable & ~group
     if np.linalg.matrix_rank(G[np.repeat(outside, 3)], tol=RANK * np.linalg.norm(G, 2)) < G.shape[1]:
         raise GeometryError(
-            f"group {name}: {int(outside.sum())} stable points are outside of it, too few or on a line: "
+            f"group {name}: {counted(int(outside.sum()), 'stable point')} outside of it, too few or "
+            "on a line: "
             "nothing is left against which it could move"
         )
     d, Q = in_datum(d, Q, G, outside.astype(float))

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
@@ -104,7 +105,7 @@ def read_covariance(
     due = HEADER_BYTES + 8 * (u * (u + 1) // 2)
     if size != due or len(sigma) > MAX_POINTS:
         raise SurveyFileError(
-            f"{path}: {size} bytes, expected {due} for the {len(sigma)} points of "
+            f"{path}: {size} bytes, expected {due} for the {counted(len(sigma), 'point')} of "
             f"{'points.csv' if points is None else POINTS_NAME}"
         )
     try:

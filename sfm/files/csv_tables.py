@@ -19,6 +19,7 @@ from typing import TextIO
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
 
@@ -156,7 +157,7 @@ def array_table(
     rows = len(next(iter(texts.values())))
     for name, column in texts.items():
         if len(column) != rows:
-            raise SurveyFileError(f"{what}: {len(column)} values of {name}, expected {rows}")
+            raise SurveyFileError(f"{what}: {counted(len(column), 'value')} of {name}, expected {rows}")
     if not rows:
         raise SurveyFileError(f"{what}: no rows, at least one is needed")
     names = tuple(
@@ -184,7 +185,8 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
                     continue
                 if len(row) != columns:
                     raise SurveyFileError(
-                        f"{path}, line {reader.line_num}: {len(row)} columns, the header has {columns}"
+                        f"{path}, line {reader.line_num}: {counted(len(row), 'column')}, the header has "
+                        f"{columns}"
                     )
                 yield reader.line_num, row
         except UnicodeDecodeError as error:

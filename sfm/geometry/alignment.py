@@ -223,7 +223,9 @@ def align_points(
     """
     common = [name for name in nominal.names if name in points.names]
     if len(common) < 3:
-        raise GeometryError(f"alignment: {len(common)} nominal points were measured, a best fit needs 3")
+        raise GeometryError(
+            f"alignment: {counted(len(common), 'nominal point')} measured, a best fit needs 3"
+        )
     rows = np.array([points.index(name) for name in common], dtype=np.int64)
     own = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
     target = nominal.xyz[own]

@@ -45,7 +45,9 @@ def refine_coplanarity(
     uv2 = np.ascontiguousarray(second, dtype=float)
     residuals, N = np.empty(len(uv1)), np.empty((UNKNOWNS, UNKNOWNS))
     if not _adjust_coplanarity(uv1, uv2, b, R, residuals, N):
-        raise GeometryError(f"relative orientation: the {len(uv1)} pairs do not determine five parameters")
+        raise GeometryError(
+            f"relative orientation: the {counted(len(uv1), 'pair')} do not determine five parameters"
+        )
     return b, R, residuals, np.asarray(np.linalg.inv(N), dtype=float)
 
 

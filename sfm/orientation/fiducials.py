@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 
 SIMILARITY, AFFINE = "similarity", "affine"
@@ -76,7 +77,8 @@ def orient_fiducials(
     n = len(m)
     if n < FEWEST[kind] or len(f) != n:
         raise GeometryError(
-            f"fiducial marks: {min(n, len(f))} marks, {kind} needs at least {FEWEST[kind]} in both systems"
+            f"fiducial marks: {counted(min(n, len(f)), 'mark')}, {kind} needs at least {FEWEST[kind]} in "
+            "both systems"
         )
     centre = m.mean(axis=0)
     spread = np.linalg.svd(m - centre, compute_uv=False)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.orientation.coplanarity import UNKNOWNS, coplanarity_residuals, refine_coplanarity
 from sfm.orientation.homography import (
@@ -99,7 +100,9 @@ def relative_orientations(
     uv2 = np.ascontiguousarray(second, dtype=float).reshape(-1, 2)
     n = len(uv1)
     if n < PLANAR_POINTS or len(uv2) != n:
-        raise GeometryError(f"relative orientation: {n} common points, at least {PLANAR_POINTS} are needed")
+        raise GeometryError(
+            f"relative orientation: {counted(n, 'common point')}, at least {PLANAR_POINTS} are needed"
+        )
     H, on_plane = fit_homography(uv1, uv2, tolerance=tolerance, seed=seed)
     spatial: RelativeOrientation | None = None
     planar: list[RelativeOrientation] = []
@@ -123,7 +126,7 @@ def relative_orientations(
     if spatial is None:
         if not planar:
             raise GeometryError(
-                f"relative orientation: the {n} common points fit no plane and no spatial scene"
+                f"relative orientation: no plane and no spatial scene fits {counted(n, 'common point')}"
             )
         return tuple(planar)
     if planar and _is_planar(H, uv1, uv2, spatial):

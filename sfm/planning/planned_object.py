@@ -111,14 +111,15 @@ def object_of_mesh(
     edges = open_edges(mesh)
     if edges and not open_surface:
         raise GeometryError(
-            f"mesh: {edges} edges belong to one triangle only: it has holes, or is an open surface, through "
-            "which points would be seen from behind; close it, or say --open-mesh"
+            f"mesh: {counted(edges, 'edge')} of one triangle only: it has holes, or is an open "
+            "surface, through which points would be seen from behind; close it, or say --open-mesh"
         )
     reversed_ = _reversed_edges(mesh)
     if reversed_:
         raise GeometryError(
-            f"mesh: at {reversed_} edges neighbouring triangles run in opposite directions, so that inside "
-            "and outside are not known; turn its triangles to run alike"
+            f"mesh: at {counted(reversed_, 'edge')} neighbouring triangles run in opposite directions, so "
+            "that "
+            "inside and outside are not known; turn its triangles to run alike"
         )
     corners = mesh.vertices[mesh.triangles]
     if not edges and np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:

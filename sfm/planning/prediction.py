@@ -21,6 +21,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of
 from sfm.orientation.ray_angles import ray_angles
@@ -190,7 +191,8 @@ def predict_network(
     found = Prediction(planned, camera, stations, sight, predict(network, estimate), place, photograph)
     if not found.determined.any():
         raise GeometryError(
-            f"plan: {len(photographs)} photographs determine none of the points, needed stations in different"
+            f"plan: {counted(len(photographs), 'photograph')} determine none of the points, needed "
+            "stations in different"
             f" places, there are {stations.of(photographs).places}"
         )
     return found

@@ -97,7 +97,8 @@ def reason_of(prediction: Prediction, j: int) -> str:
         words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
     elif angle >= FLAT_DEG:
         words.append(
-            f"far from the stations or seen by few (median of points: {_median_rays(prediction)} rays)"
+            f"far from the stations or seen by few (median of points: "
+            f"{counted(_median_rays(prediction), 'ray')})"
         )
     return ", ".join(words)
 

@@ -1,6 +1,6 @@
-"""Kind: a row of the catalogue of remarks, and the sentence that it makes of a remark.
+"""Kind: a row of the catalogue of remarks, and the sentences that it makes of a remark.
 
-A sentence is a text with fields in braces, one for each part of the remark:
+Sentence, cause and remedy are texts with fields in braces, one for each part of the remark:
 
     {point}                 names, listed          {distance}            number with its unit
     {points:point}          "3 points"             {count:point}         the same of a number
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.display import listed, plural
+from sfm.display import agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
@@ -68,8 +68,8 @@ class Kind:
     name: str
     severity: Severity | Grade
     sentence: str  # with fields, see above
-    cause: str  # why it happens
-    remedy: str  # what to do
+    cause: str  # why it happens; fields as of the sentence
+    remedy: str  # what to do; likewise
     short: str = ""  # what it is called in the sentences of others, whose subjects have its name
     explains: tuple[str, ...] = ()  # kinds that follow from it, whose remedies would mislead beside it
 
@@ -84,8 +84,8 @@ class Kind:
             return self.severity.severity_of(one)
         return self.severity
 
-    def sentence_of(self, one: Remark) -> str:
-        """Return the sentence of a remark of this kind.
+    def write(self, text: str, one: Remark) -> str:
+        """Return a text of this kind, its sentence, cause or remedy, with the parts of a remark.
 
         Raises:
             KeyError: a part is missing that is not optional.
@@ -96,7 +96,7 @@ class Kind:
             inner = found.group(1)
             return inner if all(name in parts for name, _ in FIELD.findall(inner)) else ""
 
-        text = OPTIONAL.sub(optional, self.sentence)
+        text = OPTIONAL.sub(optional, text)
         return FIELD.sub(lambda found: _written(parts, found.group(1), found.group(2) or ""), text)
 
 
@@ -105,7 +105,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     part = parts[name]
     count = part.value if isinstance(part, Quantity) else len(part)
     if "|" in spec:
-        return spec.split("|")[0 if count == 1 else 1]
+        return agreeing(count, spec)
     if spec and spec[0].isalpha():
         return f"{count:,.0f} {plural(spec, count)}"
     if not isinstance(part, Quantity):

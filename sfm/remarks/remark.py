@@ -58,13 +58,26 @@ class Remark:
     @property
     def text(self) -> str:
         """Its sentence, by the catalogue."""
+        return self._write(self.row.sentence)
+
+    @property
+    def cause(self) -> str:
+        """Why it happens, by the catalogue."""
+        return self._write(self.row.cause)
+
+    @property
+    def remedy(self) -> str:
+        """What to do, by the catalogue."""
+        return self._write(self.row.remedy)
+
+    def _write(self, text: str) -> str:
         from sfm.remarks.catalogue import KINDS
 
         subjects = {  # other kinds have their short names
             role: tuple(KINDS[name].short or name if name in KINDS else name for name in names)
             for role, names in self.subjects.items()
         }
-        return self.row.sentence_of(replace(self, subjects=subjects))
+        return self.row.write(text, replace(self, subjects=subjects))
 
     def number(self, name: str) -> float:
         """Return the value of a number; NaN where the remark has none of that name."""
@@ -86,8 +99,8 @@ class Remark:
                 name: {"value": one.value if math.isfinite(one.value) else None, "unit": one.unit}
                 for name, one in self.numbers.items()
             },
-            "cause": self.row.cause,
-            "remedy": self.row.remedy,
+            "cause": self.cause,
+            "remedy": self.remedy,
         }
 
 

@@ -33,7 +33,12 @@ def with_tables(page: str) -> str:
 
 
 def _row(kind: Kind) -> str:
-    cells = (f"{_pattern(kind.sentence)} `{kind.name}`", _severity(kind), kind.cause, kind.remedy)
+    cells = (
+        f"{_pattern(kind.sentence)} `{kind.name}`",
+        _severity(kind),
+        _pattern(kind.cause),
+        _pattern(kind.remedy),
+    )
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

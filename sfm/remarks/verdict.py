@@ -68,7 +68,7 @@ def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
     lines = []
     for (severity, _), same in groups.items():
         lines += [
-            Line(severity, one.text, "" if k else one.row.remedy, bool(one.row.explains))
+            Line(severity, one.text, "" if k else one.remedy, bool(one.row.explains))
             for k, one in enumerate(same[:MAX_LISTED])
         ]
         if len(same) > MAX_LISTED:

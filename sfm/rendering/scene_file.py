@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.toml_files import read_toml
@@ -277,7 +278,7 @@ def _place_grid(
     codes = list(grid.codes) or [0] * (columns * rows)
     if len(codes) != columns * rows:
         raise SurveyFileError(
-            f"{path}: face {name}: {len(codes)} codes for a grid of {columns} x {rows} targets"
+            f"{path}: face {name}: {counted(len(codes), 'code')} for a grid of {columns} x {rows} targets"
         )
     for k, code in enumerate(codes):
         x, y = grid.first[0] + grid.step[0] * (k % columns), grid.first[1] + grid.step[1] * (k // columns)

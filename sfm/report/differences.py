@@ -12,6 +12,7 @@ import numpy as np
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
@@ -116,7 +117,7 @@ def words_of_pairing(found: ResultComparison) -> str:
         (pairing.points_by_place, "by their place"),
     ]
     said = ", ".join(f"{count} {way}" for count, way in ways if count)
-    return f"{len(found.points)} common points{f' ({said})' if said else ''}"
+    return f"{counted(len(found.points), 'common point')}{f' ({said})' if said else ''}"
 
 
 def words_of_scale(found: ResultComparison) -> str:

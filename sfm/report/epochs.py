@@ -74,7 +74,7 @@ def words_of_stable(found: Displacements) -> str:
     ]
     count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
     if count == all_of_them:
-        return f"All {count} points of reference agree."
+        return f"All {counted(count, 'point')} of reference agree."
     by = (
         " by removing one after the other"
         if found.congruency.robust is None or _same(found)

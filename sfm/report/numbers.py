@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from sfm.conventions import METRES, FloatArray
-from sfm.display import counted
+from sfm.display import agreeing, counted
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
 
@@ -142,6 +142,7 @@ def is_number(text: str) -> bool:
 FILTERS = {
     one.__name__: one
     for one in (
+        agreeing,
         counted,
         fixed,
         probability,

@@ -177,7 +177,11 @@ def words_left_out(findings: Findings) -> str:
 def words_of_datum(adjustment: Adjustment) -> str:
     """Return what carries the datum: its kind, and how many points where they were chosen."""
     points = adjustment.datum_points
-    return adjustment.datum if points is None else f"{adjustment.datum} on {int(points.sum())} chosen points"
+    return (
+        adjustment.datum
+        if points is None
+        else f"{adjustment.datum} on {counted(int(points.sum()), 'chosen point')}"
+    )
 
 
 def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:

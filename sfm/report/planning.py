@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.display import counted
 from sfm.files.plain_text import csv_text, or_none
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.findings import verdict_of_plan
@@ -109,7 +110,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
     worst, along = float(p.sigma[p.determined].max()), float(p.largest_sigma[p.determined].max())
     per_mm = p.scale_number / float(np.mean(p.camera.pixel_mm))
     rows = [
-        ("photographs", f"{len(p.stations)} from {p.stations.places} stations"),
+        ("photographs", f"{len(p.stations)} from {counted(p.stations.places, 'station')}"),
         ("object points", f"{int(p.determined.sum())} of {len(p.planned.names)} determined"),
         ("image points", f"{len(a.network.image_points)}, sigma {significant(p.sigma_px)} px (median)"),
         ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import agreeing, counted
 from sfm.files.plain_text import csv_text
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
@@ -61,9 +62,10 @@ def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict
 
 def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
     """Return the line of the RMS that COLMAP finds in the files, and why it is larger than that adjusted."""
+    kept = numbers.written - found.refined
     return (
-        f"in the files  {numbers.written_px:.4f} px, with {numbers.written - found.refined} key points as "
-        f"they came, of points not measured anew in {MIN_RAYS} photographs"
+        f"in the files  {numbers.written_px:.4f} px, with {counted(kept, 'key point')} as "
+        f"{agreeing(kept, 'it|they')} came, of points not measured anew in {MIN_RAYS} photographs"
     )
 
 

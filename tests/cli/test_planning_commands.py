@@ -165,7 +165,7 @@ BAD = [
         ("plate:1000,1000", *LENS, "--stations", "ring:6", "--max-incidence-deg", "1"),
         "0 of 6 photographs show",
     ),
-    (("holes.stl", *LENS, "--stations", "ring:6"), "3 edges belong to one triangle only"),
+    (("holes.stl", *LENS, "--stations", "ring:6"), "3 edges of one triangle only"),
     (("mixed.stl", *LENS, "--stations", "ring:6"), "at 3 edges neighbouring triangles run in opposite"),
     (("line.csv", *LENS, "--stations", "ring:6"), "4 points on one line"),
     (("zero.csv", *LENS, "--stations", "ring:6"), "point c has a normal of length 0"),

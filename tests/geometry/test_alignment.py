@@ -148,7 +148,7 @@ def test_bad_input_is_one_line() -> None:
         align_321(points, ["0", "1"], ["5", "6"], "5")
     with pytest.raises(GeometryError, match="lie on a line"):
         align_321(points, ["0", "1", "0"], ["5", "6"], "5")
-    with pytest.raises(GeometryError, match="2 nominal points were measured, a best fit needs 3"):
+    with pytest.raises(GeometryError, match="2 nominal points measured, a best fit needs 3"):
         align_points(points, Nominal(("0", "1", "x"), np.eye(3)))
     bare = replace(points, covariance=None)
     with pytest.raises(GeometryError, match='expected weights = "equal"'):

@@ -195,7 +195,7 @@ def test_bad_input_is_refused_in_one_line() -> None:
         match_lsm(photograph, photograph, at, at, model="helmert")
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, interpolation="sinc")
-    with pytest.raises(GeometryError, match="1 points in the left photograph, 2 in the right"):
+    with pytest.raises(GeometryError, match="1 point in the left photograph, 2 in the right"):
         match_lsm(photograph, photograph, at, np.vstack([at, at]))
     with pytest.raises(PhotographError, match="int32 intensities"):
         match_lsm(photograph.astype(np.int32), photograph, at, at)

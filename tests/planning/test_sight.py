@@ -155,7 +155,7 @@ def test_meshes_with_holes_are_refused_unless_open() -> None:
     assert box is not None and open_edges(box) == 0
     holed = replace(box, triangles=box.triangles[1:])
     assert open_edges(holed) == 3
-    with pytest.raises(GeometryError, match=r"mesh: 3 edges belong to one triangle only: .*--open-mesh"):
+    with pytest.raises(GeometryError, match=r"mesh: 3 edges of one triangle only: .*--open-mesh"):
         object_of_mesh(holed, 20)
     assert len(object_of_mesh(holed, 20, open_surface=True).names) == 20
     inside_out = object_of_mesh(replace(box, triangles=box.triangles[:, ::-1]), 50)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 
 import pytest
 
@@ -23,7 +22,7 @@ def sentence(text: str, **parts: object) -> str:
     kind = Kind("some", "note", text, "cause", "remedy")
     subjects = {name: one for name, one in parts.items() if isinstance(one, tuple)}
     numbers = {name: one for name, one in parts.items() if isinstance(one, Quantity)}
-    return kind.sentence_of(Remark("some", subjects, numbers))
+    return kind.write(text, Remark("some", subjects, numbers))
 
 
 @pytest.mark.parametrize(
@@ -284,4 +283,4 @@ def test_probabilities_are_written_as_numbers_that_say_something() -> None:
     row = KINDS["sigma0_high"]
     for value, text in ((4.92e-31, "p < 0.001"), (0.0124, "p = 0.012"), (0.5, "p = 0.500")):
         one = Remark("sigma0_high", numbers={"p": Quantity(value)})
-        assert replace(row, sentence="{p:<}").sentence_of(one) == text
+        assert row.write("{p:<}", one) == text

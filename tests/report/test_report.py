@@ -490,7 +490,7 @@ def test_every_remark_is_shown_once_by_every_renderer(
     told, page = capsys.readouterr().out, report_page(findings, (), ())
     for one in findings.verdict.remarks:
         assert words.count(one.text) == 1 and told.count(one.text) == 1
-        assert page.count(str(escape(one.text))) == 1 and str(escape(one.row.remedy)) in page
+        assert page.count(str(escape(one.text))) == 1 and str(escape(one.remedy)) in page
     assert f"{result.failed[0].image}: {result.failed[0].reason.text}" in words
     write_summary(findings, tmp_path)
     stored = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
@@ -698,9 +698,9 @@ def test_the_terminal_says_once_why_photographs_are_lost(
         said = replace(result, failed=lost, remarks=(group, board) if explained else ())
         tell_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
         told = [line.strip() for line in capsys.readouterr().out.splitlines()]
-        ends = tuple(f"{one.text} {one.row.remedy}" for one in (few, apart))
+        ends = tuple(f"{one.text} {one.remedy}" for one in (few, apart))
         reasons = [line for line in told if line.startswith("lost") and line.endswith(ends)]
-        assert any(line.endswith(board.row.remedy) for line in told) == bool(explained)
+        assert any(line.endswith(board.remedy) for line in told) == bool(explained)
         assert [line.split(":")[0] for line in reasons] == (
             ["lost 1"] if explained else ["lost 1, lost 2, each", "lost 3"]
         )

@@ -103,5 +103,5 @@ def test_photographs_of_one_place_are_named_as_such() -> None:
     measured = measurements_from_observations(survey_of(network, truth))
     copies = {"image 2": ("image 1", 0.99), "image 3": ("image 1", 0.98)}
     assert len(without_copies(measured, {"image 2": copies["image 2"]}).network.images) == 2
-    with pytest.raises(GeometryError, match="2 photographs of 3 show"):
+    with pytest.raises(GeometryError, match="2 of 3 photographs show"):
         without_copies(measured, copies)

@@ -113,8 +113,8 @@ def test_unreadable_files_are_named_once_with_their_reason(
 @pytest.mark.parametrize(
     ("replaced", "found"),
     [
-        ({"codes": '"none"'}, r"0 codes were read in 0 of them; .*codes = 'none', polarity = 'dark'"),
-        ({"codes": '"arcs"'}, r"codes were read in \d+ of them; .*codes = 'arcs'"),
+        ({"codes": '"none"'}, r"0 codes read in 0 of them; .*codes = 'none', polarity = 'dark'"),
+        ({"codes": '"arcs"'}, r"codes read in \d+ of them; .*codes = 'arcs'"),
         (
             {"codes": '"ring20"'},
             r"codes = 'ring20', .*; in photo \d\.png codes = 'ring14' reads \d\d? codes$",
@@ -131,7 +131,7 @@ def test_without_codes_the_settings_are_named(
     folder = changed(survey_file, tmp_path / "codes", **replaced)
     with pytest.raises(GeometryError, match="no two photographs have 4 coded targets in common") as error:
         run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert error.match(r"\d+ targets were found in 6 photographs, ") and error.match(found)
+    assert error.match(r"\d+ targets found in 6 photographs, ") and error.match(found)
 
 
 def test_photographs_start_from_approximate_values(

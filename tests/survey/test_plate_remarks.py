@@ -109,7 +109,7 @@ def test_a_board_that_is_not_found_is_sought_by_the_keys_that_it_has(codes: str)
     board = PlateFamily(codes, 6, 8, (), "aruco4x4_50" if codes in TAGGED else "", 0.5)
     (one,) = missing_plates(board, lost)
     assert one.names("photographs") == ("a",) and one.names("size") == ("6 x 8",)
-    words = {word.strip(".,") for word in one.row.remedy.split()}
+    words = {word.strip(".,") for word in one.remedy.split()}
     assert {"rows", "columns"} <= words or codes == "grid"
     assert ({"dictionary", "tag_size", "first_tag"} <= words) == (codes in TAGGED)
     assert codes in TAGGED or not {"dictionary", "tag_size", "first_tag"} & words

@@ -95,7 +95,7 @@ def _check_targets() -> str:
     error = np.linalg.norm(found.xy[:, None] - centres, axis=2).min(axis=1).max()
     if error > CENTRE_PX:
         raise KolinearError(f"a dot is {error:.3f} px off, expected {CENTRE_PX} px at most")
-    return f"{len(found)} dots measured, {error:.4f} px off at most"
+    return f"{counted(len(found), 'dot')} measured, {error:.4f} px off at most"
 
 
 @cache

@@ -165,7 +165,8 @@ def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera
     names = [camera.name for camera in cameras]
     if name is None and len(cameras) > 1:
         raise SurveyFileError(
-            f"{where}: {len(cameras)} cameras ({', '.join(names)[:80]}), say one with --camera-name"
+            f"{where}: {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), say one with "
+            "--camera-name"
         )
     found = [camera for camera in cameras if name in (None, camera.name)]
     if not found:

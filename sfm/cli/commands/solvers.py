@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
@@ -98,7 +99,10 @@ def compare(
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
-    print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
+    print(
+        f"{words_of_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
+        f"{words_of_scale(found)}"
+    )
     tell_verdict(verdict_of_comparison(found))
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")

@@ -25,7 +25,7 @@ from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
 from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
-from sfm.display import program_name
+from sfm.display import counted, program_name
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.network import Estimate, Network
@@ -138,7 +138,8 @@ def compare_adjusters(
     held: tuple[str, ...] = ()
     if rational and (ours.undetermined or not ours.converged):
         held = ours.undetermined or (
-            f"k1 to k6 still grow together after {ours.iterations} iterations, numerator and denominator of "
+            f"k1 to k6 still grow together after {counted(ours.iterations, 'iteration')}, numerator and "
+            "denominator of "
             "the rational distortion cancelling",
         )
     while True:

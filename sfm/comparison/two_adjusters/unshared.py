@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera
+from sfm.display import counted
 
 
 def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
@@ -29,7 +30,7 @@ def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tu
             held[own[s]] = tuple(dict.fromkeys((*held[own[s]], camera.names[s])))
         alone.append(replace(camera, free=camera.free & ~shared, shared=()))
     words = tuple(
-        f"{', '.join(names)} of {group}, shared by {members[group]} cameras"
+        f"{', '.join(names)} of {group}, shared by {counted(members[group], 'camera')}"
         for group, names in held.items()
         if names
     )

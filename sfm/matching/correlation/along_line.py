@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.correlation.ncc import NccMatches, least_deviations, matches_of, template_corners
 from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
@@ -49,7 +50,10 @@ def match_along_line(
     side = odd_window("NCC template", template_px)
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     if len(lines) != len(a):
-        raise GeometryError(f"NCC: {len(a)} points in the left photograph, {len(lines)} lines in the right")
+        raise GeometryError(
+            f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(lines), 'line')} in "
+            "the right"
+        )
     grey_left, grey_right = grey_of(left), grey_of(right)
     least = least_deviations(left, right)
     half = side // 2

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.correlation.peak import (
     CXX,
@@ -103,7 +104,9 @@ def match_ncc(
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = np.asarray(xy_right, dtype=float).reshape(-1, 2)
     if len(a) != len(b):
-        raise GeometryError(f"NCC: {len(a)} points in the left photograph, {len(b)} windows in the right")
+        raise GeometryError(
+            f"NCC: {counted(len(a), 'point')} in the left photograph, {len(b)} windows in the right"
+        )
     grey_left, grey_right = grey_of(left), grey_of(right)
     least = least_deviations(left, right)
     out = np.zeros((len(a), OUTPUTS))

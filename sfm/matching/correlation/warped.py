@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.correlation.ncc import NccMatches, least_deviations, matches_of, template_corners
 from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
@@ -54,7 +55,8 @@ def match_ncc_warped(
         raise GeometryError(f"NCC: a reach of {reach_px.min()} px, needed at least 1 px")
     if len(a) != len(b) or A.shape != (len(a), 2, 2):
         raise GeometryError(
-            f"NCC: {len(a)} points in the left photograph, {len(b)} places in the right and maps of shape "
+            f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(b), 'place')} in the "
+            "right and maps of shape "
             f"{A.shape}, needed one of each for every point"
         )
     grey_left, grey_right = grey_of(left), grey_of(right)

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.cholesky import solve_factorised
 from sfm.kernels.options import compiled
@@ -146,7 +147,9 @@ def match_lsm(
     b = np.ascontiguousarray(xy_right, dtype=float).reshape(-1, 2)
     k = len(a)
     if len(b) != k:
-        raise GeometryError(f"LSM: {k} points in the left photograph, {len(b)} in the right, needed in pairs")
+        raise GeometryError(
+            f"LSM: {counted(k, 'point')} in the left photograph, {len(b)} in the right, needed in pairs"
+        )
     given = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
     if given.shape not in ((k, 2, 2), (k, 3, 3)):
         raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")

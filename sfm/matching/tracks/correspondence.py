@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.epipolar import essential_matrices
 from sfm.matching.tracks.evidence import (
@@ -96,7 +97,9 @@ def match_targets(
     m = len(estimate.position)
     for what, given in (("cameras", camera), ("lists of targets", targets)):
         if len(given) != m:
-            raise GeometryError(f"matching: {len(given)} {what} for {m} photographs, needed one for each")
+            raise GeometryError(
+                f"matching: {len(given)} {what} for {counted(m, 'photograph')}, needed one for each"
+            )
     if min_rays < 2:
         raise GeometryError(f"matching: min_rays is {min_rays}, an object point needs at least 2 rays")
     scene, unusable = _scene(estimate, camera, targets, kinds, diameters_px, tolerance_px, max_size_ratio)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.matching.radiometry import grey_of, odd_window
@@ -69,7 +70,9 @@ def foerstner_points(
     """
     side = odd_window("interest operator", window_px)
     if max_points < 1:
-        raise GeometryError(f"interest operator: {max_points} points asked for, at least 1 is needed")
+        raise GeometryError(
+            f"interest operator: {counted(max_points, 'point')} asked for, at least 1 is needed"
+        )
     grey = grey_of(photograph)
     gx, gy = _gradients(grey)
     weight, roundness = _texture(gx, gy, side)

@@ -80,7 +80,8 @@ def resect_least_squares(
         raise GeometryError("resection: points lie behind the camera at the start values")
     if state == RANK:
         raise GeometryError(
-            f"resection: the {n} points do not determine position and rotation (collinear or coincident)"
+            f"resection: the {counted(n, 'point')} do not determine position and rotation (collinear or "
+            "coincident)"
         )
     redundancy = 2 * n - UNKNOWNS
     cofactors = cofactors_in_angles(np.asarray(np.linalg.inv(N), dtype=float), R)

@@ -78,7 +78,9 @@ def design_network(
     Source: Fedorov (1972), Theory of Optimal Experiments; Fraser (1984).
     """
     if max_photographs < FEWEST:
-        raise GeometryError(f"plan: at most {max_photographs} photographs, needed {FEWEST} or more")
+        raise GeometryError(
+            f"plan: at most {counted(max_photographs, 'photograph')}, needed {FEWEST} or more"
+        )
     found = candidates(planned, camera, allowed, seeing, count=count)
     return _Designer(planned, camera, seeing, wanted, found, max_photographs, bars).run()
 

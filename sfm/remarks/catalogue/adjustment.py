@@ -55,15 +55,16 @@ ROWS = (
     Kind(
         "gross_errors_kept",
         "warning",
-        "{beyond} of {tested} image coordinates have residuals beyond {critical} robust standard deviations "
-        "({chance} by chance), and none was rejected.",
+        "{beyond} of {tested} image coordinates {beyond:has a residual|have residuals} beyond {critical} "
+        "robust "
+        "standard deviations ({chance} by chance), and {beyond:it was not|none was} rejected.",
         'gross errors, and adjust.reject = "none"',
         'Set adjust.reject = "tau", which rejects gross errors.',
     ),
     Kind(
         "image_points_rejected",
         REJECTED,
-        "{rejected} of {total} image points were rejected.",
+        "{rejected} of {total} image points {rejected:was|were} rejected.",
         "wrong matches or names, an object that moved, or a camera model that does not suit the lens",
         "Look at the rejected image points in the report.",
     ),
@@ -87,8 +88,9 @@ ROWS = (
         "warning",
         "No image point fits in {photographs}: nothing determines {photographs:its|their} position and "
         "rotation.",
-        "the robust estimator gives all image points of the photograph a small weight",
-        "Remove the photograph, or correct the names of its points.",
+        "the robust estimator gives all image points of a photograph a small weight",
+        "Remove {photographs:the photograph|these photographs}, or correct the names of "
+        "{photographs:its|their} points.",
     ),
     Kind(
         "weights_not_converged",
@@ -101,9 +103,12 @@ ROWS = (
         "held_to_converge",
         "warning",
         "{parameters} of camera {camera} {parameters:was|were} held fixed: with {parameters:it|them} free "
-        "the adjustment does not converge.",
-        "the photographs do not separate these parameters from position and rotation",
-        "Give calibrated values and leave the parameters out of free.",
+        "the adjustment does not "
+        "converge.",
+        "the photographs do not separate {parameters:this parameter|these parameters} from position and "
+        "rotation",
+        "Give {parameters:a calibrated value|calibrated values} and leave "
+        "{parameters:the parameter|the parameters} out of free.",
     ),
     Kind(
         "better_solution_taken",

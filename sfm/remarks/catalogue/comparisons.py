@@ -92,7 +92,7 @@ ROWS = (
     Kind(
         "tested_part",
         "note",
-        "{tested} of {points} points are tested, whose covariance together both results keep.",
+        "{tested} of {points} points {tested:is|are} tested, whose covariance together both results keep.",
         "of many points only a sample is kept with its covariance",
         "Nothing needs to be done.",
     ),

@@ -65,8 +65,8 @@ ROWS = (
     Kind(
         "orientation_replaced",
         "warning",
-        "The given orientation of {photograph} was replaced: {before} of {image_points:image point} fit it, "
-        "{after} fit the new one.",
+        "The given orientation of {photograph} was replaced: {before} of {image_points:image point} "
+        "{before:fits|fit} it, {after} {after:fits|fit} the new one.",
         "the given orientation is wrong",
         "Correct or complete [approximate], or leave it out.",
     ),

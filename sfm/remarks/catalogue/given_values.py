@@ -73,10 +73,10 @@ ROWS = (
     Kind(
         "given_renamed",
         "warning",
-        "Of {of:@}, {given} {given:has|have} the coordinates of {given:another point|other points}: these "
-        "were reassigned.",
+        "Of {of:@}, {given} {given:has|have} the coordinates of {given:another point|other points}: "
+        "{given:its|their} coordinates were reassigned.",
         "names exchanged or a list shifted by a row, in the given coordinates or in the photographs",
-        "Correct these names.",
+        "Correct {given:this name|these names}.",
     ),
     Kind(
         "given_mirrored",
@@ -141,7 +141,9 @@ ROWS = (
     Kind(
         "checks_contradict",
         "error",
-        "{count} of the {all} check points differ from their given coordinates, by up to {distance}.",
+        "{count} of the {all} check points {count:differs from its|differ from their} given coordinates, "
+        "by up "
+        "to {distance}.",
         "wrong control or scale, a weak network, or check points of another system or epoch",
         "Find out whether control or check points are wrong before you use the result.",
     ),

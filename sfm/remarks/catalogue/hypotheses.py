@@ -16,10 +16,12 @@ ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "The camera of {photographs} is not that of the others[[ of camera {camera}]] (c {change:+}"
+        "{photographs} {photographs:fits|fit} another camera than the others[[ of camera {camera}]] (c "
+        "{change:+}"
         f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
-        "Give these photographs another camera in the survey file, or set per_photograph.",
+        "Give {photographs:this photograph|these photographs} another camera in the survey file, or set "
+        "per_photograph.",
         short="another camera in some photographs",
     ),
     Kind(
@@ -70,8 +72,7 @@ ROWS = (
     Kind(
         "object_deformed",
         SHIFT,
-        "The object has another shape in photographs {photographs}, by up to {deformation}. "
-        f"{SHIFTED}{INSTEAD}",
+        f"The object has another shape in {{photographs}}, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
         "the object expanded, bent or settled during the survey",
         "Adjust the two states as two surveys and compare them with epochs.",
         short="an object that deformed",
@@ -90,14 +91,14 @@ ROWS = (
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
         f"{INSTEAD}",
         "targets or parts of the object moved during the survey",
-        "Adjust the two states as two surveys, or remove these points.",
+        "Adjust the two states as two surveys, or remove {points:this point|these points}.",
         short="points that moved",
     ),
     Kind(
         "too_many_to_test",
         "note",
         "One camera for all photographs and one shape of the object are assumed, not tested: "
-        "{photographs:photograph} are too many.",
+        "{photographs} photographs are too many.",
         "the tests take the normal equations of all photographs together",
         "Survey parts of the object by themselves to test them.",
     ),

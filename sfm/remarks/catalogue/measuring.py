@@ -8,21 +8,22 @@ ROWS = (
     Kind(
         "out_of_tolerance",
         "error",
-        "{tolerance}: {out} of {total} deviations are proven to be out of tolerance: {points}.",
+        "{tolerance}: {out} of {total} deviations {out:is|are} proven to be out of tolerance: {points}.",
         "the object deviates from its drawing by more than tolerance and uncertainty",
         "See the table of deviations.",
     ),
     Kind(
         "tolerance_undecided",
         "warning",
-        "{tolerance}: {undecided} of {total} deviations are too near the limit to be decided.",
+        "{tolerance}: {undecided} of {total} deviations {undecided:is|are} too near the limit to be decided.",
         "the uncertainty of the measurement reaches across the limit",
         "Measure with a smaller uncertainty: more photographs, or larger in the photographs.",
     ),
     Kind(
         "tolerance_unknown",
         "warning",
-        "{tolerance}: {unknown} of {total} deviations have no standard deviation and are not decided.",
+        "{tolerance}: {unknown} of {total} deviations {unknown:has|have} no standard deviation and "
+        "{unknown:is|are} not decided.",
         "the result has no covariance of these points",
         "Run the survey again with this version, or measure a result with standard deviations.",
     ),
@@ -31,7 +32,7 @@ ROWS = (
         "warning",
         "{tolerance}: {points:point} {points:was|were} not measured: {points}.",
         "the nominal table names points that the result lacks",
-        "Measure them, or remove them from the table.",
+        "Measure {points:it|them}, or remove {points:it|them} from the table.",
     ),
     Kind(
         "no_precision",
@@ -82,8 +83,8 @@ ROWS = (
         "shape_points_left_out",
         "warning",
         "The fit of {shape} leaves out {points:point}: {points}.",
-        "they contradict the others",
-        "See whether they belong to the shape.",
+        "{points:it contradicts|they contradict} the others",
+        "See whether {points:it belongs|they belong} to the shape.",
     ),
     Kind(
         "datum_dependent",
@@ -109,8 +110,9 @@ ROWS = (
     Kind(
         "lengths_exceed_limit",
         "error",
-        "The errors of {exceeding} of {total} lengths exceed the limit; no standard deviation of the "
-        "calibration is given that could explain {exceeding:it|them}.",
+        "{exceeding} of {total} errors of length {exceeding:exceeds|exceed} the limit; no standard "
+        "deviation of "
+        "the calibration is given that could explain {exceeding:it|them}.",
         "the error of length measurement is larger than the limit, and the column sigma is empty",
         "See the table of lengths; enter the standard deviations of the calibration.",
     ),
@@ -132,7 +134,7 @@ ROWS = (
     Kind(
         "lines_missing",
         "warning",
-        "There are {lines} measuring lines; part 1 asks for {needed}.",
+        "There {lines:is|are} {lines:measuring line}; part 1 asks for {needed}.",
         "VDI/VDE 2634 part 1, sec. 4",
         "Add measuring lines.",
     ),

@@ -43,7 +43,7 @@ ROWS = (
         "{photographs} {photographs:is|are} blurred: edges of targets are {blur} soft (standard deviation), "
         "those of the other photographs[[ of camera {camera}]] {others}.",
         "out of focus, or the camera or the object moved during the exposure",
-        "Take the photograph again, or leave it out.",
+        "Take {photographs:the photograph|these photographs} again, or leave {photographs:it|them} out.",
     ),
     Kind(
         "camera_by_size",
@@ -72,7 +72,7 @@ ROWS = (
     Kind(
         "plate_not_recognised",
         "note",
-        "In {photographs:photograph} {dots:dot} do not fit the plate of {size}: {photographs}.",
+        "In {photographs:photograph} {dots:dot} {dots:does|do} not fit the plate of {size}: {photographs}.",
         "rows, columns or marks are not those of the plate; its marks are hidden; a part of it without marks",
         "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
         explains=("photograph_with_few_points",),
@@ -123,28 +123,28 @@ ROWS = (
     Kind(
         "copy_of_file",
         "note",
-        "Its file is that of {original}.",
+        "It is a copy of {original}: the files are the same.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_picture",
         "note",
-        "Its picture is that of {original}.",
+        "It is a copy of {original}: the pictures are the same.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_image_points",
         "note",
-        "Its image points are those of {original}.",
+        "It is a copy of {original}: the image points are the same.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_errors",
         "note",
-        "Its image points have the errors of those of {original}.",
+        "It is a copy of {original}: the errors of the image points are the same.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copy.",
     ),
@@ -158,10 +158,10 @@ ROWS = (
     Kind(
         "photographs_not_drawn",
         "note",
-        "{photographs} {photographs:has|have} no overlay: the file could not be read again when the report "
-        "was written.",
-        "the photograph was moved, removed or changed during the run",
-        "Put it back and run the survey again.",
+        "{photographs} {photographs:has|have} no overlay: {photographs:the file|the files} could not be read "
+        "again when the report was written.",
+        "a photograph was moved, removed or changed during the run",
+        "Put {photographs:it|them} back and run the survey again.",
     ),
     Kind(
         "photograph_of_other_size",
@@ -195,14 +195,16 @@ ROWS = (
     Kind(
         "photograph_with_few_fitting",
         "warning",
-        "Only {fitting} of its {points:point} fit the network; {needed} are needed.",
+        "Only {fitting} of its {points:point} {fitting:fits|fit} the network; {needed} are needed.",
         "wrong names of points, another object, or a wrong principal distance",
         "Check the names of its points and the camera.",
     ),
     Kind(
         "photograph_contradicting",
         "warning",
-        "{confirmed} conditions of its points confirm the network, {against} of its points contradict it.",
+        "{confirmed:condition} of its points {confirmed:confirms|confirm} the network, {against} of its "
+        "points "
+        "{against:contradicts|contradict} it.",
         "another object, a mirrored picture or wrong codes",
         "Leave it out, or survey it by itself.",
     ),
@@ -224,14 +226,16 @@ ROWS = (
     Kind(
         "photograph_of_mirror_image",
         "warning",
-        "{photographs} show the mirror image of the others, by {points:common point}.",
-        "either these photographs or the others were mirrored by a program, or their x was reversed",
+        "{photographs} {photographs:shows|show} the mirror image of the others, by {points:common point}.",
+        "{photographs:this photograph|these photographs} or the others were mirrored by a program, or x "
+        "was reversed",
         "Use the original photographs; check the handedness of the result.",
     ),
     Kind(
         "photograph_of_second_object",
         "warning",
-        "{photographs} fit one another and not the others: {points:common point} differ by {misfit:%} of "
+        "{photographs} fit one another and not the others: {points:common point} {points:differs|differ} "
+        "by {misfit:%} of "
         "their spread.",
         "a second object with the same codes, or this one in another state",
         "Survey them by themselves.",
@@ -247,7 +251,9 @@ ROWS = (
     Kind(
         "photograph_not_explained",
         "warning",
-        "{against} of its {points:point} contradict the network, and no other c explains them.",
+        "{against} of its {points:point} {against:contradicts|contradict} the network, and no other c "
+        "explains "
+        "{against:it|them}.",
         "another state of the object, another object or wrong codes",
         "Leave it out, or survey it by itself.",
     ),

@@ -16,9 +16,9 @@ ROWS = (
     Kind(
         "plan_points_undetermined",
         "error",
-        "{lost} of {total} points are not determined: {points}.",
-        "fewer than two photographs show them",
-        "Add stations that see them.",
+        "{lost} of {total} points {lost:is|are} not determined: {points}.",
+        "fewer than two photographs show {lost:it|them}",
+        "Add stations that see {lost:it|them}.",
     ),
     Kind(
         "plan_short_of_wanted",
@@ -31,8 +31,8 @@ ROWS = (
         "plan_points_with_few_rays",
         "note",
         "{few:point} {few:has|have} fewer than {needed} rays.",
-        "few photographs show them",
-        "Add stations that see them.",
+        "few photographs show {few:it|them}",
+        "Add stations that see {few:it|them}.",
     ),
     Kind(
         "plan_does_not_calibrate",
@@ -53,8 +53,8 @@ ROWS = (
         "warning",
         "{photographs:photograph} {photographs:shares|share} fewer than {needed} points with others: "
         "{photographs}.",
-        "they overlap too little",
-        "Add photographs between them.",
+        "{photographs:it overlaps the others|they overlap} too little",
+        "Add photographs beside {photographs:it|them}.",
     ),
     Kind(
         "plan_without_scale",
@@ -75,7 +75,7 @@ ROWS = (
         "note",
         "{photographs:photograph} {photographs:has|have} fewer than {needed} places of coded targets: "
         "{photographs}.",
-        "they show few points",
+        "{photographs:it shows|they show} few points",
         "Plan more coded targets there.",
     ),
     Kind(

@@ -9,32 +9,33 @@ ROWS = (
         "rays_rejected",
         "warning",
         "More rays of {points:point} were rejected than chance makes: {points}.",
-        "the point moved, has the name of another, or is hard to measure",
-        "Look at its rejected image points in the report.",
+        "a point moved, has the name of another, or is hard to measure",
+        "Look at {points:its|their} rejected image points in the report.",
     ),
     Kind(
         "two_rays",
         "note",
         "{two:point} of {total} {two:has|have} two rays, so that errors along the epipolar line are not "
         "found.",
-        "the point is seen in two photographs only",
-        "Add a photograph of these points.",
+        "two photographs show {two:it|them}",
+        "Add a photograph of {two:this point|these points}.",
     ),
     Kind(
         "points_not_determined",
         "note",
         "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "determine {points:it|them}: {points}.",
-        "the point is in fewer photographs than it needs, or its rays are almost parallel",
-        "Add photographs of these points, if you need them.",
+        "a point is in fewer photographs than it needs, or its rays are almost parallel",
+        "Add photographs of {points:this point|these points}, if you need {points:it|them}.",
     ),
     Kind(
         "points_contradicted",
         "warning",
         "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "meet: {points}.",
-        "the point moved, or its name stands for two points",
-        "Look at the reasons in left_out.csv; measure the points again or rename them.",
+        "a point moved, or its name stands for two points",
+        "Look at the reasons in left_out.csv; measure {points:the point|the points} again or rename "
+        "{points:it|them}.",
     ),
     Kind(
         "point_with_few_rays",
@@ -74,16 +75,17 @@ ROWS = (
     Kind(
         "points_doubtful",
         "warning",
-        "The coordinates of {points:point} are doubtful, as either of two rays may be wrong: {points}.",
-        "too few rays to decide which of them is wrong",
-        "Add photographs of these points.",
+        "{points:point} {points:has|have} doubtful coordinates, as either of two rays may be wrong: "
+        "{points}.",
+        "too few rays to decide which one is wrong",
+        "Add photographs of {points:this point|these points}.",
     ),
     Kind(
         "points_with_large_residuals",
         "warning",
         "The residuals of {points:point} are together larger than chance: {points}.",
-        "the point moved a little, or its target is damaged or seen at a flat angle",
-        "Look at the target; leave the point out if you do not trust it.",
+        "a point moved a little, or its target is damaged or seen at a flat angle",
+        "Look at {points:the target|the targets}; leave out {points:the point|points} that you do not trust.",
     ),
     Kind(
         "image_points_identical",
@@ -127,7 +129,8 @@ ROWS = (
     Kind(
         "codes_too_small",
         "note",
-        "{targets:target} {targets:has|have} a code that is too small to read: dots are {dot} across with "
+        "{targets:target} {targets:has a code that is|have codes that are} too small to read: dots are "
+        "{dot} across with "
         "edges {blur} soft, {needed} are needed.",
         "targets are too small or too far away, or photographs are not sharp",
         "Print the targets larger, go nearer or focus better.",
@@ -149,8 +152,8 @@ ROWS = (
     Kind(
         "diameters_differ",
         "warning",
-        "The stated diameters of {differing} of {total} targets differ by more than {limit} from the "
-        "ellipses, most that of {target}: {stated} stated, {found} found.",
+        "The ellipses of {differing} of {total} targets differ by more than {limit} from the stated "
+        "{differing:diameter|diameters}, most that of {target}: {stated} stated, {found} found.",
         "diameters are those of rings, or in another unit, or of other targets",
         "State the diameters of the dots in the object unit, by the ids of the targets.",
     ),

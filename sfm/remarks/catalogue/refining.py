@@ -16,13 +16,14 @@ ROWS = (
         "photographs_not_adjusted",
         "warning",
         "{photographs:photograph} {photographs:was|were} not adjusted: {photographs}.",
-        "too few of their key points could be measured anew",
-        "See the reasons beside the key points; the photographs keep the orientation of the model.",
+        "too few of {photographs:its|their} key points could be measured anew",
+        "See the reasons beside the key points; {photographs:the photograph keeps|the photographs keep} the "
+        "orientation of the model.",
     ),
     Kind(
         "key_points_not_measured",
         Grade("missing", warning=0.5),  # more than half: photographs or windows are wrong
-        "Only {measured} of {total} key points were measured anew.",
+        "Only {measured} of {total} key points {measured:was|were} measured anew.",
         "photographs of another size or state than those of the model, or little texture",
         "Give the photographs of the model; see the reasons beside the key points.",
     ),

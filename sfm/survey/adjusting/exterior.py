@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
 from sfm.remarks.remark import Remark, remark
@@ -155,7 +156,7 @@ def _too_few(places: int, turned: int, *, on_a_line: bool = False) -> str:
     """Say why observed exterior orientation and control do not place the network."""
     how = " on a line" if on_a_line else ""
     return (
-        f"datum 'control': {places} projection centres and control points{how} in the "
+        f"datum 'control': {counted(places, 'projection centre')} and control points{how} in the "
         f"network and the angles of {turned} photographs are known; needed three places that are not on a "
         "line, or two and the angles of a photograph"
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.conventions import AnyArray
-from sfm.display import counted, listed
+from sfm.display import agreeing, counted, listed
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
 from sfm.remarks.remark import Remark, remark
@@ -38,8 +38,8 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     settings = survey.targets
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
-        f"{sum(targets)} targets were found in {counted(len(targets), 'photograph')}, "
-        f"{sum(codes)} codes were read in "
+        f"{counted(sum(targets), 'target')} found in {counted(len(targets), 'photograph')}, "
+        f"{counted(sum(codes), 'code')} read in "
         f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
@@ -80,7 +80,7 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
 
 def _in_error(one: Remark) -> str:
     """Return a remark as a part of the message of an error."""
-    return f"{one.text.rstrip('.')}: {one.row.remedy.rstrip('.')}"
+    return f"{one.text.rstrip('.')}: {one.remedy.rstrip('.')}"
 
 
 def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
@@ -91,7 +91,8 @@ def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     if count < MIN_POINTS * len(photographs.targets):
         return ""
     return (
-        f"; {count} candidates are smaller than min_diameter_px = {survey.targets.min_diameter_px:g}; codes "
+        f"; {counted(count, 'candidate')} {agreeing(count, 'is|are')} smaller than min_diameter_px = "
+        f"{survey.targets.min_diameter_px:g}; codes "
         f"are read from dots of {MIN_DOT_PX:g} px on in sharp photographs"
     )
 

@@ -46,7 +46,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
         else "; add photographs or points"
     )
     raise GeometryError(
-        f"{counted(n, 'common point')} in {counted(m, 'photograph')}: {observations} "
-        "observations and datum conditions for "
-        f"{unknowns} unknowns{free}, more are needed{advice}"
+        f"{counted(n, 'common point')} in {counted(m, 'photograph')}: {counted(observations, 'observation')} "
+        "and datum conditions for "
+        f"{counted(unknowns, 'unknown')}{free}, more are needed{advice}"
     )

@@ -241,7 +241,7 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
     ]
     if trial.plate is not None:
         plate = trial.plate
-        marks = f", {len(plate.marks)} marks" if plate.marks else ""
+        marks = f", {counted(len(plate.marks), 'mark')}" if plate.marks else ""
         found.append(("targets", f"{plate.name} of {plate.rows} rows and {plate.columns} columns{marks}"))
     elif trial.codes != "none":
         repeated = (

@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import IntArray
+from sfm.display import counted
 from sfm.distortion.balanced import from_balanced
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import Metadata
@@ -41,7 +42,7 @@ def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) 
     ]
     if len(matches) != 1:
         globs = ", ".join(f"{c.name} {', '.join(map(repr, c.images or ()))}" for c in cameras)
-        many = "no camera" if not matches else f"{len(matches)} cameras"
+        many = "no camera" if not matches else f"{counted(len(matches), 'camera')}"
         raise SurveyFileError(f"{source}: image '{image}' matches the glob of {many}: {globs}")
     return matches[0]
 

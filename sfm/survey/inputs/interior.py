@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
 from sfm.survey.inputs.cameras import free_start_values
@@ -162,7 +163,7 @@ def group_of_image(settings: CameraSettings, image: str, source: str = "survey")
     """
     matches = [g for g, glob in enumerate(settings.groups) if fnmatch.fnmatchcase(image, glob)]
     if len(matches) != 1:
-        many = "no group" if not matches else f"{len(matches)} groups"
+        many = "no group" if not matches else f"{counted(len(matches), 'group')}"
         raise SurveyFileError(
             f"{source}: camera {settings.name}: photograph '{image}' is in {many} of groups "
             f"{', '.join(settings.groups)}; one is needed"

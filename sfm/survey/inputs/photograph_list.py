@@ -117,4 +117,4 @@ def _holds(folder: Path) -> str:
     files = sorted(path.name for path in folder.iterdir() if path.is_file())
     if not files:
         return "which holds no files (--images names another folder)"
-    return f"which holds {len(files)} files such as '{files[0]}' (--images names another folder)"
+    return f"which holds {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"

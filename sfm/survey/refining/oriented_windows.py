@@ -10,6 +10,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.match_flags import LsmFlag, in_words
@@ -111,8 +112,10 @@ def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[st
     if adjusted.redundancy <= 0:
         why = words_of_reasons(by_count(lost))
         raise GeometryError(
-            f"refine: {2 * len(part.image_points)} coordinates of {len(part.points)} points measured anew in "
-            f"{len(part.images)} photographs are not more than is to be estimated from them; hold parameters "
+            f"refine: {counted(2 * len(part.image_points), 'coordinate')} of {len(part.points)} points "
+            "measured anew in "
+            f"{counted(len(part.images), 'photograph')} are not more than is to be estimated from them; "
+            "hold parameters "
             "of the cameras" + (f" (not measured anew: {why})" if why else "")
         )
 

@@ -23,6 +23,7 @@ from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, IntArray
+from sfm.display import counted
 from sfm.kernels.options import compiled
 from sfm.network import Network
 
@@ -94,7 +95,7 @@ def refuse_too_large(network: Network) -> None:
     first = step * m // TRIED_PAIRS
     second = (first + 1 + step * 7919 % (m - 1)) % m  # from next to it to far off in the sequence
     if (sees[first].multiply(sees[second]).sum(axis=1) > 0).mean() > MOSTLY:
-        refuse_what_does_not_fit(size, f"{6 * m} unknowns that are all connected", limit=limit)
+        refuse_what_does_not_fit(size, f"{counted(6 * m, 'unknown')} that are all connected", limit=limit)
 
 
 @compiled

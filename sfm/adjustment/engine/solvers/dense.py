@@ -40,6 +40,7 @@ from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares, times_i
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
+from sfm.display import counted
 from sfm.kernels.options import compiled, kernel
 from sfm.kernels.threads import at_once
 
@@ -88,7 +89,7 @@ class DenseSolver:
             GeometryError: the matrix would not fit in memory.
         """
         memory.refuse_what_does_not_fit(
-            self.bytes, f"{self.layout.reduced} unknowns that are all connected", limit=self.limit
+            self.bytes, f"{counted(self.layout.reduced, 'unknown')} that are all connected", limit=self.limit
         )
         scale = equations.parts.scale
         S = schur_complement(equations, self.layout, self.pairs, single=coarse)

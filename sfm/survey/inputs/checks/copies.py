@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
-from sfm.display import counted, listed
+from sfm.display import agreeing, counted, listed
 from sfm.distributions import f_sf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, rows_of
@@ -92,8 +92,9 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     keep = np.array([name not in copies for name in network.images], dtype=bool)
     if keep.sum() < 2:
         raise GeometryError(
-            f"{counted(len(copies), 'photograph')} of {len(keep)} show the object as another one does, "
-            f"down to the errors ({listed(copies)}): they are copies, or nothing moved "
+            f"{len(copies)} of {counted(len(keep), 'photograph')} {agreeing(len(copies), 'shows|show')} "
+            "the object "
+            f"as another one does, down to the errors ({listed(copies)}): copies, or nothing moved "
             "between the exposures; photograph from other directions, or move the plate"
         )
     every = np.ones(len(network.image_points), dtype=bool)

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.files.plain_text import as_plain
 from sfm.survey.inputs.settings import Section
 
@@ -53,7 +53,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):
         found = _found(list(first["input"]))
-        return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
+        return f"{where}{_key(location[:-1])}: found {found}, needed {counted(location[-1] + 1, 'value')}"
     if kind == "missing":
         every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
         return f"{where}{listed(every, most=MAX_TOLD)} {'is' if len(every) == 1 else 'are'} missing"
@@ -71,7 +71,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         needed = f"at most {context['le']:g}"
     elif kind == "too_long":
         most = context["max_length"]
-        needed = f"{most} values" if most <= FEW else f"at most {most} values"
+        needed = f"{counted(most, 'value')}" if most <= FEW else f"at most {counted(most, 'value')}"
     elif kind == "too_short":
         needed = f"at least {context['min_length']}"
     if needed is None:
