@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Iterable, Sequence
 
 MAX_LISTED = 5  # of many in one message
+NO_BREAK = "\N{NO-BREAK SPACE}"
+# a number and its unit, and between a number and what it is one of, are not parted at the end of a line
+WITH_UNIT = re.compile(r"(?<=\d) (?=(?:%|px|[kmcdµun]?m|deg|s|sigma|mrad|iterations?)(?![\w^]))")
 PROGRAMS = {"kolinear": "Kolinear", "colmap": "COLMAP"}  # as people write what survey files and tables name
 TEMPLATE = """\
 <table><caption>{{ title }}</caption>
@@ -38,6 +43,27 @@ def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
         for line in lines
     ]
     return "\n".join([title, *told])
+
+
+def bound(text: str) -> str:
+    """Return a text with no-break spaces between numbers and their units.
+
+    Examples:
+        >>> bound("95 % 1.95 px").split(" ") == [f"95{NO_BREAK}%", f"1.95{NO_BREAK}px"]
+        True
+    """
+    return WITH_UNIT.sub(NO_BREAK, text)
+
+
+def wrapped(text: str, width: int) -> str:
+    """Return a text in lines of a width that part no number from its unit.
+
+    Args:
+        text: of one paragraph.
+        width: characters of a line.
+    """
+    lines = textwrap.wrap(bound(text), max(width, 1), break_on_hyphens=False)
+    return "\n".join(lines).replace(NO_BREAK, " ")
 
 
 def plural(noun: str, count: float) -> str:

@@ -1,9 +1,15 @@
-"""Units of length that are taken for one another, recognised by the factor of lengths."""
+"""Units of length: those in which a length reads well, and those that are taken for one another."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from sfm.conventions import METRES
+
+METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
+"""metric units and their length in metres, largest first"""
+IMPERIAL = ("in", "ft")
 UNITS = {
     **{10.0: ("mm", "cm"), 100.0: ("cm", "m"), 1e3: ("mm", "m"), 1e6: ("um", "m")},
     **{25.4: ("mm", "inch"), 2.54: ("cm", "inch"), 1 / 0.0254: ("inch", "m"), 12.0: ("inch", "foot")},
@@ -21,6 +27,20 @@ class UnitFactor:
 
     factor: float  # of UNITS, or 1 over it
     units: tuple[str, str]  # the finer and the coarser one
+
+
+def finer_unit(unit: str, value: float) -> tuple[float, str]:
+    """Return by what to multiply lengths of about this size, and the metric unit in which they read well.
+
+    Args:
+        unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
+        value: the largest of the lengths, in that unit.
+    """
+    metres = METRES.get(unit)
+    if metres is None or unit in IMPERIAL or not math.isfinite(value) or value <= 0:
+        return 1.0, unit
+    name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
+    return metres / size, name
 
 
 def find_unit(lengths: float, rest: float) -> UnitFactor | None:

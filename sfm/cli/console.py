@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm.display import MAX_LISTED, counted, listed, program_name
+from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
@@ -26,6 +26,7 @@ from sfm.report.phrases import (
 from sfm.result import SurveyResult
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+COLUMN_GAP = 2  # characters between columns
 STYLES: dict[Severity, str] = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
@@ -39,10 +40,12 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     a = result.adjustment
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table = Table(show_header=False, box=None, padding=(0, COLUMN_GAP, 0, 0), pad_edge=False)
     figures = (*_figures(findings), ("time", f"{seconds:.1f} s, report included"))
-    for name, value in (*figures, *(_details(findings) if verbose else ())):
-        table.add_row(Text(name, style="dim"), Text(value))
+    rows = (*figures, *(_details(findings) if verbose else ()))
+    room = console.width - max(len(name) for name, _ in rows) - COLUMN_GAP
+    for name, value in rows:
+        table.add_row(Text(name, style="dim"), Text(wrapped(value, room)))
     console.print(table)
     tell_remarks(console, verdict.lines)
     for line in _failures(findings):

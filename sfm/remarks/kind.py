@@ -20,8 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.conventions import METRES
 from sfm.display import agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
+from sfm.units import finer_unit
 
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
 # coordinates, and where it is the root mean square of all, nothing of a result is right.
@@ -90,14 +92,35 @@ class Kind:
         Raises:
             KeyError: a part is missing that is not optional.
         """
-        parts: dict[str, tuple[str, ...] | Quantity] = {**one.subjects, **one.numbers}
+        stated: dict[str, tuple[str, ...] | Quantity] = {**one.subjects, **one.numbers}
+        parts = {**stated, **_readable(one.numbers)}
 
         def optional(found: re.Match[str]) -> str:
             inner = found.group(1)
             return inner if all(name in parts for name, _ in FIELD.findall(inner)) else ""
 
         text = OPTIONAL.sub(optional, text)
-        return FIELD.sub(lambda found: _written(parts, found.group(1), found.group(2) or ""), text)
+
+        def field(found: re.Match[str]) -> str:
+            name, spec = found.group(1), found.group(2) or ""
+            return _written(stated if spec.startswith(".") else parts, name, spec)  # decimals are of its unit
+
+        return FIELD.sub(field, text)
+
+
+def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
+    """Return numbers with lengths in the metric unit in which the largest reads well, or in a larger one."""
+    largest: dict[str, float] = {}
+    for one in numbers.values():
+        if one.unit in METRES and np.isfinite(one.value):
+            largest[one.unit] = max(abs(one.value), largest.get(one.unit, 0.0))
+    finer = {unit: finer_unit(unit, value) for unit, value in largest.items()}
+    shown = dict(numbers)
+    for name, one in numbers.items():
+        factor, unit = finer.get(one.unit, (1.0, one.unit))
+        if factor > 1:
+            shown[name] = Quantity(factor * one.value, unit)
+    return shown
 
 
 def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: str) -> str:

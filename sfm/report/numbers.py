@@ -6,17 +6,16 @@ Every report writes its numbers with these; the templates know them as filters o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from sfm.conventions import METRES, FloatArray
-from sfm.display import agreeing, counted
+from sfm.conventions import FloatArray
+from sfm.display import agreeing, bound, counted
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
+from sfm.units import finer_unit as finer_unit
 
-METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
-"""metric units and their length in metres, largest first"""
-IMPERIAL = ("in", "ft")
 SMALL = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -67,6 +66,14 @@ def or_fixed(sigma: float) -> str:
     return "fixed" if sigma == 0 else significant(sigma)
 
 
+def alike(values: Sequence[float], digits: int = 3) -> tuple[str, ...]:
+    """Write numbers of one quantity with significant digits, all with an exponent if one has it."""
+    told = tuple(significant(value, digits) for value in values)
+    if not any("e" in one for one in told):
+        return told
+    return tuple(scientific(value, digits - 1) if np.isfinite(value) else "not known" for value in values)
+
+
 def with_exponent(value: float, sigma: float) -> tuple[str, str]:
     """Write a parameter to the second digit of its standard deviation, and the latter; small ones as m e-n.
 
@@ -115,20 +122,6 @@ def raised(unit: str) -> str:
     return base + power.translate(SUPERSCRIPTS) if power else unit
 
 
-def finer_unit(unit: str, value: float) -> tuple[float, str]:
-    """Return by what to multiply lengths of about this size, and the metric unit in which they read well.
-
-    Args:
-        unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
-        value: the largest of the lengths, in that unit.
-    """
-    metres = METRES.get(unit)
-    if metres is None or unit in IMPERIAL or not np.isfinite(value) or value <= 0:
-        return 1.0, unit
-    name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
-    return metres / size, name
-
-
 def finer_unit_of(unit: str, *values: FloatArray) -> tuple[float, str]:
     """Return the same for arrays of lengths, of which the largest known one counts."""
     return finer_unit(unit, max(float(np.nanmax(np.abs(array), initial=0.0)) for array in values))
@@ -143,6 +136,7 @@ FILTERS = {
     one.__name__: one
     for one in (
         agreeing,
+        bound,
         counted,
         fixed,
         probability,

@@ -14,7 +14,7 @@ from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.precision import Precision
-from sfm.report.numbers import finer_unit, significant, with_exponent
+from sfm.report.numbers import alike, finer_unit, significant, with_exponent
 from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
@@ -89,10 +89,10 @@ def words_of_check(found: CheckedControl, unit: str) -> str:
     """
     longest, points = float(found.length[found.worst]), found.check.points
     factor, finer = finer_unit(unit, longest)
-    rms = ", ".join(significant(value * factor) for value in found.check.rms)
+    *rms, most = alike([*(found.check.rms * factor), longest * factor])
     return (
-        f"RMS {rms} {finer} in X, Y, Z at {counted(len(points), 'point')}; largest "
-        f"{significant(longest * factor)} {finer} at {points[found.worst]}"
+        f"RMS {', '.join(rms)} {finer} in X, Y, Z at {counted(len(points), 'point')}; largest "
+        f"{most} {finer} at {points[found.worst]}"
     )
 
 
@@ -124,11 +124,10 @@ def words_of_precision(typical: float, largest: float, unit: str) -> str:
         unit: object unit.
     """
     factor, finer = finer_unit(unit, largest)
-    sigmas, within = (
-        f"{significant(times * typical)} {finer} RMS, {significant(times * largest)} {finer} at most"
-        for times in (factor, NORMAL_95 * factor)
-    )
-    return f"1 sigma {sigmas}; 95 % {within}"
+    one = np.array([typical, largest]) * factor
+    rms, most, rms_95, most_95 = alike([*one, *(NORMAL_95 * one)])
+    sigmas = f"1 sigma {rms} {finer} RMS, {most} {finer} at most"
+    return f"{sigmas}; 95 % {rms_95} {finer} RMS, {most_95} {finer} at most"
 
 
 def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:

@@ -44,5 +44,7 @@ def test_what_cannot_be_inverted_is_refused() -> None:
     network, truth = make_network(seed_of("undistort"), images=2, points=10, model="opencv")
     camera = truth.cameras[0]
     folded = camera.with_parameters(camera.parameters + np.array([0, 0, 0, 0, -50.0, 0, 0, 0]))
-    with pytest.raises(GeometryError, match=r"cannot be inverted at \d+ image points?, the first is point \d"):
+    with pytest.raises(
+        GeometryError, match=r"cannot be inverted at \d+ image points?, the first is point \d"
+    ):
         undistort(network, replace(truth, cameras=(folded,)), ("opencv",))

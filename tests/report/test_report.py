@@ -37,9 +37,17 @@ from sfm.report.findings.geometry import geometry_of
 from sfm.report.findings.other_adjuster import comparison_of
 from sfm.report.html.page import environment
 from sfm.report.html.report_page import report_page
-from sfm.report.numbers import finer_unit, placed, probability, significant, to_precision, with_exponent
+from sfm.report.numbers import (
+    alike,
+    finer_unit,
+    placed,
+    probability,
+    significant,
+    to_precision,
+    with_exponent,
+)
 from sfm.report.output import WRITTEN, write_result
-from sfm.report.phrases import words_left_out
+from sfm.report.phrases import words_left_out, words_of_precision
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
 from sfm.report.text.filters import WIDTH
@@ -304,7 +312,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
         assert question in tags.text
     assert "too small" in tags.text
     assert "1 of 9 photographs is not in the result." in tags.text
-    assert f"{result.adjustment.sigma0_px:.4f} px" in tags.text
+    assert f"{result.adjustment.sigma0_px:.4f}\N{NO-BREAK SPACE}px" in tags.text
 
 
 def test_plots_are_legible_on_a_telephone(browser: Any, result: SurveyResult, tmp_path: Path) -> None:
@@ -707,3 +715,18 @@ def test_the_terminal_says_once_why_photographs_are_lost(
 
 
 REASONS = (("photograph_with_few_points", "seen"), ("photograph_not_connected", "shared"))
+
+
+def test_numbers_of_one_quantity_are_written_alike(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert alike([9.15e-7, 1.56e-6]) == ("9.15e-07", "1.56e-06")
+    assert alike([9.15e-3, 1.56e-2, np.nan]) == ("0.00915", "0.0156", "not known")
+    told = words_of_precision(9.15e-7, 1.56e-6, "network units")
+    assert len(re.findall(r"\de-\d", told)) == 4 and "0.0000" not in told
+    monkeypatch.setenv("COLUMNS", "60")
+    tell_result(findings_of(result), Path("page"), seconds=1.0, verbose=True)
+    for line in capsys.readouterr().out.splitlines():
+        assert not re.match(r" +(?:%|px|mm|m|deg)(?:[ ,;]|$)", line), line
+    page = report_page(findings_of(result), (), ())
+    assert re.search(r"95(?: |&nbsp;|\xa0)%", page) and not re.search(r"<small>[^<]*\d px", page)

@@ -21,7 +21,6 @@ from sfm.remarks.remark import Remark, remark
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
 from sfm.report.findings.protocol import ControlCoordinate
-from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
@@ -112,17 +111,14 @@ def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...
     points, off = {one.point for one in tested}, {one.point for one in beyond}
     if 2 * len(off) > len(points):
         farthest = max(abs(one.difference) for one in beyond)
-        factor, finer = finer_unit(unit, farthest)
-        distance = (factor * farthest, finer)
-        return (remark("checks_contradict", count=len(off), all=len(points), distance=distance),)
+        return (remark("checks_contradict", count=len(off), all=len(points), distance=(farthest, unit)),)
     worst = max(beyond, key=lambda one: abs(one.test))
-    factor, finer = finer_unit(unit, abs(worst.difference))
     return (
         remark(
             "check_differs",
             coordinate=worst.coordinate,
             point=worst.point,
-            difference=(factor * abs(worst.difference), finer),
+            difference=(abs(worst.difference), unit),
             sigmas=abs(worst.test),
         ),
     )
