@@ -2,7 +2,8 @@
 
 Every line has `time` (UTC) and `event`:
 
-    start       survey, file, version; in a batch: inputs (fingerprint of all it reads)
+    start       survey, file, version; survey_at, images_at (paths from the folder of the result);
+                in a batch: inputs (fingerprint of all it reads)
     photograph  image, targets, rejected, features, stored (measured in an earlier run), seconds; or failed
     stage       stage, seconds, steps
     warning     text

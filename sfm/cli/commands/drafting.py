@@ -60,33 +60,42 @@ def init(
     print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
 
 
-def drafted_beside(photographs: Path, out: Path | None, pitch: float | None) -> tuple[Path, Path]:
+def drafted_beside(
+    photographs: Path, out: Path | None, pitch: float | None, *, overwrite: bool = False
+) -> tuple[Path, Path]:
     """Draft the survey of a folder of photographs, unless a file beside the result has it already.
 
     Args:
         photographs: the folder.
         out: folder of the result, None for out/NAME OF THE FOLDER.
         pitch: of a plate, mm; None to assume it.
+        overwrite: whether a file of other photographs is drafted anew.
 
     Returns:
         The survey file, and the folder of the result.
 
     Raises:
-        KolinearError: no photographs, a pitch beside a file that has one, or the file cannot be written.
+        KolinearError: no photographs, a pitch beside a file that has one, a result of other photographs, or
+            the file cannot be written.
     """
     with loading():
         from sfm.files.open_folders import refuse_links
+        from sfm.report.origin import Origin, read_origin, refuse_other_origin
         from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(photographs.resolve().name) if out is None else out
     file = out.parent / f"{out.name}.toml"
     refuse_links(file)
-    if file.exists():
+    if not overwrite:
+        refuse_other_origin(out, Origin(file, photographs))
+    earlier = read_origin(out)
+    is_other = earlier is not None and earlier.images.resolve() != photographs.resolve()
+    if file.exists() and not is_other:
         refuse_pitch(pitch, file)
         print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
         return file, out
     draft = _draft(photographs, pitch)
-    _write(draft, file)
+    _write(draft, file, replaces=is_other)
     return file, out
 
 
@@ -119,13 +128,13 @@ def _draft(photographs: Path, pitch: float | None = None) -> Draft:
     return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
-def _write(draft: Draft, file: Path) -> None:
+def _write(draft: Draft, file: Path, *, replaces: bool = False) -> None:
     """Write a drafted survey, and tell on stderr what was found."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.remarks.verdict import lines_of
 
-    with whole_file(file) as part:
+    with whole_file(file, replaces=replaces) as part:
         try:
             part.write_text(draft.text, encoding="utf-8")
         except UnicodeEncodeError as error:

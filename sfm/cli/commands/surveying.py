@@ -39,9 +39,13 @@ Out = Annotated[
     typer.Option(
         "--out",
         metavar="DIR",
-        help="Folder of the result, written whole or not at all; an earlier result is replaced.  "
-        "[default: out/NAME OF THE SURVEY]",
+        help="Folder of the result, written whole or not at all; an earlier result of the survey is "
+        "replaced.  [default: out/NAME OF THE SURVEY]",
     ),
+]
+Overwrite = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace a result of another survey file or of other photographs."),
 ]
 Jobs = Annotated[
     int | None,
@@ -95,6 +99,7 @@ def run(
     camera: Calibration = None,
     camera_weighted: Weighted = False,
     out: Out = None,
+    overwrite: Overwrite = False,
     jobs: Jobs = None,
     pictures_mb: PicturesMb = 15.0,
     allow_outside: AllowOutside = False,
@@ -116,7 +121,7 @@ def run(
             print(f"Running {survey_file}", file=sys.stderr)
         else:
             images = survey_file
-            survey_file, out = drafted_beside(images, out, pitch)
+            survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite)
             pitch = None
     if survey_file.is_file():
         refuse_pitch(pitch, survey_file)
@@ -130,6 +135,7 @@ def run(
         from_photographs=True,
         camera=camera,
         weighted=camera_weighted,
+        overwrite=overwrite,
         pictures_mb=pictures_mb,
     )
 
@@ -139,6 +145,7 @@ def adjust(
     camera: Calibration = None,
     camera_weighted: Weighted = False,
     out: Out = None,
+    overwrite: Overwrite = False,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
@@ -153,6 +160,7 @@ def adjust(
         from_photographs=False,
         camera=camera,
         weighted=camera_weighted,
+        overwrite=overwrite,
     )
 
 
@@ -163,6 +171,7 @@ def run_file(survey_file: Path) -> Path:
         from_photographs=None,
         camera=None,
         weighted=False,
+        overwrite=False,
         pictures_mb=15.0,
     )
 
@@ -178,6 +187,7 @@ def _run_survey(
     from_photographs: bool | None,
     camera: Path | None,
     weighted: bool,
+    overwrite: bool,
     pictures_mb: float = 0.0,
 ) -> Path:
     """Run a survey, write and tell its result, return its folder; the command is for photographs or not."""
@@ -190,6 +200,7 @@ def _run_survey(
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
+        from sfm.report.origin import Origin, refuse_other_origin
         from sfm.report.output import write_result
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
@@ -230,6 +241,9 @@ def _run_survey(
         raise KolinearError("--camera-weighted: expected --camera RESULT with it")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
+    origin = Origin(survey_file, images or survey_file.parent)
+    if not overwrite:
+        refuse_other_origin(folder, origin)
     if from_photographs:
         find_photographs(survey, images_dir=images)  # a wrong folder is told before anything is compiled
     compile_first()
@@ -247,7 +261,7 @@ def _run_survey(
         _written(folder),
         SurveyLog(watch=drawn) as log,
     ):
-        log.start(survey.name, survey_file)
+        log.start(survey.name, survey_file, **origin.written(folder))
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
         findings = findings_of(result)
         page = write_result(

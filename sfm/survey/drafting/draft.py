@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,15 +178,25 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
 
 
 def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
-    counted = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
-    lines = [f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"]
-    families = fill(", ".join((*FAMILIES, *PLATES)), COMMENT_WIDTH, break_on_hyphens=False)
-    lines += [f"# {line}" for line in f"Families of codes, plates and boards:\n{families}".splitlines()]
+    kinds = _kinds_of_codes().splitlines()
     if trial.plate is not None:
-        return [*lines, *_plate_lines(trial.plate, pitch)]
+        return [*kinds, *_plate_lines(trial.plate, pitch)]
+    counted = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
+    tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"
+    lines = [tried, *kinds]
     if trial.codes == "none":
         return [*lines, "# No coded targets: points of natural texture take their place.", "[tie_points]"]
     return [*lines, "[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
+
+
+def _kinds_of_codes() -> str:
+    """Return a comment that names the kinds of codes, with … for many of one kind, and the plates."""
+    kinds: dict[str, list[str]] = {}
+    for name in FAMILIES:
+        kinds.setdefault(re.split(r"[\d_]", name)[0], []).append(name)
+    codes = ", ".join(names[0] if len(names) == 1 else f"{kind}…" for kind, names in kinds.items())
+    text = f"# Codes: {codes}; plates: {', '.join(PLATES)}"
+    return fill(text, COMMENT_WIDTH, subsequent_indent="# ", break_on_hyphens=False)
 
 
 def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:

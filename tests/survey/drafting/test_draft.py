@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import sys
 import tomllib
 from pathlib import Path
@@ -15,12 +16,27 @@ from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.sensor_widths import sensor_width_mm
 from sfm import cli
-from sfm.errors import GeometryError
+from sfm.errors import GeometryError, OutputError
+from sfm.files.manifest import manifest_text, sha256_of
+from sfm.report.origin import Origin, read_origin, refuse_other_origin
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
 from sfm.targets.codes.families import FAMILIES
 from sfm.targets.codes.plates import PLATES
 from tests.surveys import write_photograph_survey
+
+PHOTOS = """
+[survey]
+name = "photos"
+unit = "mm"
+[[camera]]
+name = "small"
+images = "*.png"
+pixel_mm = [0.005, 0.005]
+c_mm = 8.0
+[datum]
+kind = "free"
+"""
 
 
 def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -67,8 +83,10 @@ def test_a_folder_becomes_a_result(
 
     survey = tmp_path / "mine/first.toml"
     comments = [line for line in survey.read_text().splitlines() if line.startswith("#")]
-    listed = set(" ".join(comments).replace("#", "").replace(",", "").split())
-    assert {*FAMILIES, *PLATES} <= listed and max(map(len, comments[1:])) <= 110
+    listed = set(" ".join(comments).replace("#", "").replace(",", "").replace(";", "").split())
+    assert set(PLATES) <= listed and max(map(len, comments[1:])) <= 110
+    heads = tuple(word.removesuffix("…") for word in listed if word.endswith("…"))
+    assert all(name in listed or name.startswith(heads) for name in FAMILIES)
     survey.write_text(survey.read_text().replace('kind = "free"', 'kind = "minimal"'))
     capsys.readouterr()
     assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
@@ -76,6 +94,38 @@ def test_a_folder_becomes_a_result(
     assert f"Running {Path('mine/first.toml')}, which is there already" in told.err
     assert "minimal" in told.out, "the file that a person changed is run as it is"
     np.testing.assert_allclose(sizes(tmp_path / "mine/first"), first, atol=1e-9)
+
+
+def test_a_result_of_another_survey_is_replaced_only_when_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same survey is run again as it is, also after all was moved together."""
+    out = tmp_path / "all" / "out" / "photos"
+    out.mkdir(parents=True)
+    file, images = out.parent / "photos.toml", tmp_path / "all" / "photos"
+    own = Origin(file, images)
+    assert read_origin(out) is None
+    refuse_other_origin(out, own)  # nothing is there
+    line = {"event": "start", "survey": "photos", **own.written(out)}
+    (out / "log.jsonl").write_text(json.dumps(line) + "\n", encoding="utf-8")
+    (out / "manifest.json").write_text(
+        manifest_text({"log.jsonl": [sha256_of(out / "log.jsonl")]}), encoding="utf-8"
+    )
+    refuse_other_origin(out, own)
+    for other in (Origin(file, tmp_path / "photos"), Origin(tmp_path / "photos.toml", images)):
+        with pytest.raises(OutputError, match="--overwrite"):
+            refuse_other_origin(out, other)
+    file.write_text(PHOTOS, encoding="utf-8")
+    monkeypatch.chdir(tmp_path / "all")
+    for given in (("--images", tmp_path / "photos"), ("--images", images)):
+        assert kolinear(monkeypatch, "run", file, *given) == 2
+        said = capsys.readouterr().err
+        assert ("--overwrite" in said) == (given[1] != images), said
+        assert kolinear(monkeypatch, "run", file, *given, "--overwrite") == 2
+        assert "--overwrite" not in capsys.readouterr().err, "no photographs are there"
+    (tmp_path / "all").rename(tmp_path / "moved")
+    moved = tmp_path / "moved"
+    refuse_other_origin(moved / "out/photos", Origin(moved / "out/photos.toml", moved / "photos"))
 
 
 def test_init_writes_only_the_file_and_replaces_none(

@@ -1,0 +1,59 @@
+"""Survey file and photographs of the result in a folder, which no other survey replaces unseen."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm.errors import OutputError
+from sfm.report.log import LOG, read_log
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a result was computed from."""
+
+    file: Path  # the survey file
+    images: Path  # folder of the photographs
+
+    def written(self, out: Path) -> dict[str, str]:
+        """Return the paths from the folder of the result, which stay true where all are moved together."""
+        return {"survey_at": _path_from(out, self.file), "images_at": _path_from(out, self.images)}
+
+
+def read_origin(out: Path) -> Origin | None:
+    """Return of what the result in a folder is; None without a result that states it."""
+    try:
+        lines = read_log(out / LOG)
+    except OSError:
+        return None
+    begun = next((line for line in lines if line.get("event") == "start"), {})
+    file, images = begun.get("survey_at"), begun.get("images_at")
+    if not isinstance(file, str) or not isinstance(images, str):
+        return None
+    return Origin(out / file, out / images)
+
+
+def refuse_other_origin(out: Path, own: Origin) -> None:
+    """Raise OutputError where a folder has the result of another survey file or of other photographs."""
+    earlier = read_origin(out)
+    if earlier is None:
+        return
+    for what, there, here in (
+        ("the survey", earlier.file, own.file),
+        ("the photographs in", earlier.images, own.images),
+    ):
+        if os.path.realpath(there) != os.path.realpath(here):
+            raise OutputError(
+                f"{out}: has the result of {what} {os.path.normpath(there)}, which --overwrite replaces; "
+                "--out names another folder"
+            )
+
+
+def _path_from(out: Path, path: Path) -> str:
+    out, path = Path(os.path.realpath(out)), Path(os.path.realpath(path))
+    try:
+        return os.path.relpath(path, out)
+    except ValueError:  # on another drive
+        return str(path)
