@@ -30,7 +30,7 @@ from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
-from sfm.report.figures.plots import SHADES, all_plots, plan_axes
+from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
@@ -730,3 +730,18 @@ def test_numbers_of_one_quantity_are_written_alike(
         assert not re.match(r" +(?:%|px|mm|m|deg)(?:[ ,;]|$)", line), line
     page = report_page(findings_of(result), (), ())
     assert re.search(r"95(?: |&nbsp;|\xa0)%", page) and not re.search(r"<small>[^<]*\d px", page)
+
+
+def test_names_in_the_plan_view_do_not_overlap(result: SurveyResult) -> None:
+    """Photographs near one another have no room for the names of all; those apart have theirs."""
+    shown = plot_data(findings_of(result))
+    assert len(shown.position) == 8
+    drawn = []
+    for spread in (1.0, 0.02):
+        middle = shown.position.mean(axis=0)
+        figure = network_figure(replace(shown, position=middle + spread * (shown.position - middle)))
+        figure.draw_without_rendering()
+        boxes = [text.get_window_extent() for text in figure.axes[0].texts if text.get_text()]
+        assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+        drawn.append(len(boxes))
+    assert drawn[0] > drawn[1] >= 1

@@ -570,3 +570,51 @@ def test_displacements_and_deviations_are_coloured_and_drawn(
             assert ends == [6 * POINTS // 2, 6 * POINTS // 2]
         assert tab.complaints == []
         tab.close()
+
+
+def test_a_plan_has_stations_in_view_and_nothing_of_residuals(
+    browser: Any, scene: ViewerScene, tmp_path: Path
+) -> None:
+    """Image points of a plan have no residuals: no scale, no column and no figure of them."""
+    planned = replace(
+        scene,
+        point_rms_px=np.zeros_like(scene.point_rms_px),
+        photo_rms_px=np.zeros_like(scene.photo_rms_px),
+        position=scene.xyz.mean(axis=0) + 12 * (scene.position - scene.xyz.mean(axis=0)),
+    )
+    tab = Tab(browser, write_view(planned, tmp_path / "plan.html", source="here", paths={}), width=500)
+    page = tab.ready()
+    assert page.locator(".v-legend:visible").count() == 1
+    assert page.locator("option[value=rms]").count() == 0
+    assert page.locator("#explore th:has-text('RMS')").count() == 0
+    seen = page.evaluate(
+        "() => { const { scene } = document.getElementById('explore').viewer;"
+        " return scene.stations.map((p) => "
+        "{ const q = p.clone().project(scene.camera); return [q.x, q.y] }) }"
+    )
+    assert len(seen) == 7 * IMAGES and np.abs(seen).max() <= 0.95
+    page.evaluate(SELECT, ["point", 3])
+    assert "RMS" not in page.locator(".v-panel").inner_text()
+    assert tab.complaints == []
+    tab.close()
+
+
+def test_names_do_not_overlap(tab: Tab) -> None:
+    page = tab.page
+    page.get_by_label("names", exact=True).check()
+    page.evaluate("() => document.getElementById('explore').viewer.scene.draw()")
+    boxes = np.array(page.evaluate("() => document.getElementById('explore').viewer.scene.named"))
+    page.get_by_label("names", exact=True).uncheck()
+    assert len(boxes) > IMAGES
+    low, high = boxes[:, None, :2], boxes[None, :, 2:]
+    apart = ((low >= high) | (low.swapaxes(0, 1) >= high.swapaxes(0, 1))).any(axis=2)
+    assert (apart | np.eye(len(boxes), dtype=bool)).all()
+
+
+def test_sigmas_of_a_photograph_have_the_unit_of_those_of_points(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    page.evaluate("() => document.getElementById('explore').viewer.model.a['photo.sigma'].fill(2e-4)")
+    page.evaluate(SELECT, ["photograph", 1])
+    panel = page.locator(".v-panel").inner_text()
+    unit = page.evaluate("() => document.getElementById('explore').viewer.model.fine.unit")
+    assert unit != scene.unit and panel.count(f"sigma 200 {unit}") == 3, panel

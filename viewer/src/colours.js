@@ -77,6 +77,7 @@ export function pointScales(model) {
   }
   const values = { sigma, rays, rms, angle }
   if (!known.length) delete scales.sigma
+  if (!model.hasResiduals) delete scales.rms
   if (model.a["point.displacement"]) {
     const displacement = Float64Array.from({ length: model.pointCount }, (_, j) => model.displacement(j))
     const first = new Scale("displacement of a point", model.fine.unit, 0, largest(displacement), {
@@ -99,8 +100,9 @@ function largest(values) {
   return values.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
 }
 
+/** The scale of the photographs; null where they have no residuals. */
 export function photoScale(model) {
-  return ratioScale("RMS residual of a photograph", "px", model.a["photo.rms"])
+  return model.hasResiduals ? ratioScale("RMS residual of a photograph", "px", model.a["photo.rms"]) : null
 }
 
 /** A scale of equal ratios from the smallest value above 0 to the largest. */

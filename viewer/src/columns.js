@@ -26,7 +26,7 @@ export function tablesOf(model, hub, element) {
       number("sigma", "sigma", (j) => model.sigma(j) * fine.factor, orFixed, fine.unit),
       number("rays", "rays", (j) => a["point.rays"][j], String),
       number("angle", "angle", (j) => a["point.angle"][j], (v) => (Number.isFinite(v) ? v.toFixed(1) : ""), "deg"),
-      number("rms", "RMS", (j) => a["point.rms"][j], short, "px"),
+      ...(model.hasResiduals ? [number("rms", "RMS", (j) => a["point.rms"][j], short, "px")] : []),
       ...(a["point.displacement"]
         ? [
             number("displacement", "displacement", (j) => model.displacement(j) * fine.factor, short, fine.unit),
@@ -48,7 +48,7 @@ export function tablesOf(model, hub, element) {
       ...["omega", "phi", "kappa"].map((name, c) => number(name, name, (i) => a["photo.angles"][3 * i + c], (v, i) => toPrecision(v, a["photo.sigma"][6 * i + 3 + c]), "deg")),
       number("points", "points", (i) => a["photo.points"][i], String),
       number("rejected", "rejected", (i) => model.raysOfPhoto(i).reduce((n, k) => n + model.a["ray.rejected"][k], 0), String),
-      number("rms", "RMS", (i) => a["photo.rms"][i], short, "px"),
+      ...(model.hasResiduals ? [number("rms", "RMS", (i) => a["photo.rms"][i], short, "px")] : []),
     ],
     every(model.photoCount),
     (i) => ({ kind: "photograph", index: i }),

@@ -36,6 +36,8 @@ class Model {
     const next = this.firstOfPhoto.slice()
     for (let k = 0; k < this.rayCount; k++) this.rayOrder[next[photo[k]]++] = k
     this.firstMark = starts(arrays["mark.photo"], this.photoCount)
+    // Image points of a plan are predicted and have no residuals.
+    this.hasResiduals = ["photo.rms", "point.rms"].some((key) => arrays[key].some((rms) => rms > 0))
     this.cropOfRay = new Map()
     arrays["crop.ray"].forEach((ray, k) => this.cropOfRay.set(ray, k))
   }

@@ -4,7 +4,7 @@ import * as THREE from "three"
 import { roundStep, significant } from "./numbers.js"
 
 const FONT = "12px system-ui, sans-serif"
-const CELL_PX = 16 // side of the cells of which each belongs to one name
+const HIGH_PX = 14 // of a line of names
 const MAX_NAMES = 400
 const MAX_LETTERS = 24
 
@@ -17,15 +17,15 @@ export function drawLabels(scene, dark) {
   context.font = FONT
   const ink = dark ? "#e6edf5" : "#1b2430"
   const paper = dark ? "rgba(40,48,58,.8)" : "rgba(255,255,255,.8)"
-  const taken = new Set()
+  const taken = []
   let left = MAX_NAMES
   const put = (text, position, must = false) => {
     const at = left > 0 || must ? scene.project(position) : null
     if (!at || at[0] < 0 || at[1] < 0 || at[0] > width || at[1] > height) return
     const short = text.length > MAX_LETTERS ? `${text.slice(0, MAX_LETTERS)}\u2026` : text
-    const cells = cellsOf(at, context.measureText(short).width)
-    if (!must && cells.some((cell) => taken.has(cell))) return
-    cells.forEach((cell) => taken.add(cell))
+    const box = [at[0], at[1] - HIGH_PX, at[0] + 7 + context.measureText(short).width, at[1]]
+    if (!must && taken.some((other) => overlap(box, other))) return
+    taken.push(box)
     left -= 1
     context.lineWidth = 3
     context.strokeStyle = paper
@@ -41,16 +41,21 @@ export function drawLabels(scene, dark) {
     if (scene.photographs.object.visible) {
       for (let i = 0; i < model.photoCount; i++) put(model.photographs[i], scene.local(model.centre(i)))
     }
-    for (let j = 0; j < model.pointCount && left > 0; j++) put(model.points[j], scene.local(model.xyz(j)))
+    for (const j of byPriority(model)) put(model.points[j], scene.local(model.xyz(j)))
   }
+  scene.named = taken
   scaleBar(scene, context, height, ink)
   axes(scene, context, width, height, ink)
 }
 
-function cellsOf([x, y], width) {
-  const found = []
-  for (let k = 0; k * CELL_PX <= width + 7; k++) found.push(`${Math.floor(x / CELL_PX) + k},${Math.floor(y / CELL_PX)}`)
-  return found
+function overlap(a, b) {
+  return a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3]
+}
+
+/** Points in the order in which they get room for their names: control, the ends of scale bars, the others. */
+function byPriority(model) {
+  const first = [...model.control, ...model.bars.flatMap((bar) => [bar.from, bar.to])]
+  return new Set([...first, ...Array(model.pointCount).keys()])
 }
 
 function scaleBar(scene, context, height, ink) {

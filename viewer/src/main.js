@@ -80,10 +80,10 @@ function toolbar(model, scene, hub, tools, legends) {
   const own = make("div", { className: "v-legend" })
   const other = make("div", { className: "v-legend" })
   legends.append(own, other)
-  let by = scales.displacement ? "displacement" : scales.deviation ? "deviation" : scales.sigma ? "sigma" : "rms"
-  let byPhoto = "rms"
+  let by = ["displacement", "deviation", "sigma", "rms", "rays"].find((key) => scales[key])
+  let byPhoto = photos ? "rms" : ""
   const paint = () => {
-    for (const scale of [...Object.values(scales), photos]) scale.dark = scene.dark
+    for (const scale of [...Object.values(scales), ...(photos ? [photos] : [])]) scale.dark = scene.dark
     scene.points.paint(values[by], scales[by])
     scene.photographs.paint(model.a["photo.rms"], byPhoto === "rms" ? photos : null)
     drawLegend(scales[by], own, make, paint)
@@ -109,10 +109,14 @@ function toolbar(model, scene, hub, tools, legends) {
     find,
     names,
     choice("points by", options, (value) => (by = value) && paint(), { value: by, id: "points-by" }),
-    choice("photographs by", [["rms", "RMS"], ["", "one colour"]], (value) => {
-      byPhoto = value
-      paint()
-    }),
+    ...(photos
+      ? [
+          choice("photographs by", [["rms", "RMS"], ["", "one colour"]], (value) => {
+            byPhoto = value
+            paint()
+          }),
+        ]
+      : []),
     standard,
     button("reset", () => scene.begin(), { title: "as at the start" }),
     tick("orthographic", false, (on) => scene.setOrthographic(on)),
@@ -217,6 +221,10 @@ function findName(model, scene, hub, input) {
   input.classList.add("v-wrong")
 }
 
+function rmsWords(model, key, index) {
+  return model.hasResiduals ? `, RMS ${significant(model.a[key][index])} px` : ""
+}
+
 function showHover(model, stage, box, { found, x, y }) {
   box.hidden = !found
   if (!found) return
@@ -224,10 +232,10 @@ function showHover(model, stage, box, { found, x, y }) {
   if (kind === "point") {
     const s = model.sigma(index)
     const words = Number.isFinite(s) ? `${sigmaWords(s * model.fine.factor, model.fine.unit)}, ` : ""
-    box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${counted(model.a["point.rays"][index], "ray")}, RMS ${significant(model.a["point.rms"][index])} px`)
+    box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${counted(model.a["point.rays"][index], "ray")}${rmsWords(model, "point.rms", index)}`)
   } else {
     const address = model.picture("thumbnail", index)
-    const words = ` ${counted(model.a["photo.points"][index], "point")}, RMS ${significant(model.a["photo.rms"][index])} px`
+    const words = ` ${counted(model.a["photo.points"][index], "point")}${rmsWords(model, "photo.rms", index)}`
     box.replaceChildren(make("b", {}, model.photographs[index]), words)
     if (address) box.append(make("img", { src: address, alt: "", width: 160 }))
   }

@@ -67,7 +67,7 @@ export class Panel {
         ...coordinates,
         ["rays", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
         ["intersection angle", `${fixed(model.a["point.angle"][j], 1)} deg`],
-        ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`],
+        model.hasResiduals ? ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`] : null,
         Number.isFinite(model.a["point.deviation"]?.[j]) ? ["deviation", `${fixed(model.a["point.deviation"][j] * model.fine.factor, 4)} ${model.fine.unit}`] : null,
         model.a["point.displacement"] && Number.isFinite(model.displacement(j)) ? ["displacement", this.displacementWords(j)] : null,
         model.control.includes(j) ? ["given as", "control point"] : null,
@@ -135,18 +135,18 @@ export class Panel {
     const angles = model.a["photo.angles"].subarray(3 * i, 3 * i + 3)
     const rays = model.raysOfPhoto(i)
     const rejected = rays.filter((k) => model.rejected(k)).length
-    const pair = (value, sigma, unit) =>
-      `${toPrecision(value, sigma)} ${unit}${sigma > 0 ? `, sigma ${significant(sigma)} ${unit}` : ""}`
+    const pair = (value, sigma, unit, { factor, unit: fine } = { factor: 1, unit }) =>
+      `${toPrecision(value, sigma)} ${unit}${sigma > 0 ? `, sigma ${significant(sigma * factor)} ${fine}` : ""}`
     this.view = new PhotographView(model, i, this.hub)
     this.element.replaceChildren(
       make("h3", { className: "v-title" }, `Photograph ${model.photographs[i]}`),
       this.view.element,
       facts([
         ["camera", model.camera(i).name],
-        ...[x, y, z].map((v, c) => [`${"XYZ"[c]}0`, pair(v, s[c], model.unit)]),
+        ...[x, y, z].map((v, c) => [`${"XYZ"[c]}0`, pair(v, s[c], model.unit, model.fine)]),
         ...["omega", "phi", "kappa"].map((name, c) => [name, pair(angles[c], s[3 + c], "deg")]),
         ["image points", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
-        ["RMS residual", `${fixed(model.a["photo.rms"][i], 4)} px`],
+        model.hasResiduals ? ["RMS residual", `${fixed(model.a["photo.rms"][i], 4)} px`] : null,
       ]),
       this.view.reasons(),
     )

@@ -50,6 +50,12 @@ export class Photographs {
   }
 }
 
+/** Positions of the corners of the pyramid of a photograph. */
+export function pyramidOf(model, i, origin, size) {
+  const all = corners(model, i, origin, size)
+  return Array.from({ length: CORNERS }, (_, k) => new THREE.Vector3(...all.slice(3 * k, 3 * k + 3)))
+}
+
 function corners(model, i, origin, size) {
   const camera = model.camera(i)
   const R = model.rotation(i)

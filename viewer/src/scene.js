@@ -6,7 +6,7 @@ import { Displacements } from "./displacements.js"
 import { Ellipsoids } from "./ellipsoids.js"
 import { drawLabels } from "./labels.js"
 import { Picker } from "./picking.js"
-import { Photographs } from "./photographs.js"
+import { Photographs, pyramidOf } from "./photographs.js"
 import { MANY, Points } from "./points.js"
 import { lines, Rays } from "./rays.js"
 
@@ -64,8 +64,9 @@ export class Scene {
     this.radius = Math.max(this.objectRadius, far)
     const places = (count, place) => Array.from({ length: count }, (_, k) => this.local(place(k)))
     this.object = places(n, (j) => model.xyz(j)).filter((p) => p.length() <= FAR_RADII * this.objectRadius)
-    this.stations = places(model.photoCount, (i) => model.centre(i)).filter((p) => p.length() <= FAR_RADII * this.radius)
     this.pyramid = 0.09 * (median(stations) || this.objectRadius) * Math.min(1, Math.sqrt(40 / model.photoCount))
+    const near = Array.from({ length: model.photoCount }, (_, i) => i).filter((i) => distanceOf(model.centre(i), middle) <= FAR_RADII * this.radius)
+    this.stations = near.flatMap((i) => pyramidOf(model, i, this.origin, this.pyramid))
     const towards = new THREE.Vector3()
     for (let i = 0; i < model.photoCount; i++) {
       const c = model.centre(i)
@@ -75,8 +76,8 @@ export class Scene {
     // Photographs all around an object say nothing of what is up: then it is Z.
     this.up = towards.length() > 0.3 * model.photoCount ? towards.normalize() : new THREE.Vector3(0, 0, 1)
     const axis = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((v) => new THREE.Vector3(...v))
-    const near = axis.find((v) => Math.abs(v.dot(this.up)) > 0.94)
-    if (near) this.up = near.multiplyScalar(Math.sign(near.dot(this.up)))
+    const nearest = axis.find((v) => Math.abs(v.dot(this.up)) > 0.94)
+    if (nearest) this.up = nearest.multiplyScalar(Math.sign(nearest.dot(this.up)))
   }
 
   barEnds() {
@@ -203,10 +204,10 @@ export class Scene {
     this.camera.updateMatrixWorld()
   }
 
-  /** Look at object and photographs, or at the object where it would be small between them. */
+  /** Look at object and photographs, or at the object where it would be small between them; a plan is of both. */
   begin() {
     this.home([...this.object, ...this.stations])
-    if (this.share() < SMALLEST) this.home()
+    if (this.share() < SMALLEST && this.model.hasResiduals) this.home()
   }
 
   /** Part of the canvas that the object takes, along the side of which it takes more. */

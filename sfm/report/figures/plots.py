@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib import colormaps
@@ -152,22 +152,37 @@ def network_figure(shown: PlotData) -> Figure:
         panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
         entitled(panel, title)
         panel.grid(color="#ddd", linewidth=0.5)
-    plan = figure.axes[0]
-    middle = sum(plan.get_xlim()) / 2
-    for name, x, y in zip(shown.images, position[:, 0], position[:, 1], strict=True):
-        if len(position) <= MAX_NAMED:
-            right = x > middle  # names go inwards
-            plan.annotate(
-                _plain(_short(name)),
+    figure.axes[0].legend(loc="upper right", fontsize=7)
+    if len(position) <= MAX_NAMED:
+        _write_names(figure.axes[0], [_plain(_short(name)) for name in shown.images], position[:, :2])
+    return figure
+
+
+def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
+    """Write names beside places, inwards and above where there is room; one without room is left out."""
+    figure = panel.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()
+    legend = panel.get_legend()
+    taken = [legend.get_window_extent()] if legend is not None else []
+    middle = sum(panel.get_xlim()) / 2
+    for name, (x, y) in zip(names, places, strict=True):
+        inwards = -1 if x > middle else 1
+        for side, height in ((inwards, 4), (inwards, -9), (-inwards, 4), (-inwards, -9)):
+            text = panel.annotate(
+                name,
                 (x, y),
-                xytext=(-4 if right else 4, 4),
-                ha="right" if right else "left",
+                xytext=(4 * side, height),
+                ha="left" if side > 0 else "right",
                 textcoords="offset points",
                 fontsize=7,
                 color="#444",
             )
-    plan.legend(loc="upper right", fontsize=7)
-    return figure
+            box = text.get_window_extent()
+            if not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+            text.remove()
 
 
 def precision_figure(shown: PlotData) -> Figure:
