@@ -22,6 +22,7 @@ from sfm.planning.weakness import (
     Calibratability,
     WeakPoint,
     calibratability,
+    separate_groups,
     unusable_photographs,
     weak_points,
 )
@@ -40,6 +41,7 @@ class Plan:
     shortfall: float  # largest of predicted over wanted; 0 where nothing is wanted
     weak: tuple[WeakPoint, ...]
     unusable: tuple[str, ...]  # photographs that share too few points with others
+    groups: tuple[tuple[str, ...], ...]  # of photographs that are connected, the largest first
     calibration: Calibratability | None  # None where the camera is held
     target: TargetSize  # that shows MIN_PIXELS from the farthest station
     coded: IntArray  # points that are coded targets, so that every photograph has five
@@ -106,6 +108,7 @@ def describe_plan(
         shortfall,
         weak_points(prediction),
         unusable_photographs(prediction),
+        separate_groups(prediction),
         calibratability(prediction, seeing),
         size,
         coded,

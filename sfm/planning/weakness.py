@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from sfm.adjustment.quality.correlations import OrientationCorrelation, orientation_correlations
 from sfm.adjustment.quality.projection import projection_covariance
@@ -108,6 +109,29 @@ def unusable_photographs(prediction: Prediction) -> tuple[str, ...]:
     return tuple(
         name for name, k in zip(prediction.stations.names, prediction.photograph, strict=True) if k < 0
     )
+
+
+def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
+    """Return the groups of photographs that share too few points to be one network, the largest first.
+
+    A group is joined to another with which it shares MIN_POINTS points, as a photograph is; a network that is
+    connected is one group.
+    """
+    network = prediction.adjustment.network
+    m = len(network.images)
+    seen = np.zeros((m, len(network.points)), dtype=np.float32)
+    seen[network.image_points.image, network.image_points.point] = 1
+    group = np.arange(m)
+    while True:
+        of_group = np.zeros((int(group.max()) + 1, seen.shape[1]), dtype=np.float32)
+        np.maximum.at(of_group, group, seen)
+        count, joined = connected_components(of_group @ of_group.T >= MIN_POINTS, directed=False)
+        group = joined[group]
+        if count == len(of_group):
+            break
+    groups = [np.flatnonzero(group == k) for k in range(count)]
+    groups.sort(key=lambda one: (-len(one), int(one[0])))
+    return tuple(tuple(network.images[k] for k in one) for one in groups)
 
 
 def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability | None:

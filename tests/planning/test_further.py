@@ -14,6 +14,7 @@ from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
+from sfm.planning.findings import verdict_of_plan
 from sfm.planning.further import further_photographs
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
@@ -22,6 +23,7 @@ from sfm.planning.sight.image_precision import TargetImage
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations, arrangement
 from sfm.planning.wanted import Wanted
+from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest, write_further
 from sfm.report.planning import write_plan
@@ -112,3 +114,20 @@ def test_a_planned_target_lies_where_its_point_is() -> None:
     scene = planned_scene(np.array([[1.0, 2, 3], [4, 5, 6]]), normals, np.array([-1, 5]), 2.0, family)
     assert np.allclose(scene.faces.normals(), normals)
     assert np.allclose(scene.faces.place(scene.targets.face, scene.targets.centre), scene.faces.centre)
+
+
+def test_groups_that_nothing_joins_are_named() -> None:
+    """Two rings of stations of which each sees other sides of a box are two networks, not one that is "
+    "weak."""
+    camera = camera_from_values("full", "brown", (6000, 4000), (0.006, 0.006), c_mm=35.0)
+    box = shape_object("box", (400.0, 300.0, 200.0), 200)
+    seeing = Seeing(sigma_px=0.05)
+    named = {}
+    for rings in ("two-rings:16", "ring:16"):
+        stations = arrangement(rings, box, camera)
+        plan = plan_of("box", "mm", box, camera, stations, seeing, wanted=Wanted())
+        found = of_kind(verdict_of_plan(plan).remarks, "plan_not_connected", "plan_undetermined")
+        named[rings] = [(one.kind, one.names("photographs"), one.names("others")) for one in found]
+        assert sorted(name for group in plan.groups for name in group) == sorted(stations.names)
+    upper, lower = (tuple(f"S{k:02d}" for k in range(first, 17, 2)) for first in (1, 2))
+    assert named == {"two-rings:16": [("plan_not_connected", lower, upper)], "ring:16": []}

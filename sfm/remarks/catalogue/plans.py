@@ -14,6 +14,16 @@ ROWS = (
         explains=("plan_does_not_calibrate",),
     ),
     Kind(
+        "plan_not_connected",
+        "error",
+        "{photographs} {photographs:shares|share} fewer than {needed} points with {others}: they are "
+        "separate "
+        "networks.",
+        "steps between directions or heights that are too large, or parts of the object that nothing joins",
+        "Add stations between them, from which points of both are seen.",
+        explains=("plan_undetermined",),
+    ),
+    Kind(
         "plan_points_undetermined",
         "error",
         "{lost} of {total} points {lost:is|are} not determined: {points}.",
