@@ -14,10 +14,12 @@ from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import PhotographList
-from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring import surface_points
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.measuring import surface_points, tie_points
 from sfm.survey.measuring.covering_points import _Places, _visible
 from sfm.survey.measuring.surface_points import Surface, cover_photographs
+from sfm.survey.measuring.tie_points import natural_points_of
 from tests.matching.test_tie_points import _scene as small_scene
 
 SURVEY = """
@@ -36,8 +38,8 @@ codes = "none"
 HELD = "window_px = 15\n"
 
 
-def covered(folder: Path, more: str = HELD) -> Surface:
-    """Return the surface of three small photographs from their true orientation and 35 tie points."""
+def prepared(folder: Path, more: str) -> tuple[Survey, Measurements, Orientation]:
+    """Return a survey of three small photographs, their true orientation and 35 tie points."""
     photographs, truth, _ = small_scene()
     (folder / "survey.toml").write_text(SURVEY + more)
     survey = read_survey(folder / "survey.toml")
@@ -55,9 +57,39 @@ def covered(folder: Path, more: str = HELD) -> Surface:
     measured = Measurements(network, truth.cameras, names, np.full(n, 3), files=files)
     fits = np.ones(3 * n, dtype=bool)
     start = Orientation(truth, (), (), (names[0], names[1]), "spatial", fits, 0.1, np.ones(1))
-    found = cover_photographs(survey, measured, start)
+    return survey, measured, start
+
+
+def covered(folder: Path, more: str = HELD) -> Surface:
+    """Return the surface of three small photographs from their true orientation and 35 tie points."""
+    found = cover_photographs(*prepared(folder, more))
     assert found is not None
     return found
+
+
+def test_tie_points_stay_where_windows_are_fewer(tmp_path: Path) -> None:
+    assert cover_photographs(*prepared(tmp_path, "window_px = 61\n")) is None
+
+
+@pytest.mark.parametrize(
+    ("more", "searched"), [("", [2000] * 3 + [8000] * 3), ("max_features = 2000\n", [2000] * 3)]
+)
+def test_photographs_with_few_tie_points_are_searched_for_more_features(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: str, searched: list[int]
+) -> None:
+    survey, measured, _ = prepared(tmp_path, HELD + more)
+    assert measured.files is not None
+    asked = []
+    monkeypatch.setattr(tie_points, "SCARCE_TIE_POINTS", 1000)  # those of this scene are fewer
+
+    def found(path: Path, settings: TiePointSettings, *args: object, **rest: object) -> object:
+        asked.append(settings.max_features)
+        return natural_points_of(path, settings, *args, **rest)
+
+    monkeypatch.setattr(tie_points, "natural_points_of", found)
+    tied = tie_points.tie_photographs(survey, measured.files)
+    assert asked == searched
+    assert len(tied.network.points) > 10
 
 
 def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 COMMENT_WIDTH = 100  # letters
-FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
+FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
 PITCH = 25.0  # of a plate, UNIT, where none is given: that of many printed boards
@@ -140,7 +140,7 @@ def _text(
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     for camera in grouping.cameras:
-        lines += ["", *_camera_lines(camera, FREE if trial.plate is None else FREE_BY_PLATES)]
+        lines += ["", *_camera_lines(camera, _free(trial))]
     if left_out:
         lines += ["", "# Left out:"]
         lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
@@ -162,6 +162,13 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
+def _free(trial: TargetTrial) -> tuple[str, ...]:
+    """Return what is free of the cameras; of texture nothing is said, and the adjustment chooses."""
+    if trial.plate is not None:
+        return FREE_BY_PLATES
+    return FREE_BY_TARGETS if trial.codes != "none" else ()
+
+
 def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
     globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
     lines = [
@@ -172,7 +179,9 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
         'model = "brown"',
-        f"free = {json.dumps(list(free))}",
+        f"free = {json.dumps(list(free))}"
+        if free
+        else '# free = ["c", "x0", "y0", "K1", "K2"]  # without it: what the photographs determine',
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
 

@@ -64,7 +64,8 @@ def cover_photographs(
         jobs: photographs worked on at a time.
 
     Returns:
-        None where the orientation leaves no tie point. Points are named t00001, t00002 ... in the order in
+        None where the tie points are more than the windows, as where the surface is nowhere plane over them,
+        or where the orientation leaves none. Points are named t00001, t00002 ... in the order in
         which they are found; these are the names that control and scale bars of the survey mean.
     """
     network, estimate, files, settings = measured.network, start.estimate, measured.files, survey.tie_points
@@ -91,6 +92,8 @@ def cover_photographs(
         min_rays=MIN_RAYS,
         threads=jobs,
     )
+    if len(found.image_points) < fits.sum():
+        return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
     order = np.argsort(found.image_points.point, kind="stable")
     covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
