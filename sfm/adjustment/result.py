@@ -26,7 +26,8 @@ class Covariance:
 
     points: FloatArray  # of X, Y, Z of each object point, object unit^2, (n, 3, 3)
     exterior: FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (m, 6, 6)
-    interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order, (f, f)
+    interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order; the variance of one
+    # that is not determined is infinite, (f, f)
     points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
 
 
@@ -140,7 +141,10 @@ class Adjustment:
         return float((used**2).sum(axis=1).max() ** 0.5)
 
     def interior_sigma(self, camera: int) -> FloatArray:
-        """Return the standard deviation of each parameter of a camera, NaN for those not adjusted, (p,)."""
+        """Return the standard deviation of each parameter of a camera, (p,).
+
+        It is NaN for those not adjusted, and infinite for those that are not determined.
+        """
         free = np.flatnonzero(self.estimate.cameras[camera].free)
         sigma = np.full(len(self.estimate.cameras[camera].free), np.nan)
         variance = np.diagonal(self.covariance.interior[camera])

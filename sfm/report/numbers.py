@@ -18,6 +18,7 @@ from sfm.units import finer_unit as finer_unit
 
 SMALL = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none
+NOT_DETERMINED = "not determined"  # in place of an infinite standard deviation
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -79,8 +80,10 @@ def with_exponent(value: float, sigma: float) -> tuple[str, str]:
 
     Args:
         value: the parameter.
-        sigma: its standard deviation, NaN if it was held fixed.
+        sigma: its standard deviation, NaN if it was held fixed, infinite if it is not determined.
     """
+    if np.isinf(sigma):
+        return (f"{value:.6g}", NOT_DETERMINED)
     if not (np.isfinite(sigma) and sigma > 0):
         return (f"{value:.6g}", "held fixed")
     if abs(value) >= SMALL or value == 0:

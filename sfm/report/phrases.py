@@ -14,7 +14,7 @@ from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.precision import Precision
-from sfm.report.numbers import alike, finer_unit, significant, with_exponent
+from sfm.report.numbers import NOT_DETERMINED, alike, finer_unit, significant, with_exponent
 from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
@@ -135,11 +135,13 @@ def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     values, sigmas, within = [], [], []
     for one in camera.parameters:
         value, sigma = with_exponent(one.value, one.sigma)
-        held = not one.sigma > 0
+        state = NOT_DETERMINED if np.isinf(one.sigma) else "" if one.sigma > 0 else "held"
         values.append(f"{one.name} {value} {one.unit}")
-        sigmas.append("held" if held else f"{sigma} {one.unit}")
-        within.append("held" if held else f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
+        sigmas.append(state or f"{sigma} {one.unit}")
+        within.append(state or f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
     rms, largest = camera.projection_rms_px, camera.projection_largest_px
+    if np.isinf(rms):
+        return ", ".join(values), ", ".join(sigmas), ", ".join(within), NOT_DETERMINED
     projection = (
         f"1 sigma {significant(rms)} px RMS over the photograph, {significant(largest)} px at most; "
         f"95 % {significant(NORMAL_95 * rms)} px, {significant(NORMAL_95 * largest)} px"

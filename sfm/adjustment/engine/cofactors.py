@@ -17,6 +17,7 @@ import numpy as np
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed
+from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.products import times_points, times_reduced
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
@@ -135,7 +136,10 @@ def hat_complement(
 
 
 def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> Covariance:
-    """Return the covariance with NaN for photographs and points that took no part or have open directions.
+    """Return the covariance without what is not determined.
+
+    NaN stands for photographs and points that took no part or have open directions. A parameter of interior
+    orientation that a null vector leaves open has an infinite variance and no covariances: no datum fixes it.
 
     Args:
         covariance: of all photographs and points.
@@ -148,7 +152,16 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
     exterior = covariance.exterior.copy()
     points[idle_point] = limiting[idle_point] = np.nan
     exterior[idle_image] = np.nan
-    return replace(covariance, points=points, exterior=exterior, points_limiting=limiting)
+    opened = np.asarray(leading(optimum.factor.further).any(axis=1))
+    interior = []
+    for own, Q in zip(layout.interior_column, covariance.interior, strict=True):
+        without, rows = Q.copy(), np.flatnonzero(opened[own])
+        without[rows] = without[:, rows] = np.nan
+        without[rows, rows] = np.inf
+        interior.append(without)
+    return replace(
+        covariance, points=points, exterior=exterior, interior=tuple(interior), points_limiting=limiting
+    )
 
 
 def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:

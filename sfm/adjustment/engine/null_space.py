@@ -23,9 +23,10 @@ from sfm.adjustment.engine.motions import Motions, carriers
 from sfm.adjustment.engine.normals import Equations, solve_transposed
 from sfm.adjustment.engine.products import times_reduced
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 
 MIN_CARRIERS = 3  # points that fix position, attitude and scale
+LEADING = 0.1  # share of the largest component of a null vector from which it leaves a parameter open
 MOVED = 1e-6  # |A dx| of the points that carry the datum from which a null vector of length 1 moves them
 
 
@@ -40,6 +41,12 @@ def on_sound_points(datum: ResolvedDatum, held: IntArray) -> ResolvedDatum:
         return datum
     sound = held == 0 if datum.points is None else datum.points & (held == 0)
     return datum._replace(points=sound) if sound.sum() >= MIN_CARRIERS else datum
+
+
+def leading(vectors: FloatArray) -> BoolArray:
+    """Return the unknowns that each null vector leaves open, (reduced, e), of scaled ones (reduced, e)."""
+    size = np.abs(vectors)
+    return np.asarray(size >= LEADING * size.max(axis=0, keepdims=True, initial=0.0))
 
 
 def with_further(

@@ -9,13 +9,13 @@ import numpy as np
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.normals import times_schur
+from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.network import Estimate, Network
 
 MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
-LEADING = 0.1  # share of the largest component of a null vector from which a parameter is named
 AXIS = 1e-3  # of length 1 that a direction may lack to be called that of a coordinate axis
 AXES = ("X", "Y", "Z")
 EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
@@ -149,12 +149,11 @@ def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> lis
 
 def _name(vector: FloatArray, layout: Unknowns, network: Network, estimate: Estimate) -> str:
     """Return the leading parameters of a null vector: "c, y0 of camera A with Z0 of 12 photographs"."""
-    size = np.abs(vector)
-    names = reduced_names(layout, network, estimate)
-    leading = [names[r] for r in np.argsort(-size) if size[r] >= LEADING * size.max()]
-    interior = [f"{part} of {owner}" for part, owner in leading if owner.startswith("camera")]
-    others = Counter(part for part, owner in leading if not owner.startswith("camera"))
-    single = {part: owner for part, owner in leading if not owner.startswith("camera")}
+    names, named = reduced_names(layout, network, estimate), leading(vector[:, None])[:, 0]
+    open_ones = [names[r] for r in np.argsort(-np.abs(vector)) if named[r]]
+    interior = [f"{part} of {owner}" for part, owner in open_ones if owner.startswith("camera")]
+    others = Counter(part for part, owner in open_ones if not owner.startswith("camera"))
+    single = {part: owner for part, owner in open_ones if not owner.startswith("camera")}
     parts = interior + [
         f"{part} of {single[part]}" if count == 1 else f"{part} of {count} photographs"
         for part, count in others.items()

@@ -299,7 +299,7 @@ def _free(camera: Camera, Q: FloatArray) -> IntArray:
 
 def _strong(Q: FloatArray, names: list[str], limit: float) -> list[Correlation]:
     sigma = np.sqrt(np.clip(np.diagonal(Q), 0, None))
-    known = sigma > 0
+    known = (sigma > 0) & np.isfinite(sigma)
     rho = Q / np.where(known, sigma, 1.0)[:, None] / np.where(known, sigma, 1.0)
     rows, columns = np.nonzero(np.triu(np.abs(rho) > limit, 1))
     return [Correlation(names[r], names[c], float(rho[r, c])) for r, c in zip(rows, columns, strict=True)]

@@ -1,4 +1,4 @@
-"""The cameras of a calibration: what matters in a result whose points are all held fixed, as on a plate."""
+"""The cameras of a calibration: what matters in a result whose points are given, as those of a plate."""
 
 from __future__ import annotations
 
@@ -22,29 +22,46 @@ class CalibratedCamera:
 
     name: str
     parameters: tuple[InteriorParameter, ...]  # focal lengths and principal point
-    projection_rms_px: float  # projection uncertainty, 1 sigma, over the whole photograph, px
-    projection_largest_px: float  # its largest value, px
+    projection_rms_px: float  # projection uncertainty, 1 sigma, over the whole photograph, px; infinite where
+    # a parameter is not determined
+    projection_largest_px: float  # its largest value, px; likewise
+
+
+def camera_is_result(adjustment: Adjustment) -> bool:
+    """Return whether a survey calibrates its cameras: it adjusts as much of them as of unknown coordinates.
+
+    The coordinates of a point are known if all three are given, to better than a pixel as its photographs
+    see it. Standard deviations that small, as of a plate, differ from a fixed point in no way that matters.
+    """
+    network, known = adjustment.network, np.zeros(len(adjustment.network.points), dtype=bool)
+    if adjustment.datum != "control" or not adjustment.unknown_counts[1]:
+        return False
+    given, seen = network.control.complete, network.image_points.select(~adjustment.rejected)
+    sigma = np.full(len(known), np.inf)
+    sigma[given.point] = np.sqrt(np.trace(given.covariance, axis1=1, axis2=2) / 3)
+    c = np.array([one.c_px for one in adjustment.estimate.cameras])[network.camera[seen.image]]
+    away = adjustment.estimate.points[seen.point] - adjustment.estimate.position[seen.image]
+    known[seen.point[c * sigma[seen.point] < np.linalg.norm(away, axis=1)]] = True
+    unknown = np.zeros(len(known), dtype=bool)
+    unknown[seen.point] = True
+    return bool(3 * (unknown & ~known).sum() <= adjustment.unknown_counts[1])
 
 
 def calibrated_cameras(adjustment: Adjustment, interior: InteriorOrientation) -> tuple[CalibratedCamera, ...]:
-    """Return the adjusted cameras where all points are held fixed; none where a coordinate was adjusted."""
-    if adjustment.unknown_counts[2]:
+    """Return the adjusted cameras of a survey that calibrates them; none of another survey."""
+    if not camera_is_result(adjustment):
         return ()
     found = []
     for f, family in enumerate(interior.families):
         projection = projection_of(adjustment, interior.family == f)
-        if projection is None:
-            continue
-        sigma = projection[2]
-        known = sigma[np.isfinite(sigma)]
-        found.append(
-            CalibratedCamera(
-                family.name,
-                tuple(one for one in family.parameters if one.parameter.role in OF_CAMERA),
-                root_mean_square(known),
-                float(known.max(initial=np.nan if not known.size else -np.inf)),
-            )
-        )
+        parameters = tuple(one for one in family.parameters if one.parameter.role in OF_CAMERA)
+        if projection is None and not any(np.isinf(one.sigma) for one in family.parameters):
+            continue  # held
+        rms = largest = np.inf
+        if projection is not None:
+            known = projection[2][np.isfinite(projection[2])]
+            rms, largest = root_mean_square(known), float(known.max()) if known.size else np.nan
+        found.append(CalibratedCamera(family.name, parameters, rms, largest))
     return tuple(found)
 
 
@@ -59,7 +76,7 @@ def projection_of(
 
     Returns:
         Columns (c,) and rows (r,) of a grid, px, and the standard deviation at its crossings, px, (r, c);
-        None where the camera was held.
+        None where the camera was held or is not determined.
     """
     network, seen = adjustment.network, adjustment.network.image_points.select(~adjustment.rejected)
     if not photographs.any():

@@ -6,14 +6,25 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import SurveyResult
 
 DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 
-def camera_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return the remarks on all cameras."""
-    return (*_hardly_determined(result), *_principal_points(result))
+def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
+    """Return the remarks on all cameras, where they are the result on how well they are known as such."""
+    weak = _not_calibrated(calibrated) if calibrated else _hardly_determined(result)
+    return (*weak, *_principal_points(result))
+
+
+def _not_calibrated(calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
+    """Return the cameras of a calibration that do not know where a direction is seen in the photograph."""
+    found: list[Remark] = []
+    for one in calibrated:
+        rms = one.projection_rms_px
+        found += unless_note(remark("camera_not_calibrated", camera=one.name, rms=(rms, "px")))
+    return tuple(found)
 
 
 def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
@@ -26,12 +37,8 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
         owner = camera.owner_of(0)
         if np.isfinite(sigma):
             share, partners = sigma / abs(c), strong.get(f"{name} of camera {owner}")
-            one = unless_note(
-                remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
-            )
-            if one and not result.adjustment.unknown_counts[2]:  # the camera is the result
-                one = (remark("camera_not_calibrated", parameter=name, camera=owner, share=share),)
-            found.setdefault(owner, one)
+            one = remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
+            found.setdefault(owner, unless_note(one))
     return tuple(one for remarks in found.values() for one in remarks)
 
 

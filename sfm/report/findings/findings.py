@@ -65,7 +65,7 @@ class Findings:
     statistics: Statistics
     geometry: Geometry
     interior: InteriorOrientation
-    calibrated: tuple[CalibratedCamera, ...]  # where all points are held fixed, as those of a plate
+    calibrated: tuple[CalibratedCamera, ...]  # where the cameras are the result
     given: Given
     check: CheckedControl | None  # control that took no part
     precision: Precision
@@ -93,6 +93,7 @@ def findings_of(result: SurveyResult) -> Findings:
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
     consistency, edges = consistency_of(a), edges_of(result.photographs)
     geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
+    calibrated = calibrated_cameras(a, interior)
     remarks = (
         *adjustment_remarks(a),
         *photograph_remarks(result),
@@ -103,7 +104,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *ray_remarks(a),
         *consistency_remarks(consistency),
         *sharpness_remarks(result, edges, consistency),
-        *camera_remarks(result),
+        *camera_remarks(result, calibrated),
         *given_remarks(result, given, statistics, check_coordinates(result)),
         *comparison_remarks(result),
     )
@@ -117,7 +118,7 @@ def findings_of(result: SurveyResult) -> Findings:
         statistics=statistics,
         geometry=geometry,
         interior=interior,
-        calibrated=calibrated_cameras(a, interior),
+        calibrated=calibrated,
         given=given,
         check=check,
         precision=precision,
