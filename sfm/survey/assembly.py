@@ -9,6 +9,7 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import CheckPoint, FailedImage, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import Correspondences, Solution
+from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import SurveyComparison
@@ -34,13 +35,14 @@ def assemble_result(
         if one[0] not in is_in
     )
     correlations = exterior_correlations(adjustment)
+    code = np.full(len(points), -1) if naming is None else naming.codes(adjustment.network)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
         images_total=len(measured.images) - sum(one.is_copy for one in measured.failed),
         failed=measured.failed + failed,
         adjustment=adjustment,
-        code=np.full(len(points), -1) if naming is None else naming.codes(adjustment.network),
+        code=code,
         comparison=compared.adjusters,
         baseline=compared.baseline,
         photographs=measured.overlays if matched.overlays is None else matched.overlays,
@@ -50,6 +52,7 @@ def assemble_result(
             *start.remarks,
             *matched.remarks,
             *solution.remarks,
+            *(() if naming is None else plates_not_in_result(survey.family, code)),
             *compared.remarks,
         ),
         eccentricity=matched.eccentricity,

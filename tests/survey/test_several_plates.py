@@ -16,6 +16,7 @@ from sfm.pipeline import run_survey
 from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.similarity import fit_similarity
+from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.detect import find_targets
@@ -153,3 +154,13 @@ def test_plates_of_a_survey_must_be_complete(tmp_path: Path) -> None:
     (tmp_path / "survey.toml").write_text(f'{rings}[[plate]]\ncodes = "grid"\n', encoding="utf-8")
     with pytest.raises(SurveyFileError, match="needed a first plate"):
         read_survey(tmp_path / "survey.toml")
+
+
+def test_a_plate_without_a_point_in_the_result_is_reported() -> None:
+    """Before, a plate that one photograph showed counted as seen, and the survey as one that worked."""
+    plates = group_plates([GRID, APRIL, BOARD])
+    first, second, third = (np.arange(one.first_point, one.last_point + 1) for one in plates.plates)
+    assert plates_not_in_result(plates, np.concatenate([first, second[:1], third, [-1]])) == ()
+    (lost,) = plates_not_in_result(plates, np.concatenate([first, third]))
+    assert (lost.kind, lost.severity) == ("plate_not_in_result", "warning")
+    assert lost.names("codes") == ("aprilgrid",)

@@ -70,6 +70,13 @@ ROWS = (
         explains=("photograph_with_few_points",),
     ),
     Kind(
+        "plate_not_in_result",
+        "warning",
+        "The result has no point of the plate or board {codes} of {size}.",
+        "it was found in fewer than two photographs, or its photographs do not belong to the others",
+        "Take more photographs that show it beside the other plates, or remove it from the survey file.",
+    ),
+    Kind(
         "plate_not_recognised",
         "note",
         "In {photographs:photograph} {dots:dot} {dots:does|do} not fit the plate of {size}: {photographs}.",

@@ -1,9 +1,10 @@
-"""Photographs in which the calibration plate of a survey was not found, and what to do."""
+"""Calibration plates that were not found in photographs, or are not in the result, and what to do."""
 
 from __future__ import annotations
 
 import statistics
 
+from sfm.conventions import IntArray
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.targets.codes.dot_plates import MIN_DOTS
@@ -48,3 +49,17 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
             many = round(statistics.median(dots[name] for name in strange))
             remarks.append(remark("plate_not_recognised", photographs=strange, dots=many, size=size))
     return tuple(remarks)
+
+
+def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[Remark, ...]:
+    """Return the remarks on plates beside another one of which the result has no point.
+
+    Args:
+        family: codes of the survey.
+        code: of each point of the result, -1 without one, (n,).
+    """
+    return tuple(
+        remark("plate_not_in_result", codes=plate.name, size=f"{plate.rows} x {plate.columns}")
+        for plate in plates_of(family)
+        if not ((code >= plate.first_point) & (code <= plate.last_point)).any()
+    )
