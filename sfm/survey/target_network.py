@@ -16,7 +16,7 @@ from sfm.survey.diagnosis.missing_plates import missing_plates
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
-from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.inputs.settings import MAX_LENGTH_PER_SIGMA, TargetSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -113,16 +113,17 @@ def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
     bars = []
     for settings, plate in zip(survey.plates, plates_of(survey.family)[1:], strict=True):
         seen = naming.code[(naming.code >= plate.first_point) & (naming.code <= plate.last_point)]
-        if len(seen) < MIN_RAYS or settings.pitch is None:
+        if not len(seen) or settings.pitch is None:
             continue
         xyz = plate.plane(settings.pitch)[seen - plate.first_point]
         for along in (xyz[:, 0] + xyz[:, 1], xyz[:, 0] - xyz[:, 1]):
             ends = along.argmin(), along.argmax()
+            if along[ends[0]] == along[ends[1]]:
+                continue  # two points across the diagonal
             length = float(np.linalg.norm(xyz[ends[1]] - xyz[ends[0]]))
-            # the print has one scale, which both diagonals share
-            one = TAG_SIGMA * length if settings.plate_sigma is None else np.sqrt(2) * settings.plate_sigma
+            sigma = np.sqrt(2) * (settings.plate_sigma or 0.0)
             start, end = (str(seen[k]) for k in ends)
-            bars.append(ScaleBar(start, end, length, float(np.sqrt(2) * one)))
+            bars.append(ScaleBar(start, end, length, max(sigma, length / MAX_LENGTH_PER_SIGMA)))
     return bars
 
 

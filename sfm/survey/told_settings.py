@@ -16,7 +16,8 @@ def told_settings(survey: Survey) -> tuple[tuple[str, str], ...]:
     """
     sections: list[tuple[str, Section]] = [(f"camera {one.name}", one) for one in survey.cameras]
     if survey.observations is None:
-        sections += [("targets", survey.targets), *(("plate", one) for one in survey.plates)]
+        sections.append(("targets", survey.targets))
+        sections += [(f"plate {k}", one) for k, one in enumerate(survey.plates, 2)]
     if survey.tie_points is not None:
         sections.append(("tie_points", survey.tie_points))
     sections += [("datum", survey.datum), ("adjust", survey.adjust), ("compare", survey.compare)]

@@ -17,7 +17,10 @@ from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
-from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.measurements import Naming
+from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.target_network import plate_bars
+from sfm.survey.told_settings import told_settings
 from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.detect import find_targets
 from tests.plates import GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
@@ -108,6 +111,34 @@ def test_a_second_plate_is_measured_in_the_frame_of_the_first(
     ratio = np.sqrt(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error).mean() / 3)
     assert 0.5 < ratio < 1.7  # errors of the orientations are common to all points of a plate
     assert shape.scale == pytest.approx(1.0, abs=5e-4)
+
+
+def two_plates(folder: Path, line: str = "") -> Survey:
+    """Return a survey of two AprilGrids, with one line more in the second."""
+    tags = 'dictionary = "apriltag36h11"\ntag_size = 9.0\n'
+    text = SURVEY.format(
+        name="two", polarity="dark", pixel=PIXEL_MM, datum="control", pitch=f"{PITCH}\n{tags}",
+        codes="aprilgrid", rows=8, columns=10, marks=[],
+    ).replace("marks = []\n", "")  # fmt: skip
+    text += f'[[plate]]\ncodes = "aprilgrid"\nrows = 6\ncolumns = 8\npitch = {PITCH}\n{tags}first_tag = 40\n'
+    (folder / "survey.toml").write_text(text + line, encoding="utf-8")
+    return read_survey(folder / "survey.toml")
+
+
+def test_a_further_plate_is_as_true_as_the_first(tmp_path: Path) -> None:
+    """Before, its diagonals had 0.2 % where nothing is stated, and those of the first none."""
+
+    def bars(line: str, codes: list[int]) -> list[tuple[str, str, float, float]]:
+        naming = Naming((), np.array(codes), (), False)
+        found = plate_bars(two_plates(tmp_path, line), naming)
+        return [(one.start, one.end, one.sigma / one.length, one.sigma) for one in found]
+
+    (first, second) = bars("", list(range(80, 128)))
+    assert first[:3] == ("120", "87", 1e-6) and second[:3] == ("80", "127", 1e-6)
+    (first, second) = bars("plate_sigma = 0.01", list(range(80, 128)))
+    assert first[3] == pytest.approx(0.01 * np.sqrt(2)) == second[3]
+    assert bars("", [80]) == [] and len(bars("", [80, 81])) == 2 and len(bars("", [80, 89])) == 1  # across
+    assert [name for name, _ in told_settings(two_plates(tmp_path))][1:3] == ["targets", "plate 2"]
 
 
 def test_points_are_numbered_on_and_found_in_one_photograph() -> None:

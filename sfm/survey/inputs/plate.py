@@ -26,7 +26,7 @@ OF_PLATES = (
 MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
 
 
-def plate_family(targets: TargetSettings | PlateSettings) -> PlateFamily | None:
+def plate_family(targets: PlateSettings) -> PlateFamily | None:
     """Return the plate that the targets are on; None where they are on none."""
     if targets.codes not in PLATES or targets.rows is None or targets.columns is None:
         return None
@@ -94,7 +94,7 @@ def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> 
     return bool(np.array_equal(control.xyz, plate.xyz) and np.array_equal(control.sigma, plate.sigma))
 
 
-def refuse_contradicting_plates(targets: TargetSettings | PlateSettings, where: str) -> None:
+def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
     """Raise SurveyFileError where what is said of a plate is incomplete, or belongs to none."""
     given = [name for name in OF_PLATES if name in targets.model_fields_set]
     if targets.codes not in PLATES:

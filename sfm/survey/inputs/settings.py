@@ -137,8 +137,22 @@ class CameraSettings(Section):
         return tuple(name for name in MODELS[self.model].names if name in FREED_FIRST)
 
 
-class TargetSettings(Section):
-    """[targets]: what circular targets look like in the photographs."""
+class PlateSettings(Section):
+    """[[plate]]: another calibration plate, fixed to that of [targets]; its points are numbered on."""
+
+    codes: Name  # a plate or board of another kind or with other tags than that of [targets]
+    rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
+    columns: PlateSide | None = None  # of the same
+    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
+    plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
+    dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid, whose side is tag_size
+    tag_size: Length | None = None  # side of the black square of all tags, object unit
+    first_tag: TagNumber = 0  # of the first of these
+
+
+class TargetSettings(PlateSettings):
+    """[targets]: what circular targets look like in the photographs, and the plate that they are on."""
 
     polarity: Literal["dark", "bright", "auto"] = "auto"  # targets darker or brighter than what is around
     channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
@@ -151,30 +165,8 @@ class TargetSettings(Section):
     eccentricity: bool = True  # whether to correct it
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
     diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
-    tag_size: Length | None = None  # side of the black square of all tags, object unit
-    tag_sigma: Length | None = None  # its standard deviation, common to all tags of a print, object unit
-    rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
-    columns: PlateSide | None = None  # of the same
-    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    tag_sigma: Length | None = None  # standard deviation of tag_size, common to all tags, object unit
     pitch_assumed: bool = False  # whether nobody measured the pitch
-    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
-    plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
-    dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid, whose side is tag_size
-    first_tag: TagNumber = 0  # of the first of these
-
-
-class PlateSettings(Section):
-    """[[plate]]: another calibration plate, fixed to that of [targets]; its points are numbered on."""
-
-    codes: Name  # as of [targets], a plate or board of another kind or with other tags
-    rows: PlateSide | None = None  # of its dots, crossings or corners
-    columns: PlateSide | None = None  # of the same
-    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
-    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
-    plate_sigma: Length | None = None  # standard deviation of its coordinates, object unit; 0.2 % without
-    dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid
-    tag_size: Length | None = None  # side of the black square of these, object unit
-    first_tag: TagNumber = 0  # of the first of these
 
 
 class TiePointSettings(Section):
