@@ -389,6 +389,45 @@ def test_a_camera_differs_in_photographs_of_its_own_only() -> None:
     assert named.number("change") == pytest.approx(2.0, abs=0.1)
 
 
+def zoomed_pair(which: int) -> Adjustment:
+    """Return six photographs of one camera, and two of another, one of which has c 2 % longer."""
+    rng = seed_of("two cameras")
+    network, truth = make_network(rng, images=8, points=40, cameras=2, free=("c",))
+    camera = np.array([0] * 6 + [1] * 2)
+    longer = replace(truth.cameras[1], parameters=truth.cameras[1].parameters * ([1.02] + [1.0] * 9))
+    own = np.where(np.arange(8) == which, 2, camera)
+    moved = observed_anew(
+        replace(network, camera=own), replace(truth, cameras=(*truth.cameras, longer)), 0.05, rng
+    )
+    return adjust(replace(moved, camera=camera), truth, datum=Datum("free"), reject="none")
+
+
+def test_of_two_photographs_of_a_camera_neither_is_blamed() -> None:
+    """Before, the second one was, whichever had another c."""
+    for which, sign in ((6, -1), (7, 1)):
+        a = zoomed_pair(which)
+        columns = columns_of(a)
+        reduced = reduce_adjustment(a, columns)
+        every = alternatives.alternatives_of(a, reduced, columns)
+        one = next(one for one in every if one.kind == "two_cameras" and one.family.name == "c")
+        found = refit.refit(a, one, a)
+        assert found is not None
+        parts = one.family.parts(one, found.adjustment, found.beta, "m")
+        assert parts["photographs"] == ("image 7", "image 8")
+        assert parts["change"][0] == pytest.approx(2.0 * sign, abs=0.1)
+        assert abs(len(every) - alternatives.count_alternatives(a)) <= 5
+
+
+def test_alternatives_are_counted_by_cameras() -> None:
+    """Before, 30 were assumed of any network; eight cameras of five photographs have 202."""
+    rng = seed_of("many")
+    network, truth = make_network(rng, images=40, points=40, cameras=8, free=("c",))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    columns = columns_of(a)
+    every = alternatives.alternatives_of(a, reduce_adjustment(a, columns), columns)
+    assert len(every) > 190 and abs(len(every) / alternatives.count_alternatives(a) - 1) < 0.1
+
+
 def test_runs_are_of_one_camera_and_in_the_order_of_the_sequence() -> None:
     camera = np.arange(150) % 2
     run = alternatives._runs(camera)

@@ -11,7 +11,7 @@ from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import families, unchecked
-from sfm.adjustment.hypotheses.alternatives import interiors, needed_gain
+from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
 from sfm.adjustment.hypotheses.score import reduce_adjustment
 from sfm.adjustment.hypotheses.unchecked import reach_of, unchecked_assumptions
@@ -40,7 +40,7 @@ def test_the_gain_that_is_needed_is_that_of_the_test_and_of_the_price() -> None:
         max(stats.chi2.isf(1e-6, 1), np.log(4) + 4 * np.log(100))
     )
     assert needed_gain(3, 500, 2.0, 30) == pytest.approx(3 * np.log(1000) + 4.0 + 2 * np.log(100))
-    assert (unchecked.POWER, WRONG_SIGMAS, unchecked.ROWS) == (0.80, 5.0, 30)
+    assert (unchecked.POWER, WRONG_SIGMAS) == (0.80, 5.0)
 
 
 def shift_of(a: Adjustment, moved_px: FloatArray) -> tuple[float, float]:
@@ -67,7 +67,7 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     reach = reach_of(one, a, reduced, columns)
     D = shared_columns(a, [(0, s)])[0][:, :, 0]
     H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
-    needed = needed_gain(1, len(D), 0.0, unchecked.ROWS)
+    needed = needed_gain(1, len(D), 0.0, count_alternatives(a))
     least = next(x for x in np.linspace(needed, 2 * needed, 2000) if stats.ncx2.sf(needed, 1, x) > 0.8)
     shift, gained = shift_of(a, D * np.sqrt(least / H))
     assert gained == pytest.approx(least, rel=0.02)
@@ -84,7 +84,7 @@ def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
     reach = reach_of(one, a, reduced, columns)
     D = reduced.whiten(one.columns(a, columns))
     H = reduced.project(D)[0]
-    needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, unchecked.ROWS)
+    needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, count_alternatives(a))
     least = next(x for x in np.linspace(needed / 2, 2 * needed, 3000) if stats.ncx2.sf(needed, 5, x) > 0.8)
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     rng, farthest = seed_of("directions"), 0.0
@@ -135,3 +135,19 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
     far = reach_of(one, a, blind, columns)  # type: ignore[arg-type]
     share = float(H[0, 0] / reduced.project(reduced.whiten(one.columns(a, columns)))[2][0])
     assert far == pytest.approx(reach_of(one, a, reduced, columns) * np.sqrt(share / 1e-5))
+
+
+def test_cameras_of_few_photographs_are_checked_too() -> None:
+    """Before, nothing was said of a camera with two or three photographs beside others."""
+    network, truth = make_network(seed_of("few of a camera"), images=8, points=40, cameras=2, free=("c",))
+    for own, pattern in ((2, "pair"), (3, "single"), (1, "")):
+        camera = (np.arange(8) >= 8 - own).astype(np.int64)
+        a = adjust(replace(network, camera=camera), truth, datum=Datum("free"), reject="none")
+        reduced = reduce_adjustment(a, columns_of(a))
+        found = [
+            one
+            for one in unchecked._typical(a, reduced)
+            if one.among is not None and one.among.sum() == own and one.family.of_camera
+        ]
+        assert {one.pattern for one in found} == ({pattern} if pattern else set())
+        assert all(np.flatnonzero(one.factor).tolist() == [7] for one in found)

@@ -56,6 +56,7 @@ MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten s
 MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
 MAX_MOVED = 60  # points that are tried together
 ROUNDS = 20  # of two means
+OF_ONE = ("single", "pair")  # patterns of one photograph
 STARTS = 8  # photographs from which a group is grown
 
 
@@ -69,6 +70,26 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
         *_moved_points(reduced),
     ]
     return tuple(sorted(found, key=lambda one: -one.evidence))
+
+
+def count_alternatives(a: Adjustment) -> int:
+    """Return how many alternatives are tested of an adjustment, but for some without any gain.
+
+    They are the held and given parameters, the families of photographs by their patterns, the format, and
+    points that moved.
+    """
+    owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
+    held = sum(len(one) + (len(one) > 1) for one in owners)
+    if len(a.network.images) < 2 * MIN_GROUP:
+        return held + 1
+    camera = cameras_of_photographs(a)
+    run, patterns = _runs(camera), 0
+    for family in OF_PHOTOGRAPHS:
+        for among in photographs_among(family, camera):
+            m = len(np.unique(run[among]))
+            names = [name for name, _, _ in _patterns(m) if family.of_camera or name not in OF_ONE]
+            patterns += len(names) + (m > 2 * MIN_GROUP)
+    return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, SHIFTED))
 
 
 def is_significant(one: Alternative, rows: int) -> bool:
@@ -216,14 +237,15 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                 H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)]
             )
             for pattern, factors, search in _patterns(len(runs)):
-                if pattern == "single" and not family.of_camera:
+                if pattern in OF_ONE and not family.of_camera:
                     continue  # an object that one photograph shows otherwise is that photograph's fault
                 gains = [part.gain(factor) for factor in factors]
                 best = max(range(len(gains)), key=lambda k: gains[k].value)
                 spread = part.spread(factors[best], gains[best])
                 factor = _of_photographs(factors[best], runs, run, m)
-                if pattern == "single":
-                    own = _variance_of(reduced, factor > 0, gains[best])
+                if pattern in OF_ONE:
+                    alone = among if pattern == "pair" else factor > 0
+                    own = _variance_of(reduced, alone, gains[best])
                     spread = replace(spread, factor=max(spread.factor, own))
                 yield _made(reduced, family, pattern, factor, gains[best], search, spread, among=among)
             if len(runs) > 2 * MIN_GROUP:
@@ -313,7 +335,7 @@ def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
 def _patterns(m: int) -> Iterator[tuple[str, FloatArray, float]]:
     """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
     if m == MIN_GROUP:
-        yield "single", np.eye(m)[1:], 0.0  # that the other one differs says the same
+        yield "pair", np.eye(m)[1:], 0.0  # that the other one differs says the same
     elif m > MIN_GROUP:
         yield "single", np.eye(m), np.log(m)
     if m < 2 * MIN_GROUP:

@@ -133,7 +133,8 @@ class CameraFamily(OfPhotographs):
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""
-        return {"linear": "camera_drift", "each": "camera_varies"}.get(pattern, "other_camera")
+        kinds = {"linear": "camera_drift", "each": "camera_varies", "pair": "two_cameras"}
+        return kinds.get(pattern, "other_camera")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return what an alternative is a case of."""
@@ -147,11 +148,14 @@ class CameraFamily(OfPhotographs):
         if one.pattern == "each":
             return self._of_each(beta.reshape(-1, len(self.places)), half)
         linear = one.pattern == "linear"
+        photographs = one.photographs
+        if one.pattern == "pair" and one.among is not None:  # which of the two differs is not known
+            photographs = np.flatnonzero(one.among)
         sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
         # a column is 1 px at the edge, and moves what is measured
         largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
         parts: Parts = {
-            "photographs": tuple(a.network.images[i] for i in one.photographs),
+            "photographs": tuple(a.network.images[i] for i in photographs),
             "change": (100 * sign * largest * float(beta[0]) / half, "%"),
         }
         if one.among is not None and not one.among.all():

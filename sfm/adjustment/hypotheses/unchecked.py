@@ -19,6 +19,7 @@ from scipy.special import chndtrinc
 from sfm.adjustment.hypotheses.alternatives import (
     MIN_GROUP,
     cameras_of_photographs,
+    count_alternatives,
     interior_parameters,
     needed_gain,
     photographs_among,
@@ -38,7 +39,6 @@ from sfm.remarks.remark import Remark, remark
 from sfm.similarity import without_motions
 
 POWER = 0.80  # with which a detectable error is found; Baarda (1968)
-ROWS = 30  # alternatives among which the level is shared: families by patterns, and held parameters
 
 
 def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
@@ -76,7 +76,8 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Return each held parameter, and a change of the camera and a strain of the object half way through.
 
-    Not a bending: the worst of its 18 directions is the shape of no object.
+    Of two or three photographs of a camera the last one differs. There is no bending: the worst of its 18
+    directions is the shape of no object.
     """
     nothing = Gain(0.0, 0, np.zeros(0))
     for owner in interior_parameters(a, HELD):
@@ -89,13 +90,15 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     for family in (*CAMERA_FAMILIES, STRAIN):
         for among in photographs_among(family, camera):
             m = int(among.sum())
-            if m < 2 * MIN_GROUP:
+            if m < MIN_GROUP or reduced.photographs < 2 * MIN_GROUP:
                 continue
-            half = among & (np.cumsum(among) > m // 2)
-            search = float(np.log(m - 2 * MIN_GROUP + 1))
-            yield Alternative(
-                *(family, "split", half.astype(float), nothing, NONE, 0.0, 0.0, search, 0.0), among=among
-            )
+            if m < 2 * MIN_GROUP:
+                pattern, first, tried = ("single", m - 1, m) if m > MIN_GROUP else ("pair", 1, 1)
+            else:
+                pattern, first, tried = "split", m // 2, m - 2 * MIN_GROUP + 1
+            after = (among & (np.cumsum(among) > first)).astype(float)
+            search = float(np.log(tried))
+            yield Alternative(*(family, pattern, after, nothing, NONE, 0.0, 0.0, search, 0.0), among=among)
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns) -> float:
@@ -112,7 +115,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
-    needed = needed_gain(rank, touched, one.search, ROWS)
+    needed = needed_gain(rank, touched, one.search, count_alternatives(a))
     least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
     X = a.estimate.points

@@ -25,6 +25,15 @@ ROWS = (
         short="another camera in some photographs",
     ),
     Kind(
+        "two_cameras",
+        SHIFT,
+        "{photographs}, taken as one camera[[ {camera}]], are not of one: from the first to the second, c "
+        f"changes by {{change:+}}[[ and the principal point by {{away}}]]. {SHIFTED}{INSTEAD}",
+        "zoom, focus or camera changed between the two, or one was cropped or resampled; nothing says which",
+        "Give each a camera in the survey file, or set per_photograph.",
+        short="another camera in one of two photographs",
+    ),
+    Kind(
         "camera_varies",
         SHIFT,
         "The camera differs from photograph to photograph"

@@ -175,7 +175,7 @@ def _explained_otherwise(
     ]
     plain, own = found
     other = None if plain is None else best_explanation(plain)
-    if plain is None or other is None or other.alternative.kind == "other_camera":
+    if plain is None or other is None or other.alternative.kind in ("other_camera", "two_cameras"):
         return False  # which photographs they are is seen best by what was rejected
     if own is None:
         return True
