@@ -9,7 +9,10 @@ from collections.abc import Iterable, Sequence
 MAX_LISTED = 5  # of many in one message
 NO_BREAK = "\N{NO-BREAK SPACE}"
 # a number and its unit, and between a number and what it is one of, are not parted at the end of a line
-WITH_UNIT = re.compile(r"(?<=\d) (?=(?:%|px|[kmcdµun]?m|deg|s|sigma|mrad|iterations?)(?![\w^]))")
+WITH_UNIT = re.compile(
+    r"(?<=95 %) (?=\d)|(?<=\d) (?=×)|(?<=×) (?=\d)|"
+    r"(?<=\d) (?=(?:%|px|[kmcdµun]?m|deg|s|sigma|mrad|iterations?)(?![\w^]))"
+)
 PROGRAMS = {"kolinear": "Kolinear", "colmap": "COLMAP"}  # as people write what survey files and tables name
 TEMPLATE = """\
 <table><caption>{{ title }}</caption>
@@ -49,7 +52,7 @@ def bound(text: str) -> str:
     """Return a text with no-break spaces between numbers and their units.
 
     Examples:
-        >>> bound("95 % 1.95 px").split(" ") == [f"95{NO_BREAK}%", f"1.95{NO_BREAK}px"]
+        >>> bound("95 % 1.95 px").split(NO_BREAK) == ["95", "%", "1.95", "px"]
         True
     """
     return WITH_UNIT.sub(NO_BREAK, text)

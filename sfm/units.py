@@ -9,6 +9,7 @@ from sfm.conventions import METRES
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMPERIAL = ("in", "ft")
 UNITS = {
     **{10.0: ("mm", "cm"), 100.0: ("cm", "m"), 1e3: ("mm", "m"), 1e6: ("um", "m")},
@@ -30,15 +31,19 @@ class UnitFactor:
 
 
 def finer_unit(unit: str, value: float) -> tuple[float, str]:
-    """Return by what to multiply lengths of about this size, and the metric unit in which they read well.
+    """Return by what to multiply lengths of about this size, and the unit in which they read well.
 
     Args:
-        unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
+        unit: object unit of the survey. Lengths in feet and inches stay as they are; of a unit without a
+            known length, as that of a network without scale, thousandths, millionths and so on are taken.
         value: the largest of the lengths, in that unit.
     """
     metres = METRES.get(unit)
-    if metres is None or unit in IMPERIAL or not math.isfinite(value) or value <= 0:
+    if not unit or unit in IMPERIAL or not math.isfinite(value) or value <= 0:
         return 1.0, unit
+    if metres is None:
+        power = min(0, 3 * math.floor(math.log10(value) / 3))
+        return (10.0**-power, f"× 10{str(power).translate(SUPERSCRIPTS)} {unit}") if power else (1.0, unit)
     name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
     return metres / size, name
 

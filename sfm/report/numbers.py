@@ -14,12 +14,12 @@ from sfm.conventions import FloatArray
 from sfm.display import agreeing, bound, counted
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
+from sfm.units import SUPERSCRIPTS
 from sfm.units import finer_unit as finer_unit
 
 SMALL = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none
 NOT_DETERMINED = "not determined"  # in place of an infinite standard deviation
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def fixed(value: float, decimals: int) -> str:

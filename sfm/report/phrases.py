@@ -6,8 +6,8 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
-from sfm.display import counted, listed
+from sfm.conventions import FloatArray, IntArray
+from sfm.display import NO_BREAK, counted, listed
 from sfm.distributions import normal_ppf
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.report.findings.checks import CheckedControl, Sigma0
@@ -136,7 +136,7 @@ def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     for one in camera.parameters:
         value, sigma = with_exponent(one.value, one.sigma)
         state = NOT_DETERMINED if np.isinf(one.sigma) else "" if one.sigma > 0 else "held"
-        values.append(f"{one.name} {value} {one.unit}")
+        values.append(f"{one.name}{NO_BREAK}{value} {one.unit}")
         sigmas.append(state or f"{sigma} {one.unit}")
         within.append(state or f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
     rms, largest = camera.projection_rms_px, camera.projection_largest_px
@@ -195,12 +195,17 @@ def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:
     known = found.angle_deg[np.isfinite(found.angle_deg)]
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""
     return (
-        ("rays of a point", f"{found.rays.min()} to {found.rays.max()}, mean {found.rays.mean():.1f}"),
+        ("rays of a point", _words_of_rays(found.rays)),
         ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
         ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
         ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
         *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
     )
+
+
+def _words_of_rays(rays: IntArray) -> str:
+    low, high = int(rays.min()), int(rays.max())
+    return f"{low} each" if low == high else f"{low} to {high}, mean {rays.mean():.1f}"
 
 
 def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:

@@ -50,7 +50,7 @@ from sfm.report.output import WRITTEN, write_result
 from sfm.report.phrases import words_left_out, words_of_precision
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.report.text.filters import WIDTH
+from sfm.report.text.filters import WIDTH, wrapped
 from sfm.report.text.text_report import _environment as text_environment
 from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
@@ -363,7 +363,7 @@ def test_colours_of_values_are_visible_on_light_and_on_dark_pages() -> None:
 def test_wide_tables_show_that_there_is_more(browser: Any, result: SurveyResult, tmp_path: Path) -> None:
     """The edge is shaded beyond which columns are hidden, and not where they all are seen."""
     (tmp_path / "report.html").write_text(report_page(findings_of(result), (), ()), "utf-8")
-    place = "(all) => all.findIndex((one) => one.clientWidth && one.scrollWidth - one.clientWidth SIGN)"
+    place = "(all) => all.findIndex((one) => one.checkVisibility() && one.scrollWidth - one.clientWidth SIGN)"
     tab = Tab(browser, tmp_path / "report.html", width=390)
     tables = tab.page.locator(".scroll")
     for sign, shaded in (("> 50", True), ("== 0", False)):
@@ -650,7 +650,10 @@ def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
     assert finer_unit("m", 3.2e-5) == (pytest.approx(1e6), "µm")
     assert finer_unit("mm", 0.5) == (pytest.approx(1e3), "µm")
     assert finer_unit("m", 0.012) == (pytest.approx(1e3), "mm")
-    assert finer_unit("ft", 1e-5) == (1.0, "ft")
+    assert finer_unit("ft", 1e-5) == (1.0, "ft") and finer_unit("", 1e-5) == (1.0, "")
+    assert finer_unit("network units", 2.12e-5) == (1e6, "× 10⁻⁶ network units")
+    assert finer_unit("network units", 0.5) == (1e3, "× 10⁻³ network units")
+    assert finer_unit("network units", 5.0) == (1.0, "network units")
 
 
 def test_table_escapes_and_aligns() -> None:
@@ -723,7 +726,7 @@ def test_numbers_of_one_quantity_are_written_alike(
     assert alike([9.15e-7, 1.56e-6]) == ("9.15e-07", "1.56e-06")
     assert alike([9.15e-3, 1.56e-2, np.nan]) == ("0.00915", "0.0156", "not known")
     told = words_of_precision(9.15e-7, 1.56e-6, "network units")
-    assert len(re.findall(r"\de-\d", told)) == 4 and "0.0000" not in told
+    assert told.count("× 10⁻⁶ network units") == 4 and "0.915" in told and "1.56" in told
     monkeypatch.setenv("COLUMNS", "60")
     tell_result(findings_of(result), Path("page"), seconds=1.0, verbose=True)
     for line in capsys.readouterr().out.splitlines():
@@ -745,3 +748,10 @@ def test_names_in_the_plan_view_do_not_overlap(result: SurveyResult) -> None:
         assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
         drawn.append(len(boxes))
     assert drawn[0] > drawn[1] >= 1
+
+
+def test_lines_of_the_text_report_part_no_number_from_its_unit() -> None:
+    line = "camera " + "c 29.991 mm, " * 20
+    for start in range(12):
+        lines = wrapped(" " * start + line, behind=start).splitlines()
+        assert len(lines) > 2 and not any(one.strip().startswith("mm") for one in lines)

@@ -85,7 +85,8 @@ ROWS = (
         "warning",
         "The residuals of {points:point} are together larger than chance: {points}.",
         "a point moved a little, or its target is damaged or seen at a flat angle",
-        "Look at {points:the target|the targets}; leave out {points:the point|points} that you do not trust.",
+        "Look at {points:the target|the targets}; leave {points:the point|points} out if you do not trust "
+        "{points:it|them}.",
     ),
     Kind(
         "image_points_identical",

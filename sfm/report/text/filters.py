@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from sfm.display import NO_BREAK, bound
+
 WIDTH = 100
 MAX_CHARACTERS = 40  # of a cell in columns
 NAME_WIDTH = 21  # of what a fact is about
@@ -51,14 +53,14 @@ def wrap(text: str) -> str:
 
 
 def wrapped(line: str, *, behind: int) -> str:
-    """Break a line between words; what follows stands behind so many spaces."""
-    lines, rest = [], line.rstrip()
+    """Break a line between words, not before a unit; what follows stands behind so many spaces."""
+    lines, rest = [], bound(line.rstrip())
     while len(rest) > WIDTH:
         cut = rest.rfind(" ", behind + 1, WIDTH)
         cut = WIDTH if cut < 0 else cut
         lines.append(rest[:cut])
         rest = " " * behind + rest[cut:].strip()
-    return "\n".join([*lines, rest])
+    return "\n".join([*lines, rest]).replace(NO_BREAK, " ")
 
 
 def _cells(line: str) -> list[str]:
