@@ -122,7 +122,7 @@ def _print(
         turn = scene.rotation[own].transpose(0, 2, 1) @ placed.rotation[on]
         turns = np.column_stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])  # small angles, image axes
         errors = np.column_stack([centres @ moved.rotation / moved.scale, turns])
-        covariance = _on_centres(adjustment)
+        covariance = covariance_on_centres(adjustment)
         m = len(on)
         predicted = moved.scale * float(
             np.sqrt(np.diagonal(covariance).reshape(m, 6)[:, :3].sum(axis=1).mean())
@@ -144,7 +144,7 @@ def _units(covariance: FloatArray) -> FloatArray:
     return np.sqrt(np.diagonal(covariance))
 
 
-def _on_centres(adjustment: Adjustment) -> FloatArray:
+def covariance_on_centres(adjustment: Adjustment) -> FloatArray:
     """Return the covariance of all X0 and small rotations together, datum on the centres, (6m, 6m).
 
     The errors are those after a similarity onto the true centres; a datum on the points predicts more.

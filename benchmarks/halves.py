@@ -1,0 +1,155 @@
+"""A result from either half of its object points: do the two agree as well as their covariances say?
+
+    python -m benchmarks.halves build/fountain/result
+    python -m benchmarks.halves build/fountain/result build/fountain/colmap --ways checker stripes
+
+Object points are halved in four ways: by chance, as a checkerboard and in stripes over the object, and into
+near and far ones. Neighbours share errors that are smooth over a photograph; by chance both halves have them
+in common, in the other ways they do not. Each half is adjusted anew with what is free in the result, and
+the projection centres of both are compared after a similarity. Points are halved by their rays: two
+intersections of each point from alternate photographs with the orientation of the whole. A ratio of 1 says
+that differences are what their standard deviations say.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import sfm
+from benchmarks.textured import covariance_on_centres
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import BoolArray, FloatArray
+from sfm.network import Estimate, Network, without_given
+from sfm.orientation.image_rays import image_tangents
+from sfm.orientation.intersection import intersect
+from sfm.reduced_network import reduce_network
+from sfm.similarity import fit_similarity
+
+WAYS = ("random", "checker", "stripes", "near-far")
+STEPS = np.eye(2)  # px
+SEEDS = 3  # halves by chance, of which the root mean square is printed
+CELLS = 8  # of the checkerboard along the longer side of the object
+STRIPES = 4
+MIN_RAYS = 2  # of a point in each half of its rays
+HEAD = "result            way        points       ppm  predicted   ratio"
+
+
+def main() -> None:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
+    parser.add_argument("results", type=Path, nargs="+", help="folders of results, or models of COLMAP")
+    parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS)
+    parser.add_argument("--equal", action="store_true", help="weight all image points alike")
+    arguments = parser.parse_args()
+    print(HEAD)
+    for path in arguments.results:
+        stored = sfm.read_result(path)
+        network, estimate = without_given(stored.network), stored.estimate
+        if arguments.equal or not np.isfinite(network.image_points.covariance).all():
+            seen = network.image_points
+            alike = np.tile(0.01 * np.eye(2), (len(seen), 1, 1))
+            network = replace(network, image_points=replace(seen, covariance=alike))
+        for way in arguments.ways:
+            _print(path.name, way, *_of_centres(network, estimate, way))
+        _print(path.name, "rays", *_of_points(network, estimate))
+
+
+def _print(name: str, way: str, points: int, found: float, predicted: float) -> None:
+    """Print one row of the table."""
+    row = f"{name[-17:]:<18}{way:<10}{points:>7}{1e6 * found:>10.1f}{1e6 * predicted:>11.1f}"
+    print(f"{row}{found / predicted:>8.2f}", flush=True)
+
+
+def _of_centres(network: Network, estimate: Estimate, way: str) -> tuple[int, float, float]:
+    """Return the number of points, and the RMS difference of the centres and what is predicted for it.
+
+    Both relative to the mean distance of the centres from the middle of the object.
+    """
+    squares = []
+    for half in _halves(estimate.points, estimate.position, way):
+        one, other = (_adjusted(network, estimate, points) for points in (half, ~half))
+        a, b = one.estimate, other.estimate
+        placed = fit_similarity(b.position, a.position)
+        moved = placed.apply_estimate(b)
+        scale = np.linalg.norm(a.position - np.nanmean(a.points, axis=0), axis=1).mean()
+        found = ((moved.position - a.position) ** 2).sum(axis=1).mean()
+        predicted = _variance(one) + placed.scale**2 * _variance(other)
+        squares.append((found / scale**2, predicted / scale**2))
+    found, predicted = np.sqrt(np.mean(squares, axis=0)).tolist()
+    return len(network.points), found, predicted
+
+
+def _variance(adjustment: Adjustment) -> float:
+    """Return the mean variance of a centre in the datum on all centres, object unit^2."""
+    m = len(adjustment.estimate.position)
+    variance = np.diagonal(covariance_on_centres(adjustment)).reshape(m, 6)
+    return float(variance[:, :3].sum(axis=1).mean())
+
+
+def _adjusted(network: Network, estimate: Estimate, points: BoolArray) -> Adjustment:
+    """Return the adjustment of some of the points, all photographs in it."""
+    everything = np.ones(len(network.image_points), dtype=bool)
+    images = np.ones(len(network.images), dtype=bool)
+    return adjust(*reduce_network(network, estimate, images, points, everything), redundancy_numbers=False)
+
+
+def _halves(xyz: FloatArray, centres: FloatArray, way: str) -> Iterator[BoolArray]:
+    """Yield halves of points: which are in the first."""
+    middle = np.median(xyz, axis=0)
+    axes = np.linalg.svd(xyz - middle, full_matrices=False)[2]
+    across = (xyz - middle) @ axes[:2].T
+    extent = np.quantile(np.abs(across), 0.99, axis=0).max() * 2
+    if way == "random":
+        for seed in range(SEEDS):
+            yield np.random.default_rng(seed).random(len(xyz)) < 0.5
+    elif way == "checker":
+        yield np.floor(across * CELLS / extent).sum(axis=1) % 2 == 0
+    elif way == "stripes":
+        yield np.floor(across[:, 0] * STRIPES / extent) % 2 == 0
+    else:
+        direction = middle - centres.mean(axis=0)
+        depth = xyz @ direction
+        yield depth < np.median(depth)
+
+
+def _of_points(network: Network, estimate: Estimate) -> tuple[int, float, float]:
+    """Return the same of points that are intersected from alternate rays, each with its covariance."""
+    seen = network.image_points
+    rank = np.zeros(len(seen), dtype=np.int64)
+    order = np.lexsort([seen.image, seen.point])
+    first = np.searchsorted(seen.point[order], np.arange(len(network.points)))
+    rank[order] = np.arange(len(seen)) - first[seen.point[order]]
+    uv = image_tangents(seen, network.camera, estimate.cameras)
+    slope = [
+        image_tangents(replace(seen, xy=seen.xy + step), network.camera, estimate.cameras) - uv
+        for step in STEPS
+    ]
+    J = np.stack(slope, axis=2)  # d (tangents) / d (px)
+    weights = np.linalg.inv(J @ seen.covariance @ J.transpose(0, 2, 1))
+    several = network.rays() >= 2 * MIN_RAYS
+    factor = adjust(network, estimate, redundancy_numbers=False).sigma0
+    found = []
+    for part in (0, 1):
+        rays = several[seen.point] & (rank % 2 == part)
+        met = intersect(
+            uv[rays], seen.image[rays], seen.point[rays], estimate.position, estimate.rotation,
+            n_points=len(network.points), weights=weights[rays],
+        )  # fmt: skip
+        found.append((met.points[several], met.cofactors[several]))
+    (a, of_a), (b, of_b) = found
+    scale = np.linalg.norm(estimate.position[:, None] - np.nanmean(a, axis=0), axis=2).mean()
+    trace = np.einsum("nii->n", of_a + of_b)
+    usual = trace < np.quantile(trace, 0.99)  # a few along their rays would decide it
+    square = ((a - b) ** 2).sum(axis=1)[usual].mean()
+    predicted = factor**2 * trace[usual].mean()
+    return int(usual.sum()), float(np.sqrt(square) / scale), float(np.sqrt(predicted) / scale)
+
+
+if __name__ == "__main__":
+    main()
