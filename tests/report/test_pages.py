@@ -16,6 +16,7 @@ from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
+from sfm.display import bound
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
@@ -166,7 +167,7 @@ def test_comparison_is_written_with_every_point(
         approximate.kind == "tested_singly"
         and said.kind == "points_differ"
         and said.names("points") == ("5",)
-        and said.text in page
+        and bound(said.text) in page
     )
     assert largest_difference(moved[0]) == "5.20 mm"
     assert "after &lt;b&gt;" in page and "after <b>" not in page
@@ -191,7 +192,7 @@ def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None
     assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
     (said,) = verdict_of_comparison(found).remarks
-    assert said.kind == "same_image_points" and said.number("share") == 1.0 and said.text in page
+    assert said.kind == "same_image_points" and said.number("share") == 1.0 and bound(said.text) in page
     write_differences(found, truth.points, tmp_path / "out")  # again, over its own files
 
 
