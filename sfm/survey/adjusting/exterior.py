@@ -156,7 +156,7 @@ def _too_few(places: int, turned: int, *, on_a_line: bool = False) -> str:
     """Say why observed exterior orientation and control do not place the network."""
     how = " on a line" if on_a_line else ""
     return (
-        f"datum 'control': {counted(places, 'projection centre')} and control points{how} in the "
-        f"network and the angles of {turned} photographs are known; needed three places that are not on a "
+        f"datum 'control': the network has {counted(places, 'place')}{how} of projection centres and control "
+        f"points, and the angles of {counted(turned, 'photograph')}; needed three places that are not on a "
         "line, or two and the angles of a photograph"
     )
