@@ -327,3 +327,29 @@ def test_reweighting_ends_where_its_rounds_do_not_converge(monkeypatch: pytest.M
     assert (
         len(rounds) == 3 + 1 + 3 + 3 + 1 + 1
     )  # by Tukey, by Huber and Tukey, with what is left; and the last one
+
+
+def test_only_rounds_in_a_row_that_do_not_converge_end_reweighting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, the third in all did, without a word, wherever rounds between them had converged."""
+    network, truth, _ = spoiled(seed_of("in a row"), 0.05, 30.0)
+    again, rounds = rejection.Run.again, []
+
+    def run_with(vague: tuple[int, ...]) -> Adjustment:
+        rounds.clear()
+
+        def marked(run: rejection.Run, optimum: Optimum, weight: FloatArray) -> Optimum:
+            rounds.append(len(rounds))
+            found = again(run, optimum, weight)
+            return replace(found, converged=found.converged and rounds[-1] not in vague)
+
+        monkeypatch.setattr(rejection.Run, "again", marked)
+        return adjust(network, truth, datum=FREE, reject="huber", covariance=False)
+
+    plain = run_with(())
+    every = len(rounds)
+    assert every > 7 and plain.remarks == ()
+    apart = run_with((0, 2, 4))
+    assert len(rounds) == every and apart.remarks == ()
+    broken = run_with((1, 2, 3))
+    assert len(rounds) == 4 + 1 and kinds_of(broken.remarks) == ("reweighting_not_converging",)
+    assert broken.remarks[0].number("rounds") == rejection.MAX_VAGUE_WEIGHTS + 1

@@ -76,6 +76,13 @@ ROWS = (
         "Look for wrong names and wrong start values.",
     ),
     Kind(
+        "reweighting_not_converging",
+        "warning",
+        "Reweighting ended after {rounds:round} that did not converge.",
+        "gross errors in most of the observations, or an undetermined network",
+        "Look for wrong names and wrong start values.",
+    ),
+    Kind(
         "snooping_unsolvable",
         "warning",
         "Data snooping ended early: with {more:image point} rejected in place of {rejected} the network is "

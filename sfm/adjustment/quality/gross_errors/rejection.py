@@ -37,7 +37,8 @@ BENT_ALONE = 10.0  # the same of one photograph, over the median of all photogra
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
 MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they tell no depth
 REWEIGHTINGS = 30
-MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence: of 400 networks with gross errors more helped none
+MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence one after another: more helped none of the 400
+# networks with gross errors of tests.adjustment.test_studies
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
@@ -62,6 +63,7 @@ def find_optimum(
         return _plain(run, state, weight, without)
     wanted, run.tolerance = run.tolerance, max(run.tolerance, ROUND_TOLERANCE)
     optimum, weight = _sound(run, state, weight, without)
+    run.remarks = ()  # on estimators that only gave a start
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
@@ -338,7 +340,8 @@ def _reweight(
         change = float(np.abs(new - weight).max())
         weight = new
         optimum = run.again(optimum, weight)
-        vague += not optimum.converged
+        vague = 0 if optimum.converged else vague + 1
         if change <= REWEIGHTED or vague > MAX_VAGUE_WEIGHTS:
             break
+    run.remarks = (remark("reweighting_not_converging", rounds=vague),) if vague > MAX_VAGUE_WEIGHTS else ()
     return optimum, weight
