@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sfm.display import MAX_LISTED
+from sfm.remarks.kind import Grade
 from sfm.remarks.remark import SEVERITIES, Remark, Severity
 
 Level = Literal["good", "fair", "bad"]
@@ -53,11 +54,17 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
         headlines: what each level means for this kind of result.
     """
     every = tuple(remarks)
-    explained = {kind for one in every for kind in one.row.explains}
-    every = tuple(one for one in every if one.kind not in explained)
+    every = tuple(one for one in every if not any(_explains(cause, one) for cause in every))
     order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order)
+
+
+def _explains(cause: Remark, one: Remark) -> bool:
+    """Return whether a remark follows from another one; of one with a grade, if it is no more serious."""
+    graded = isinstance(cause.row.severity, Grade)
+    serious = SEVERITIES.index(cause.severity) <= SEVERITIES.index(one.severity)
+    return one.kind in cause.row.explains and (serious or not graded)
 
 
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:

@@ -83,6 +83,28 @@ def test_what_another_remark_explains_is_left_out() -> None:
     assert judge([high, other], HEADLINES).remarks == (high, other)
 
 
+def test_what_wrong_coordinates_pull_away_is_not_told_beside_them() -> None:
+    """Before, to leave points out and to set sigma_px were advised beside the cause."""
+    pulled = (
+        remark("image_points_rejected", rejected=80, total=768, share=80 / 768),
+        remark("points_with_large_residuals", points=["89"]),
+        remark("photographs_uneven", photograph="a", p=1e-4, ratio=1.7),
+    )
+    strained = remark("given_strained", of="control", elongation=(0.5, "%"), chi2=1e6, fitting=296.0)
+    assert judge((*pulled, strained), HEADLINES).remarks == (strained,)
+    high = remark("sigma0_high", ratio=6.0, stated=(0.05, "px"))
+    assert (high.severity, pulled[1].severity) == ("error", "warning")
+    for shift, severity, left in (
+        (16.0, "error", ()),
+        (4.0, "warning", (high,)),
+        (2.0, "note", (high, pulled[1])),
+    ):
+        cause = remark("given_not_exact", of="control", sigma=(0.1, "mm"), shift=shift)
+        assert cause.severity == severity
+        found = judge((cause, pulled[1], high), HEADLINES).remarks
+        assert set(kinds_of(found)) == {cause.kind, *kinds_of(left)}
+
+
 def test_every_kind_that_is_explained_is_known() -> None:
     for row in KINDS.values():
         assert set(row.explains) <= set(KINDS)

@@ -7,6 +7,11 @@ from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
 # What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
 DETECTED = Grade("shift", error=WRONG_SIGMAS)
+# Held or weighted coordinates of a wrong shape pull image points, points and photographs away.
+PULLED = (
+    *("image_points_rejected", "rays_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
+    *("points_with_large_residuals", "photographs_uneven"),
+)
 
 ROWS = (
     Kind(
@@ -69,6 +74,7 @@ ROWS = (
         "given, {fitting} if not stretched): scale and shape of the result are not dependable.",
         "coordinates of a print or a scan, or axes of different scale or unit",
         "Correct the scale of the axes, or give coordinates that were measured.",
+        explains=PULLED,
     ),
     Kind(
         "given_renamed",
@@ -105,6 +111,7 @@ ROWS = (
         "contain it.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
+        explains=PULLED,
     ),
     Kind(
         "given_rounded",
