@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.codes.tags import DICTIONARIES, find_tags, tag_family, tag_modules
+from sfm.targets.codes.tags import DICTIONARIES, _widening, find_tags, tag_family, tag_modules
 from sfm.targets.detect import find_targets
 from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.flags import Flag
@@ -123,6 +125,85 @@ def shaded(name: str, half: float) -> AnyArray:
 def test_codes_are_confirmed_in_uneven_light(name: str, half: float) -> None:
     tags = find_tags(shaded(name, half), tag_family(name), polarity="dark", scale=255.0)
     assert len(tags.quads) == 1 and tags.code.tolist() == [68, 69, 70, 71]
+
+
+Light = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def shadow(left: float, offset: float, angle: float) -> Light:
+    """Return a shadow that leaves a part of the light beyond an edge, in sides of the tag and degrees."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return lambda x, y: np.where(x * c + y * s > offset, left, 1.0)
+
+
+def highlight(x0: float, y0: float, radius: float) -> Light:
+    """Return a soft highlight of 60 grey values on paper of 200."""
+    return lambda x, y: 1 + 0.3 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * radius**2))
+
+
+def lit(name: str, side: int, angle: float, light: Light) -> tuple[AnyArray, FloatArray]:
+    """Return a photograph of tag 17 and of two more beside it in even light, and its corners."""
+    modules = tag_family(name).modules
+    n, fine_of = int(side * 2.2) + 24, 4
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    turned_square = side * square @ turned(np.radians(angle))
+    whole, px = TEXTURE * (modules + 2), fine_of * n
+    y, x = ((np.mgrid[:px, :px] + 0.5) / fine_of - n / 2) / side
+    pictures = []
+    for number, falls in ((17, light), (18, None), (19, None)):
+        printed = np.pad(~tag_modules(tag_family(name), number), 1, constant_values=True)
+        texture = np.kron(np.where(printed, 200, 40), np.ones((TEXTURE, TEXTURE))).astype(np.float32)
+        H = cv2.getPerspectiveTransform(
+            (whole * (square + 0.5) - 0.5).astype(np.float32),
+            (fine_of * (turned_square * (modules + 2) / modules + n / 2) - 0.5).astype(np.float32),
+        )
+        fine = np.full((px, px), 200.0, np.float32)
+        cv2.warpPerspective(texture, H, (px, px), dst=fine, borderMode=cv2.BORDER_TRANSPARENT)
+        if falls is not None:
+            fine = (fine * falls(x, y)).astype(np.float32)
+        soft = cv2.GaussianBlur(fine, (0, 0), fine_of * np.sqrt(0.8**2 - 1 / 12))
+        pictures.append(cv2.resize(soft, (n, n), interpolation=cv2.INTER_AREA))
+    picture = np.hstack(pictures)
+    picture = picture + NOISE * seed_of(f"{name} {side} {angle}").standard_normal(picture.shape)
+    return np.rint(picture).clip(0, 255).astype(np.uint8), turned_square + n / 2 - 0.5
+
+
+LIGHTS = {
+    **{f"{left} {offset} {angle}": (angle, shadow(left, offset, edge))
+       for left in (0.8, 0.7, 0.6)
+       for offset, edge, angle in ((-0.3, 30, 0), (0.0, 0, 12), (0.25, 200, 0), (0.4, 77, 70))},
+    **{f"highlight {x} {y} {r}": (12, highlight(x, y, r))
+       for x, y, r in ((0, 0, 0.15), (0.3, 0.2, 0.25), (-0.5, 0.5, 0.4), (0, 0.1, 0.7))},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("side", [15, 20, 30, 60])
+@pytest.mark.parametrize("name", ["apriltag36h11", "aruco4x4_1000"])
+def test_tags_are_read_as_by_opencv_under_shadows_and_highlights(name: str, side: int) -> None:
+    """Errors over stated standard deviations: 6 to 8 where small tags are fitted as if light were even."""
+    family, errors = tag_family(name), []
+    detector = cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[name]))
+    )
+    for angle, light in LIGHTS.values():
+        picture, corners = lit(name, side, angle, light)
+        theirs = detector.detectMarkers(picture)[1]
+        tags = find_tags(picture, family, polarity="dark", scale=255.0)
+        numbers = set((tags.code // 4).tolist())
+        assert set(np.ravel(theirs if theirs is not None else []).tolist()) <= numbers <= {17, 18, 19}
+        ours = tags.code // 4 == 17
+        off = tags.xy[ours] - corners[tags.code[ours] % 4]
+        errors += np.einsum("ki,kij,kj->k", off, np.linalg.inv(tags.covariance[ours]), off).tolist()
+    ratio = np.sqrt(np.mean(errors) / 2)
+    print(name, side, len(errors), ratio)
+    assert 0.75 < ratio < (1.3 if side == 60 else 2.4)
+
+
+def test_undisturbed_corners_are_not_widened() -> None:
+    noise = np.array([1.0, 1.1, 0.95, 1.2, 1.0, 1.05, 2.4, 5.0])
+    widening = _widening(noise)
+    assert (widening[:6] == 1).all() and 10 < widening[6] < widening[7] < 17
+    assert len(_widening(np.zeros(0))) == 0 and (_widening(np.zeros(3)) == 1).all()
 
 
 @pytest.mark.parametrize("side", [40, 80, 160, 300])

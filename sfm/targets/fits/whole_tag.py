@@ -7,13 +7,19 @@ blur, and c(i, j) = 1 for black modules:
 
     I = B + A sum_ij c(i, j) W_i(u) W_j(v),   W_i(u) = Phi((u - i) / s_u) - Phi((u - i - 1) / s_u)
 
-s_u = s |grad u| is the blur in modules. Distortion does not bend edges of so few px. A wrong code, or a
-picture that is no tag, leaves modules off the levels of the code: the fit confirms the reading as well.
+s_u = s |grad u| is the blur in modules. Distortion does not bend edges of so few px. Uneven light (shadows,
+highlights) is estimated with them as a random field, by its values in the middle of modules. A wrong code, or
+a picture that is no tag, leaves modules off what light does to the levels of the code: the fit confirms the
+reading as well.
+
+Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, chapters 2 and 5, for the
+field, its likelihood and the prediction of each value by all others.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
@@ -36,13 +42,19 @@ from sfm.targets.flags import Flag
 
 # Tags are printed with one clear module around them. What is behind it acts up to so many blurs into it.
 BEHIND_BLURS = 2.0
-# Largest RMS of the distances of modules from the levels of their code, in steps, beyond what noise explains.
-# Of tags of 10 to 120 px with noise of 1 to 10 % of the step, in a light that changes by 30 % over them or on
-# bent paper the largest is 0.061; covered by a disc at one corner 0.073. The least of 67 letters read as tags
-# is 0.099. The edge of a shadow that takes 40 % of the light makes 0.08 to 0.18.
-MAX_MODULE_RMS = 0.08
+# Light on a tag is a random field that forgets itself over so many modules: it changes what is reflected by a
+# share, that of shadows of 40 %, and adds a share of the step (glare).
+LIGHT_SIGMA, GLARE_SIGMA, LIGHT_MODULES = 0.4, 0.05, 3.0
+# Light that modules do not resolve, in steps, for each pixel; the likeliest of these strengths is estimated.
+PIXEL_SIGMA, STRENGTHS = 0.1, (1.0, 0.3, 0.1, 0.03)
+LIGHT_ROUNDS = 2  # of estimating it, each with the levels of the one before
+MIN_SEEN = 0.3  # share of the usual weight of a module with which one beside the tag counts
+# How uneven print may be, in steps, and the largest RMS of what modules are off their prediction by all
+# others, in standard deviations of light, print and noise. Of 800 tags of 15 to 120 px under the edges of
+# shadows of 30 and 40 % and under highlights the largest is 0.94; the least of 90 letters and plates 1.03.
+PRINT_SIGMA, MAX_MISFIT = 0.03, 0.98
 # Largest number of steps; the last one is less than this for each corner, px.
-STEPS, LAST_STEP_PX = 40, 1e-3
+STEPS, LAST_STEP_PX = 200, 1e-3
 # In a tilted tag the blur acts on u and v with a correlation. That part is a blur along one direction, summed
 # up at the nodes of Gauss and Hermite (Abramowitz and Stegun 1964, table 25.10, n = 5, for a unit variance).
 NODES = (-2.85697001, -1.35562618, 0.0, 1.35562618, 2.85697001)
@@ -106,6 +118,7 @@ def _fit_tag(
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = uv[:, :2] / uv[:, 2:]
     inside = ((uv > -margin) & (uv < modules + margin)).all(axis=1)
+    inside &= ((uv > 0) & (uv < modules)).any(axis=1)  # at the corners of an AprilGrid's tags are squares
     outer = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * margin + _square(modules)
     around = _pixels_of(H, outer) * scale + middle
     if not ((around >= 0) & (around <= (width - 1, height - 1))).all():
@@ -118,37 +131,24 @@ def _fit_tag(
         return Flag.NO_CONVERGENCE.value
     design = np.column_stack([np.ones(len(P)), pattern])
     theta[_B : _A + 1] = np.linalg.lstsq(design[used], value[used], rcond=None)[0]
-    damping, converged = 1e-3, False
-    predicted, J = _intensity(theta, P, black)
-    residual = np.where(used, value - predicted, np.maximum(value - predicted, 0.0))
-    for _ in range(STEPS):
-        N, g = J.T @ J, J.T @ residual
-        step = np.linalg.lstsq(N + damping * np.diag(np.diag(N) + 1e-12), g, rcond=None)[0]
-        tried = theta + step
-        tried[_S] = np.clip(tried[_S], MIN_BLUR / scale, MAX_BLUR / scale)
-        corners = [_corners(one, modules) for one in (theta, tried)]
-        moved = np.abs(corners[1] - corners[0]).max() * scale
-        if not np.isfinite(moved):
+    light: _Light | None = None
+    for _ in range(1 + LIGHT_ROUNDS):
+        found = _iterate(theta, P, value, used, black, scale, light)
+        if found is None:
             return Flag.NO_CONVERGENCE.value
-        predicted, J_tried = _intensity(tried, P, black)
-        after = np.where(used, value - predicted, np.maximum(value - predicted, 0.0))
-        if after @ after <= residual @ residual:
-            theta, J, residual, damping = tried, J_tried, after, damping / 5
-        else:
-            damping *= 5
-        if moved < LAST_STEP_PX:
-            converged = True
-            break
-    corners_px = _corners(theta, modules) * scale + middle
+        theta, J, residual = found
+        corners_px = _corners(theta, modules) * scale + middle
+        if np.abs(corners_px - quad).max() > FARTHEST_PX:
+            return Flag.NO_CONVERGENCE.value
+        light = _describe_light(theta, P, residual, used, noise, black)
+    assert light is not None
     row = fits.theta[i]
-    if not converged or np.abs(corners_px - quad).max() > FARTHEST_PX:
-        return Flag.NO_CONVERGENCE.value
-    variance = float(residual @ residual) / max(int(used.sum()) - len(theta), 1)
-    if _module_rms(theta, P, residual, noise, black) > MAX_MODULE_RMS:
+    if light.misfit(residual) > MAX_MISFIT:
         return Flag.POOR_FIT.value
     row[:, :2] = corners_px
     row[:, BACKGROUND], row[:, CONTRAST], row[:, BLUR] = theta[_B], theta[_A], theta[_S] * scale
-    cofactor = np.linalg.pinv(J.T @ J, hermitian=True)
+    variance = float(residual @ light.without(residual)) / max(int(used.sum()) - len(theta), 1)
+    cofactor = np.linalg.pinv(J.T @ light.without(J), hermitian=True)
     fits.noise[i] = math.sqrt(variance)
     for j, place in enumerate(_square(modules)):
         D = np.zeros((5, len(theta)))
@@ -159,6 +159,72 @@ def _fit_tag(
         fits.covariance[i, j] = 0.0
         fits.covariance[i, j][np.ix_(columns, columns)] = variance * D @ cofactor @ D.T
     return 0 if used.all() else Flag.SATURATED.value
+
+
+@dataclass(frozen=True)
+class _Light:
+    """Uneven light on a tag: a random field, seen by its pixels and by its modules."""
+
+    pixels: FloatArray
+    """covariances of the light at pixels with that at modules, (n, q)"""
+    weights: FloatArray
+    """what takes residuals summed over `pixels` to the coefficients of the most probable field, (q, q)"""
+    modules: FloatArray
+    """what takes residuals to the mean of each module, (n, q)"""
+    inverse: FloatArray
+    """inverse of the covariance of these means, (q, q)"""
+    judged: BoolArray
+    """which of the modules are those of the tag, not around it, (q,)"""
+
+    def without(self, values: FloatArray) -> FloatArray:
+        """Return values at pixels, (n,) or (n, k), without the most probable light in them."""
+        return np.asarray(values - self.pixels @ (self.weights @ (self.pixels.T @ values)))
+
+    def misfit(self, residual: FloatArray) -> float:
+        """Return the RMS of what modules are off their prediction by all others, in its sigmas."""
+        errors = self.inverse @ (self.modules.T @ residual)
+        return math.sqrt(float((errors**2 / np.diag(self.inverse))[self.judged].mean()))
+
+
+def _iterate(
+    theta: FloatArray,
+    P: FloatArray,
+    value: FloatArray,
+    used: BoolArray,
+    black: BoolArray,
+    scale: float,
+    light: _Light | None,
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return the unknowns of the least squares fit, its Jacobian and residuals, None if it does not converge.
+
+    The light, if given, is estimated with them. Of censored intensities those above the model count.
+    """
+    modules, damping = len(black), 1e-3
+
+    def model(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        predicted, J = _intensity(theta, P, black)
+        off = np.where(used, value - predicted, np.maximum(value - predicted, 0.0))
+        weighted = off if light is None else light.without(off)
+        return J, off, weighted, float(off @ weighted)
+
+    J, residual, weighted, cost = model(theta)
+    for _ in range(STEPS):
+        N, g = J.T @ (J if light is None else light.without(J)), J.T @ weighted
+        step = np.linalg.lstsq(N + damping * np.diag(np.diag(N) + 1e-12), g, rcond=None)[0]
+        tried = theta + step
+        tried[_S] = np.clip(tried[_S], MIN_BLUR / scale, MAX_BLUR / scale)
+        moved = np.abs(_corners(tried, modules) - _corners(theta, modules)).max() * scale
+        if not np.isfinite(moved):
+            return None
+        after = model(tried)
+        if after[-1] <= cost:
+            theta, damping = tried, damping / 5
+            J, residual, weighted, cost = after
+        else:
+            damping *= 5
+        if moved < LAST_STEP_PX:
+            return theta, J, residual
+    return None
 
 
 def _square(modules: int) -> FloatArray:
@@ -229,26 +295,52 @@ def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
     return uv, w, along, sigma * np.sqrt(rest)[:, None]
 
 
-def _module_rms(
-    theta: FloatArray, P: FloatArray, residual: FloatArray, noise: float, black: BoolArray
-) -> float:
-    """Return how far modules are from the levels of their code, RMS in steps, without the share of noise.
+def _describe_light(
+    theta: FloatArray, P: FloatArray, residual: FloatArray, used: BoolArray, noise: float, black: BoolArray
+) -> _Light:
+    """Return the light on a tag, given by its values in the middle of modules and of the clear ones around.
 
-    The light may change linearly over the tag.
+    The residuals are those of a fit of the tag, light in them.
     """
+    m = len(black)
     uv, _, along, rest = _in_modules(theta, P)
-    share = np.zeros((len(P), *black.shape))
+    shares = np.zeros((len(P), m + 2, m + 2))
     for node, weight in zip(NODES, WEIGHTS, strict=True):
-        phi = ndtr(((uv + node * along)[:, :, None] - np.arange(len(black) + 1)) / rest[:, :, None])
+        phi = ndtr(((uv + node * along)[:, :, None] - np.arange(-1, m + 2)) / rest[:, :, None])
         W = phi[:, :, :-1] - phi[:, :, 1:]
-        share += weight * W[:, 1, :, None] * W[:, 0, None, :]
-    level = theta[_B] + theta[_A] * share[:, black].sum(axis=1)
-    design = np.column_stack([np.ones(len(P)), level, level[:, None] * P[:, :2]])
-    unexplained = residual - design @ np.linalg.lstsq(design, residual, rcond=None)[0]
-    steps = theta[_A] * share.reshape(len(P), -1)
-    weight_of_module = np.maximum((steps**2).sum(axis=0), 1e-12)
-    error = steps.T @ unexplained / weight_of_module
-    return math.sqrt(max(float((error**2 - noise**2 / weight_of_module).mean()), 0.0))
+        shares += weight * W[:, 1, :, None] * W[:, 0, None, :]
+    share: FloatArray = shares.reshape(len(P), -1)
+    weight_of_module = (share**2).sum(axis=0)
+    seen = weight_of_module > MIN_SEEN * np.median(weight_of_module)
+    seen[[0, m + 1, -m - 2, -1]] = False
+    share = share[:, seen]
+    modules = share / weight_of_module[seen]
+    printed, judged = np.pad(black, 1), np.pad(np.ones_like(black), 1).ravel()[seen]
+    place = np.asarray(np.argwhere(np.ones_like(printed))[seen, ::-1] - 0.5, dtype=float)
+    level_px = np.asarray(theta[_B] + theta[_A] * share[:, printed.ravel()[seen]].sum(axis=1), dtype=float)
+    printed, step = printed.ravel()[seen], max(abs(theta[_A]), np.finfo(float).eps)
+    level = np.asarray(theta[_B] + theta[_A] * printed, dtype=float)
+
+    def covariance(at: FloatArray, level_at: FloatArray) -> FloatArray:
+        distance = np.hypot(*(at[:, None] - place[None]).transpose(2, 0, 1))
+        shade = LIGHT_SIGMA**2 * np.outer(level_at, level)
+        return np.asarray((shade + (GLARE_SIGMA * step) ** 2) * np.exp(-distance / LIGHT_MODULES))
+
+    K = covariance(place, level)
+    pixels = covariance(uv, level_px) * used[:, None]
+    seen_by, N = pixels.T @ residual, pixels.T @ pixels
+    likeliest = math.inf
+    for strength in STRENGTHS:
+        R = (PIXEL_SIGMA * step / strength) ** 2 * K
+        inverse = np.linalg.inv(N + R)
+        left = float(residual @ residual - seen_by @ inverse @ seen_by)
+        unlikely = len(P) * math.log(left) + np.linalg.slogdet(N + R)[1] - np.linalg.slogdet(R)[1]
+        if unlikely < likeliest:
+            likeliest, weights = unlikely, inverse
+    mixed = modules.T @ share
+    errors = mixed @ K @ mixed.T
+    errors += noise**2 * modules.T @ modules + (PRINT_SIGMA * step) ** 2 * np.eye(len(K))
+    return _Light(pixels, weights, modules, np.linalg.inv(errors), judged)
 
 
 def _intensity(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
