@@ -29,7 +29,9 @@ from sfm.units import finer_unit
 # coordinates, and where it is the root mean square of all, nothing of a result is right.
 WRONG_SIGMAS = 5.0
 MIN_PROBABILITY = 1e-3  # smaller ones are written as less than it
-EXPECTED_SIGMAS = 3.0  # below them a shifted result stays within the limits that anybody expects
+# Below these a shifted result stays within the limits that anybody expects: 99.7 % of normally distributed
+# errors are within (Pukelsheim 1994, "The three sigma rule", The American Statistician 48(2)).
+EXPECTED_SIGMAS = 3.0
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
     "centres": "the projection centres",

@@ -147,6 +147,15 @@ def test_a_covered_tag_is_not_measured() -> None:
         assert (find_targets(image, codes="cctag3").code >= 0).sum() == kept
 
 
+@pytest.mark.parametrize(("part", "kept"), [(0.25, 1), (0.5, 0)])
+def test_a_disc_on_the_rings_refuses_the_tag_from_some_size_on(part: float, kept: int) -> None:
+    """Residuals of the sixteenth with the disc are 0.24 and 0.35 steps."""
+    (tag,) = drawn("cctag3", 1, 40.0, tilt_deg=0.0)
+    image, at = tag.image.copy(), np.rint(tag.truth + np.array([30, 0])).astype(int).tolist()
+    cv2.circle(image, at, round(40 * part), 120, -1)
+    assert (find_targets(image, codes="cctag3").code >= 0).sum() == kept
+
+
 def test_unresolved_rings_are_not_read() -> None:
     read = read_tags(drawn("cctag4", 6, 12.0, blur=1.5, noise=5.0), "cctag4")
     assert (read.right, read.wrong) == (0, 0)

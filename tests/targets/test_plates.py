@@ -106,7 +106,7 @@ def test_three_marks_are_enough_wherever_they_are(layout: str) -> None:
 
 @pytest.mark.parametrize("strange", [0.01, 0.3])
 def test_sizes_have_a_density(strange: float) -> None:
-    z = np.linspace(-dot_plates.RANGE / 2, dot_plates.RANGE / 2, 20001)
+    z = np.linspace(-dot_plates.RANGE_SIGMAS / 2, dot_plates.RANGE_SIGMAS / 2, 20001)
     density = np.exp(dot_plates._log_likelihood(z, strange))
     assert np.trapezoid(density, z) == pytest.approx(1, abs=2e-3)
 

@@ -25,7 +25,7 @@ from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, estimate_noise
 OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
 WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
 # Of the range of intensities in the window, below which it is dark: midway to the half where squares touch.
-DARK = 0.25
+DARK_FRACTION = 0.25
 MIN_MODULE_PX = 2.0  # of a tag that is read: no less tells one black module and one clear one apart (Nyquist)
 SPACING = 0.2  # of the side of a tag, between crossings at first
 CELL_PX = 8  # side of a module where a tag is read
@@ -76,7 +76,7 @@ def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
             cv2.erode(smooth, around).astype(np.float32),
             cv2.dilate(smooth, around).astype(np.float32),
         )
-        dark = ((smooth < low + DARK * (high - low)) & (high - low > min_range)).astype(np.uint8)
+        dark = ((smooth < low + DARK_FRACTION * (high - low)) & (high - low > min_range)).astype(np.uint8)
         for side in OPENED_PX:
             opened = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
             for outline in cv2.findContours(opened, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:

@@ -52,7 +52,7 @@ RAYS, SAMPLES_PER_PX, MIN_RAYS = 64, 2.0, 0.5
 PROFILE_BLURS, PROFILE_SIZES, PROFILE = (0.6, 0.9, 1.3, 1.8, 2.5), (0.96, 0.98, 1.0, 1.02, 1.04), 80
 # Of a profile so much may not be explained by a tag (0.05 of those of 48 tags of 15 to 60 px, and the right
 # one explained most), and so many of the most similar tags are fitted.
-UNEXPLAINED, FITTED = 0.1, 2
+MAX_UNEXPLAINED_FRACTION, MAX_FITTED_TAGS = 0.1, 2
 # A code is read if the radii are within a quarter of the way to any other code, the ink spreads by no more
 # than a quarter of a bit, and half the way is at least so many standard deviations.
 QUARTER, CODE_SIGMAS = 0.25, 5.0
@@ -60,7 +60,7 @@ QUARTER, CODE_SIGMAS = 0.25, 5.0
 PRINT_SIGMA = 0.0025
 # Largest root mean square residual on a sixteenth of the circumference, in steps of intensity. On tags of 15
 # to 40 px it is 1.05 times the noise, 0.074 with noise of 7 % of the step. More is what covers a tag.
-WRONG_SECTOR = 0.3
+MAX_SECTOR_RMS = 0.3
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def _read(
             continue
         contrast = sign * fit.theta[CONTRAST]
         confidence = _confidence(fit, number, table, family)
-        if confidence > 0 and contrast > least and fit.sectors.max() < WRONG_SECTOR * contrast:
+        if confidence > 0 and contrast > least and fit.sectors.max() < MAX_SECTOR_RMS * contrast:
             return number, confidence, fit
     return None
 
@@ -302,7 +302,7 @@ def _edges_on_rays(
 def _most_similar(
     profile: FloatArray, rho: FloatArray, table: FloatArray, length: float
 ) -> list[tuple[int, float, float]]:
-    """Return the most similar tags, sizes of their outer edges and blurs, px, at most FITTED."""
+    """Return the most similar tags, sizes of their outer edges and blurs, px, at most MAX_FITTED_TAGS."""
     size = np.array(PROFILE_SIZES)
     # The tags share few radii: each edge is drawn once and added to the tags that have it.
     radii, which = np.unique(np.round(table, 9), return_inverse=True)
@@ -317,12 +317,12 @@ def _most_similar(
     explained = (ink @ (weight * seen)) ** 2 / np.maximum((ink * ink) @ weight, 1e-12)
     share = explained / max(float(weight @ (seen * seen)), 1e-12)
     best = share.reshape(len(table), -1)
-    order = np.argsort(-best.max(axis=1))[:FITTED]
+    order = np.argsort(-best.max(axis=1))[:MAX_FITTED_TAGS]
     at = best.argmax(axis=1)
     return [
         (int(k), float(size[at[k] // len(blur)]), PROFILE_BLURS[at[k] % len(blur)])
         for k in order
-        if best[k].max() > 1 - UNEXPLAINED
+        if best[k].max() > 1 - MAX_UNEXPLAINED_FRACTION
     ]
 
 

@@ -23,9 +23,9 @@ MIN_DOTS, MIN_BENT_DOTS = 9, 20  # that show a plate, and the bend of the trend 
 MIN_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
 # A dot is anything with this probability at least, spread over so many standard deviations, and where more of
 # them lie so far off, with theirs. A plate is larger than its table with the same probability.
-STRANGE, RANGE, OUTLYING = 0.01, 50.0, 5.0
-RING = 10.0  # standard deviations of a ring: never taken for a dot
-CERTAIN = 0.999  # probability of a placement
+STRANGE_PROBABILITY, RANGE_SIGMAS, OUTLYING_SIGMAS = 0.01, 50.0, 5.0
+RING_SIGMAS = 10.0  # standard deviations of a ring: never taken for a dot
+MIN_CERTAINTY = 0.999  # probability of a placement
 
 
 def name_dots(xy: FloatArray, radius: FloatArray, is_ring: BoolArray, plate: PlateFamily) -> IntArray:
@@ -58,7 +58,7 @@ def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> F
     Args:
         lattice: the dots.
         radius: mean semi-axes of all dots and rings, px, (k,).
-        is_ring: which are insides of rings, (k,); they are RING standard deviations larger.
+        is_ring: which are insides of rings, (k,); they are RING_SIGMAS standard deviations larger.
     """
     log, ring = np.log(radius[lattice.rows]), is_ring[lattice.rows]
     place = lattice.place - lattice.place.mean(axis=0)
@@ -75,7 +75,7 @@ def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> F
             weight = ~ring / np.maximum(np.abs(larger), MIN_SCATTER)
         else:
             weight = ~ring * np.maximum(1 - (larger / (BIWEIGHT * scatter)) ** 2, 0.0) ** 2
-    return np.where(ring, RING, np.clip(larger / scatter, -RANGE / 2, RANGE / 2))
+    return np.where(ring, RING_SIGMAS, np.clip(larger / scatter, -RANGE_SIGMAS / 2, RANGE_SIGMAS / 2))
 
 
 def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
@@ -100,8 +100,8 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
     marked = np.zeros(plate.count + 1, dtype=bool)
     marked[[row * plate.columns + column for row, column in plate.marks]] = True
     found: list[tuple[float, IntArray]] = []
-    outlying = float((np.abs(size) > OUTLYING).sum() - len(plate.marks)) / len(size)
-    strange = max(STRANGE, outlying)
+    outlying = float((np.abs(size) > OUTLYING_SIGMAS).sum() - len(plate.marks)) / len(size)
+    strange = max(STRANGE_PROBABILITY, outlying)
     plain = _log_likelihood(size, strange)
     for place in placements(lattice, plate):
         low, high = place.min(axis=0), place.max(axis=0)
@@ -113,13 +113,13 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
             larger = max(float(np.median(size[here])), 0.0)
             gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())
             if (code == UNCODED).any():  # few plates are larger than is said
-                gain += math.log(STRANGE)
+                gain += math.log(STRANGE_PROBABILITY)
             found.append((gain, code))
     if not found:
         return None
     best, code = max(found, key=lambda one: one[0])
     all_of_them = sum(math.exp(gain - best) for gain, _ in found) + math.exp(-best)  # or no mark is seen
-    return code if 1 / all_of_them > CERTAIN else None
+    return code if 1 / all_of_them > MIN_CERTAINTY else None
 
 
 def _placed_whole(lattice: Lattice, plate: PlateFamily) -> IntArray | None:
@@ -164,4 +164,4 @@ def rings_among(polarity: IntArray) -> BoolArray:
 def _log_likelihood(z: FloatArray, strange: float) -> FloatArray:
     """Return the logarithm of the density of normal deviates of which this share are anything."""
     normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-    return np.asarray(np.log((1 - strange) * normal + strange / RANGE))
+    return np.asarray(np.log((1 - strange) * normal + strange / RANGE_SIGMAS))
