@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import families, unchecked
+from sfm.adjustment.hypotheses import alternatives, families, unchecked
 from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
 from sfm.adjustment.hypotheses.score import reduce_adjustment
@@ -64,7 +64,7 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     reduced = reduce_adjustment(a, columns)
     s = a.estimate.cameras[0].names.index(name)
     one = next(one for one in interiors(a, reduced, families.HELD) if one.parameters == ((0, s),))
-    reach = reach_of(one, a, reduced, columns)
+    reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
     D = shared_columns(a, [(0, s)])[0][:, :, 0]
     H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
     needed = needed_gain(1, len(D), 0.0, count_alternatives(a))
@@ -81,7 +81,7 @@ def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
     reduced = reduce_adjustment(a, columns)
     one = next(one for one in unchecked._typical(a, reduced) if one.family is families.STRAIN)
     assert one.factor.tolist() == [0] * 5 + [1] * 5 and one.search == pytest.approx(np.log(7))
-    reach = reach_of(one, a, reduced, columns)
+    reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
     D = reduced.whiten(one.columns(a, columns))
     H = reduced.project(D)[0]
     needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, count_alternatives(a))
@@ -132,9 +132,12 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
         shifts=reduced.shifts,
         project=lambda D: (1e-12 * H, np.zeros(1), reduced.project(D)[2]),
     )
-    far = reach_of(one, a, blind, columns)  # type: ignore[arg-type]
+    rows = count_alternatives(a)
+    far = reach_of(one, a, blind, columns, rows=rows)  # type: ignore[arg-type]
     share = float(H[0, 0] / reduced.project(reduced.whiten(one.columns(a, columns)))[2][0])
-    assert far == pytest.approx(reach_of(one, a, reduced, columns) * np.sqrt(share / 1e-5))
+    assert far == pytest.approx(
+        reach_of(one, a, reduced, columns, rows=count_alternatives(a)) * np.sqrt(share / 1e-5)
+    )
 
 
 def test_cameras_of_few_photographs_are_checked_too() -> None:
@@ -151,3 +154,17 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
         ]
         assert {one.pattern for one in found} == ({pattern} if pattern else set())
         assert all(np.flatnonzero(one.factor).tolist() == [7] for one in found)
+
+
+def test_cameras_too_many_to_test_are_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, more than 60 cameras counted as one, of which some photographs might have another one."""
+    assert alternatives.MAX_RUNS == 60
+    monkeypatch.setattr(alternatives, "MAX_RUNS", 4)
+    network, truth = make_network(seed_of("61"), images=10, points=30, cameras=5, free=("c",))
+    for cameras, untested in ((5, True), (4, False)):
+        camera = np.minimum(np.arange(10) % 5, cameras - 1)
+        a = adjust(replace(network, camera=camera), truth, datum=Datum("free"), reject="none")
+        every = alternatives.alternatives_of(a, reduce_adjustment(a, columns_of(a)), columns_of(a))
+        of_camera = [one for one in every if isinstance(one.family, families.CameraFamily)]
+        assert bool(of_camera) != untested
+        assert ("cameras_untested" in kinds_of(unchecked_assumptions(a))) == untested

@@ -228,7 +228,8 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     run = _runs(camera)
     m = int(run.max()) + 1
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
-    yield from _each(reduced, H, g, squares, run)
+    if not too_many_cameras(camera):
+        yield from _each(reduced, H, g, squares, run)
     for family in OF_PHOTOGRAPHS:
         some = np.array(family.places)
         for among in photographs_among(family, camera):
@@ -257,17 +258,16 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
-    """Return the number of the camera that took each photograph, (m,); parameters of its own leave it one.
-
-    More than MAX_RUNS cameras count as one.
-    """
+    """Return the number of the camera that took each photograph, (m,); parameters of its own leave it one."""
     names = [camera.shared_name for camera in a.estimate.cameras]
     _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
-    return np.where(number.max() < MAX_RUNS, number, 0)
+    return np.asarray(number)
 
 
 def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> list[BoolArray]:
     """Return the photographs among which some may differ, (m,) each: of each camera, or all of the object.
+
+    More than MAX_RUNS cameras are too many to test.
 
     Args:
         family: what differs.
@@ -275,14 +275,24 @@ def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> 
     """
     if not family.of_camera:
         return [np.ones(len(camera), dtype=bool)]
-    return [camera == k for k in range(int(camera.max()) + 1)]
+    return [] if too_many_cameras(camera) else [camera == k for k in range(int(camera.max()) + 1)]
+
+
+def too_many_cameras(camera: IntArray) -> bool:
+    """Return whether there are more cameras, by `cameras_of_photographs`, than are tested."""
+    return int(camera.max()) >= MAX_RUNS
 
 
 def _runs(camera: IntArray) -> IntArray:
-    """Return the run of each photograph, (m,): those of one camera that follow one another."""
+    """Return the run of each photograph, (m,): those of one camera that follow one another.
+
+    Of more cameras than are tested a run has several.
+    """
     m = len(camera)
     if m <= MAX_RUNS:
         return np.arange(m)
+    if too_many_cameras(camera):
+        camera = np.zeros_like(camera)
     piece = np.empty(m, dtype=np.int64)
     piece[np.argsort(camera, kind="stable")] = np.arange(m) * MAX_RUNS // m
     _, run = np.unique([camera, piece], axis=1, return_inverse=True)

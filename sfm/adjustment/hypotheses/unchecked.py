@@ -23,6 +23,7 @@ from sfm.adjustment.hypotheses.alternatives import (
     interior_parameters,
     needed_gain,
     photographs_among,
+    too_many_cameras,
 )
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import (
@@ -52,10 +53,14 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
     """
     columns = columns_of(a)
     reduced = reduce_adjustment(a, columns)
+    number, rows = cameras_of_photographs(a), count_alternatives(a)
+    untested: tuple[Remark, ...] = ()
+    if too_many_cameras(number):
+        untested = (remark("cameras_untested", cameras=int(number.max()) + 1),)
     found: dict[str, float] = {}
     held: dict[str, dict[str, float]] = defaultdict(dict)
     for one in _typical(a, reduced):
-        reach = reach_of(one, a, reduced, columns)
+        reach = reach_of(one, a, reduced, columns, rows=rows)
         if not reach > WRONG_SIGMAS:
             continue
         if isinstance(one.family, InteriorFamily):
@@ -65,6 +70,7 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
         else:
             found[one.family.unchecked] = max(reach, found.get(one.family.unchecked, 0.0))
     return (
+        *untested,
         *(
             remark("held_weakly_tested", camera=camera, parameters=tuple(some), sigmas=max(some.values()))
             for camera, some in held.items()
@@ -101,7 +107,7 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
             yield Alternative(*(family, pattern, after, nothing, NONE, 0.0, 0.0, search, 0.0), among=among)
 
 
-def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns) -> float:
+def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int) -> float:
     """Return by how much coordinates shift at most before an alternative is named, in standard deviations.
 
     Args:
@@ -109,13 +115,14 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
         a: the adjustment.
         reduced: its normal equations.
         columns: its derivatives.
+        rows: alternatives that are tested, which share the level.
     """
     D = reduced.whiten(one.columns(a, columns))
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
-    needed = needed_gain(rank, touched, one.search, count_alternatives(a))
+    needed = needed_gain(rank, touched, one.search, rows)
     least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
     X = a.estimate.points

@@ -128,6 +128,13 @@ ROWS = (
         "Take more photographs.",
     ),
     Kind(
+        "cameras_untested",
+        "note",
+        "Each of {cameras:camera} is assumed not to change, not tested: they are too many.",
+        "cameras of single photographs, or of a few",
+        "Make those one camera in the survey file that are one.",
+    ),
+    Kind(
         "camera_weakly_tested",
         "note",
         "The camera may change during the survey and shift coordinates by up to {sigmas} standard deviations "
