@@ -43,7 +43,10 @@ def section_of(annotation: Any) -> type[Section]:
 
 def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
     """Return key, type, default and meaning of every key of a section."""
-    comments = comments_of(section)
+    comments: dict[str, str] = {}
+    for one in reversed(section.__mro__):
+        if issubclass(one, Section):  # inherited keys too
+            comments |= comments_of(one)
     rows = []
     for name, field in section.model_fields.items():
         default = "required" if field.default is PydanticUndefined else shown(field.default)
