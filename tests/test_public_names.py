@@ -192,7 +192,7 @@ def test_photographs_of_a_survey_made_in_python(tmp_path: Path) -> None:
             {"targets": {"polarity": "grey"}},
             r"survey s: targets: polarity: found 'grey', needed one of 'dark'",
         ),
-        ({"targets": {"code": "x"}}, r"survey s: targets: unknown key 'code' in it, known are polarity"),
+        ({"targets": {"code": "x"}}, r"survey s: targets: unknown key 'code' in it, known are codes"),
         ({"targets": "ring14"}, "survey s: targets: found 'ring14', needed settings as in the survey file"),
         ({"name": "a\nb"}, "needed plain text"),
         ({"datum": {"kind": "control"}}, "datum kind 'control' needs"),
