@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray
-from sfm.survey.drafting.target_trial import try_targets
+from sfm.survey.drafting.target_trial import _side_by_side, try_targets
 from sfm.targets.codes.concentric import concentric_family
-from sfm.targets.codes.plate_search import search_april_grid, search_checkerboard
+from sfm.targets.codes.plate_search import search_april_grids, search_checkerboard
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
 from sfm.targets.detect import find_targets
@@ -45,8 +45,8 @@ def charuco_photograph(name: str, *, is_older: bool = False) -> AnyArray:
 def test_an_empty_first_photograph_does_not_hide_an_april_grid() -> None:
     grid = PlateFamily("aprilgrid", 6, 8, (), "apriltag36h11", 0.8, 17)
     shown = [photographed(drawn(grid), f"trial {k}") for k in range(2)]
-    plate = search_april_grid([EMPTY, shown[0]], shown[1:])
-    assert plate is not None and (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
+    (plate,) = search_april_grids([EMPTY, shown[0]], shown[1:])
+    assert (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
 
 
 @pytest.mark.slow
@@ -102,3 +102,15 @@ def test_concentric_tags_are_recognised_by_the_codes_that_photographs_share(
     trial = try_targets(sorted(tmp_path.iterdir()))
     assert (trial.codes, trial.polarity) == (family, "dark")
     assert sorted(map(int, trial.repeated)) == list(numbers)
+
+
+def test_a_plate_that_looks_alike_when_turned_is_not_used_beside_another() -> None:
+    marks = ((3, 3), (3, 5), (4, 7), (5, 4))
+    dots, board = PlateFamily("grid", 9, 11, marks), PlateFamily("checkerboard", 7, 10)
+    assert _side_by_side((board, dots)) == ((board, dots), ())
+    for alike in (PlateFamily("checkerboard", 7, 9), PlateFamily("grid", 9, 11)):
+        assert alike.is_ambiguous
+        one, other = (alike, dots) if alike.name == "checkerboard" else (board, alike)
+        used, left_out = _side_by_side((one, other))
+        assert used == ((dots,) if alike is one else (board,))
+        assert [plate for plate, _ in left_out] == [alike]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
+from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import plate_bars
@@ -139,6 +141,18 @@ def test_a_further_plate_is_as_true_as_the_first(tmp_path: Path) -> None:
     assert first[3] == pytest.approx(0.01 * np.sqrt(2)) == second[3]
     assert bars("", [80]) == [] and len(bars("", [80, 81])) == 2 and len(bars("", [80, 89])) == 1  # across
     assert [name for name, _ in told_settings(two_plates(tmp_path))][1:3] == ["targets", "plate 2"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("first", "second"), [(APRIL, OTHER), (GRID, BOARD)])
+def test_two_plates_in_one_folder_are_both_drafted(
+    tmp_path: Path, first: PlateFamily, second: PlateFamily
+) -> None:
+    folder = written(tmp_path / "two", first, second).parent
+    sections = tomllib.loads(draft_survey(folder).text)
+    drafted = [sections["targets"], *sections["plate"]]
+    size = {(one["codes"], one["rows"], one["columns"], one.get("first_tag", 0)) for one in drafted}
+    assert size == {(one.name, one.rows, one.columns, one.first_tag) for one in (first, second)}
 
 
 def test_points_are_numbered_on_and_found_in_one_photograph() -> None:

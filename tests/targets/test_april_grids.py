@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.targets.codes.april_grids import MIN_MODULE_PX, _outlines, _unique, name_corners, read_april_tags
-from sfm.targets.codes.plate_search import search_april_grid
+from sfm.targets.codes.plate_search import search_april_grids
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import tag_family, tag_modules
 from sfm.targets.detect import find_targets
@@ -131,24 +131,25 @@ def test_tags_of_another_grid_have_no_names() -> None:
 @pytest.mark.parametrize("border", [1, 2])
 def test_a_grid_is_found(border: int) -> None:
     pictures = [photographed(drawn(GRID, border=border), f"found {k}") for k in range(2)]
-    plate = search_april_grid(pictures)
-    assert plate is not None
+    (plate,) = search_april_grids(pictures)
     assert (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
     assert plate.tag_share == pytest.approx(GRID.tag_share, abs=0.01)
 
 
-def test_of_two_grids_the_first_is_found() -> None:
-    other = replace(GRID, first_tag=29)
-    sheets = [np.hstack([drawn(GRID), drawn(other)]), np.hstack([drawn(other), drawn(GRID)])]
-    plate = search_april_grid(sheets)
-    assert plate is not None and (plate.rows, plate.columns, plate.first_tag) == (6, 8, 17)
+@pytest.mark.parametrize("first_tag", [29, 40])
+def test_two_grids_seen_together_are_both_found(first_tag: int) -> None:
+    other = replace(GRID, rows=4, first_tag=first_tag)
+    low = np.pad(drawn(other), ((0, len(drawn(GRID)) - len(drawn(other))), (0, 0)), constant_values=255)
+    sheets = [np.hstack([drawn(GRID), low]), np.hstack([low, drawn(GRID)])]
+    found = [(one.rows, one.columns, one.first_tag) for one in search_april_grids(sheets)]
+    assert found == [(6, 8, 17), (4, 8, first_tag)]
     for one in (GRID, other):
         assert len(find_targets(sheets[0], codes=one)) == one.count
+    apart = [drawn(GRID), drawn(GRID), low, low]
+    assert [one.first_tag for one in search_april_grids(apart)] == [17]
 
 
 def test_tags_without_squares_are_no_grid() -> None:
     """Their corners are corners, and measured as such."""
-    assert (
-        search_april_grid([photographed(drawn(GRID, squares=False), f"bare {k}") for k in range(2)]) is None
-    )
-    assert search_april_grid([np.full((300, 400), 128, dtype=np.uint8)] * 2) is None
+    assert search_april_grids([photographed(drawn(GRID, squares=False), f"bare {k}") for k in range(2)]) == ()
+    assert search_april_grids([np.full((300, 400), 128, dtype=np.uint8)] * 2) == ()

@@ -149,7 +149,14 @@ def _text(
         lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
         lines += ["", *_example_lines(trial)]
     else:
-        lines += ["", "[datum]", 'kind = "control"  # the plate, flat and true, is the datum']
+        lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
+        for plate in trial.plates[1:]:
+            lines += [
+                "",
+                "# fixed to the first plate; its points are measured",
+                *_other_plate_lines(plate, pitch),
+            ]
+        lines += [f"# Left out: {_described(plate)} ({why})" for plate, why in trial.left_out]
     sigma = CORNER_SIGMA_PX if trial.codes in ("none", *BOARDS) else SIGMA_PX
     lines += [
         "",
@@ -209,15 +216,23 @@ def _kinds_of_codes() -> str:
 
 
 def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
+    lines = ["[targets]", *_lines_of_any_plate(plate, pitch)]
+    if not pitch:
+        lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
+    return lines
+
+
+def _other_plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
+    return ["[[plate]]", *_lines_of_any_plate(plate, pitch)]
+
+
+def _lines_of_any_plate(plate: PlateFamily, pitch: float | None) -> list[str]:
     lines = [
-        "[targets]",
         f"codes = {_quoted(plate.name)}",
         f"rows = {plate.rows}  # of dots, of crossings inside the board, or of corners of tags",
         f"columns = {plate.columns}",
         f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots, crossings or tags",
     ]
-    if not pitch:
-        lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
     if plate.marks:
         lines.append(f"marks = {json.dumps([list(mark) for mark in plate.marks])}  # row and column, from 0")
     if plate.dictionary:
@@ -229,6 +244,11 @@ def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
     if plate.first_tag:
         lines.append(f"first_tag = {plate.first_tag}  # number of the first tag of the board")
     return lines
+
+
+def _described(plate: PlateFamily) -> str:
+    marks = f", {counted(len(plate.marks), 'mark')}" if plate.marks else ""
+    return f"{plate.name} of {plate.rows} rows and {plate.columns} columns{marks}"
 
 
 def _example_lines(trial: TargetTrial) -> list[str]:
@@ -260,9 +280,8 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
         for camera in grouping.cameras
     ]
     if trial.plate is not None:
-        plate = trial.plate
-        marks = f", {counted(len(plate.marks), 'mark')}" if plate.marks else ""
-        found.append(("targets", f"{plate.name} of {plate.rows} rows and {plate.columns} columns{marks}"))
+        found.append(("targets", "; ".join(map(_described, trial.plates))))
+        found += [("left out", f"{_described(plate)} ({why})") for plate, why in trial.left_out]
     elif trial.codes != "none":
         repeated = (
             f"{counted(len(trial.repeated), 'code')} that two of {len(trial.photographs)} photographs have"

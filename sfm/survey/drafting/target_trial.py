@@ -19,17 +19,19 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
+from sfm.targets.codes.boards import find_crossings
 from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
 from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.families import code_family
+from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plate_search import (
-    search_april_grid,
+    search_april_grids,
     search_charuco,
     search_checkerboard,
     search_dots,
     shows_a_lattice,
 )
-from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.codes.ring_reading import read_codes
 from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily
 from sfm.targets.codes.tags import (
@@ -60,8 +62,14 @@ class TargetTrial:
     circles: float  # median number of circular targets in a photograph
     blur_px: float  # median standard deviation of their edges, px; NaN without
     photographs: tuple[str, ...]  # that were tried
-    plate: PlateFamily | None = None  # calibration plate
+    plates: tuple[PlateFamily, ...] = ()  # calibration plates; those after the first are seen with it
+    left_out: tuple[tuple[PlateFamily, str], ...] = ()  # plates that have no place beside the first, and why
     unreadable: tuple[tuple[str, str], ...] = ()  # photographs that could not be decoded, and why
+
+    @property
+    def plate(self) -> PlateFamily | None:
+        """The first calibration plate."""
+        return self.plates[0] if self.plates else None
 
 
 def try_targets(
@@ -90,39 +98,72 @@ def try_targets(
                 codes = list(map(partial(_ring_codes, family), photographs, plain))
                 counts[family] = _repeated(codes)
     progress.advance("rings")
-    best, plate, measured = max(counts, key=lambda family: len(counts[family])), None, plain
+    best, measured = max(counts, key=lambda family: len(counts[family])), plain
+    plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
     if len(counts[best]) < MIN_REPEATED:
         refused = {name for name, _ in unreadable}
         more = [paths[k] for k in _spread(len(paths), PLATES_TRIED) if paths[k].name not in refused]
         read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
-        tags, plate = _tags_and_boards(read_already, more, progress)
-        if plate is None and tags:
+        tags, plates = _tags_and_boards(read_already, more, progress)
+        if not plates and tags:
             measured = [_measure(path, tags, store) for path in tried]
             counts[tags], best = _repeated([one.code for one in measured]), tags
-        elif plate is None:
-            plate = _dots(plain, [path for path in more if path not in tried], store)
+        else:
+            dots = _dots(plain, [path for path in more if path not in tried], store)
+            seen = zip(read_already.values(), plain, strict=True)
+            if dots is None or not plates:
+                plates = plates if dots is None else (dots,)
+            elif any(_shows_both(grey, targets, plates[0], dots) for grey, targets in seen):
+                plates, left_out = _side_by_side((*plates, dots))
+            else:
+                left_out = ((dots, "no photograph tried shows it with the first plate"),)
         progress.advance("plates of dots")
-        if plate is None and not tags:
+        if not plates and not tags:
             read = [read_resolved(photograph) for photograph in photographs]
             counts |= {family: _repeated([one[family] for one in read]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
             if len(counts[best]) >= MIN_REPEATED:
                 measured = [_measure(path, best, store) for path in tried]
         progress.advance("concentric tags")
-    coded = len(counts[best]) >= MIN_REPEATED and plate is None
+    coded = len(counts[best]) >= MIN_REPEATED and not plates
     if coded and best in RING_NAMES:
         measured = [_measure(path, best, store) for path in tried]
     return TargetTrial(
-        best if coded else "none" if plate is None else plate.name,
+        best if coded else plates[0].name if plates else "none",
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
         float(np.median([np.isfinite(one.axes_covariance[:, 0, 0]).sum() for one in measured])),
         _blur(measured),
         tuple(path.name for path in tried),
-        plate,
+        plates,
+        left_out,
         unreadable,
     )
+
+
+def _shows_both(grey: AnyArray, targets: Targets, board: PlateFamily, dots: PlateFamily) -> bool:
+    """Return whether a photograph shows a board and most of a plate of dots."""
+    lattice = find_lattice(targets.xy, np.ones(len(targets.xy), dtype=bool))
+    if lattice is None or len(lattice.rows) < dots.count / 2:
+        return False
+    crossings, _ = find_crossings(grey, board, scale=255.0, noise=1.0)
+    return len(crossings.xy) >= board.count / 2
+
+
+def _side_by_side(
+    plates: tuple[PlateFamily, ...],
+) -> tuple[tuple[PlateFamily, ...], tuple[tuple[PlateFamily, str], ...]]:
+    """Return the plates that one survey can use, and the others and why; one with a place is the first."""
+    used, left_out = list[PlateFamily](), list[tuple[PlateFamily, str]]()
+    for plate in sorted(plates, key=lambda one: one.is_ambiguous):
+        try:
+            group_plates([*used, plate] if used else [])
+        except GeometryError as error:
+            left_out.append((plate, str(error)))
+        else:
+            used.append(plate)
+    return tuple(used), tuple(left_out)
 
 
 def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray:
@@ -136,17 +177,18 @@ def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray
 
 def _tags_and_boards(
     read_already: Mapping[Path, AnyArray], more: Sequence[Path], progress: Progress
-) -> tuple[str, PlateFamily | None]:
-    """Return the dictionary of tags that photographs have in common, "" without, and their board.
+) -> tuple[str, tuple[PlateFamily, ...]]:
+    """Return the dictionary of tags that photographs have in common, "" without, and their boards.
 
     A checkerboard may be a ChArUco board, which its tags show.
     """
     none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
     others = [_as_bytes(read_photograph(path)) for path in more if path not in read_already]
-    plate = search_april_grid(tried, others)  # first, since modules of tags may pass for squares
-    if plate is not None:
-        return "", plate
+    grids = search_april_grids(tried, others)  # first, since modules of tags may pass for squares
+    if grids:
+        return "", grids
     plate = search_checkerboard([*tried, *others])
+    boards = () if plate is None else (plate,)
     progress.advance("boards")
     read = [read_dictionaries(photograph) for photograph in tried]
     if any(read):
@@ -157,10 +199,11 @@ def _tags_and_boards(
     }
     family = max(repeated, key=lambda name: len(repeated[name]))
     if not len(repeated[family]):
-        return "", plate
+        return "", boards
     seen = [one.get(family, none) for one in read]
     family = smallest_dictionary(family, repeated[family])
-    return family, search_charuco([*tried, *others], family, seen) or plate
+    charuco = search_charuco([*tried, *others], family, seen)
+    return family, boards if charuco is None else (charuco,)
 
 
 def _shared(photographs: Sequence[IntArray]) -> IntArray:

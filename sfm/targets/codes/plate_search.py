@@ -102,24 +102,45 @@ def search_charuco(
     return None
 
 
-def search_april_grid(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()) -> PlateFamily | None:
-    """Return the AprilGrid that photographs (uint8) show, of tags of Kalibr's family; None without.
+def search_april_grids(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()) -> tuple[PlateFamily, ...]:
+    """Return the AprilGrids that photographs (uint8) show, of tags of Kalibr's family, by their numbers.
 
-    Others are read where one that is tried has tags. Of several grids side by side it is the one with the
-    lowest numbers.
+    Others are read where one that is tried has tags. A grid beside those of lower numbers is one that a
+    photograph shows together with one of these.
     """
     seen = [read_april_tags(grey, KALIBR_TAGS) for grey in tried]
     if not any(len(number) >= MIN_TAGS_OF_BOARD for number, _ in seen):
-        return None
+        return ()
     photographs = [*tried, *others]
     seen += [read_april_tags(grey, KALIBR_TAGS) for grey in others]
-    first = min(int(number.min()) for number, _ in seen if len(number))
-    last = max(int(number.max()) for number, _ in seen if len(number)) - first
+    grids, shown = list[PlateFamily](), list[set[int]]()
+    while (grid := _april_grid(photographs, seen)) is not None:
+        of_grid = [(number >= grid.first_tag) & (number <= grid.last_tag) for number, _ in seen]
+        showing = {k for k, own in enumerate(of_grid) if own.sum() >= MIN_TAGS_OF_BOARD}
+        if not grids or any(showing & one for one in shown):
+            grids.append(grid)
+            shown.append(showing)
+        seen = [(number[~own], quads[~own]) for (number, quads), own in zip(seen, of_grid, strict=True)]
+    return tuple(grids)
+
+
+def _april_grid(
+    photographs: Sequence[AnyArray], seen: Sequence[tuple[IntArray, FloatArray]]
+) -> PlateFamily | None:
+    """Return the grid whose tags have the lowest numbers of those that photographs show, None without."""
+    numbers = np.unique(np.concatenate([number for number, _ in seen]))
+    if not len(numbers):
+        return None
+    first = int(numbers[0])
+    last = int(numbers[-1]) - first
     sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # whole, or with other grids behind it
     sizes += sorted(
         ((m, n) for n in range(2, last) for m in range(2, last // n + 1)), key=lambda one: -one[0] * one[1]
     )
     for down, across in sizes:
+        in_last_row = (numbers - first) // across == down - 1
+        if not in_last_row.any():
+            continue
         row, column = np.divmod(np.arange(across * down), across)
         middle = np.stack([column, -row], axis=1).astype(float)
         parts = [
