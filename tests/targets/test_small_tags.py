@@ -199,6 +199,19 @@ def test_tags_are_read_as_by_opencv_under_shadows_and_highlights(name: str, side
     assert 0.75 < ratio < (1.3 if side == 60 else 2.4)
 
 
+def test_uneven_print_is_read() -> None:
+    """Modules differ by 7 % of the step, as those of a poor printer."""
+    name, side_px = "aruco4x4_1000", 30
+    modules = np.pad(~tag_modules(tag_family(name), 17), 1, constant_values=True)
+    printed = np.where(modules, 200, 40) + 0.07 * 160 * seed_of("print").standard_normal(modules.shape)
+    picture = cv2.GaussianBlur(
+        np.pad(np.kron(printed, np.ones((side_px, side_px))), 40, constant_values=200.0), (0, 0), 0.8
+    )
+    picture = picture + seed_of("noise").standard_normal(picture.shape)
+    tags = find_tags(np.rint(picture).astype(np.uint8), tag_family(name), polarity="dark", scale=255.0)
+    assert tags.code.tolist() == [68, 69, 70, 71]
+
+
 def test_undisturbed_corners_are_not_widened() -> None:
     noise = np.array([1.0, 1.1, 0.95, 1.2, 1.0, 1.05, 2.4, 5.0])
     widening = _widening(noise)
