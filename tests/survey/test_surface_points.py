@@ -115,13 +115,17 @@ def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) 
     )
 
 
-def test_the_sigma_of_the_survey_is_added_to_that_of_the_matches(tmp_path: Path) -> None:
+def test_the_sigma_of_the_survey_sets_the_level_of_covariances_and_residuals_their_shape(
+    tmp_path: Path,
+) -> None:
     plain = covered(tmp_path, HELD + "[adjust]\nsigma_px = 0.1\n").network.image_points
     more = covered(tmp_path, HELD + "[adjust]\nsigma_px = 0.5\n").network.image_points
     np.testing.assert_array_equal(more.xy, plain.xy)
-    np.testing.assert_allclose(
-        more.covariance - plain.covariance, np.tile(0.24 * np.eye(2), (len(more), 1, 1))
-    )
+    ratio = np.linalg.norm(more.covariance, axis=(1, 2)) / np.linalg.norm(plain.covariance, axis=(1, 2))
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.1)
+    for one, sigma_px in ((plain, 0.1), (more, 0.5)):
+        usual = np.median(np.trace(one.covariance, axis1=1, axis2=2)) / 2
+        assert sigma_px**2 < usual < sigma_px**2 + 0.01
 
 
 def test_a_photograph_has_as_many_points_as_the_survey_says(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
+SETTLED_PARTS = 0.01  # the same of the covariance of two parts, and change of the share of one
 MAX_ROUNDS = 20
 FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
 IMAGE_POINTS = "image points"
@@ -206,6 +207,63 @@ def estimate_components(
         tried.append(factor)
         rejected.append(adjustment.rejected)
     return adjustment, factor, False
+
+
+def estimate_common_part(
+    adjust_with: Callable[[FloatArray], Adjustment], covariance: FloatArray, common_px: float
+) -> tuple[float, float]:
+    """Return the factor on stated standard deviations of image points, and the sigma of what is not stated.
+
+    The covariance of an image point is f^2 C + s^2 I: C is stated for each, as by matching, f says how far
+    these are from the truth, and s is what they say nothing of, as the shape of a surface inside a window or
+    an unsteady lens. The squares of both are estimated from the residuals by Fisher scoring; the redundancy
+    of an image point is taken alike in all directions.
+
+    Args:
+        adjust_with: adjusts a network with covariances of its image points, px^2, (k, 2, 2).
+        covariance: stated, px^2, (k, 2, 2).
+        common_px: s to begin with, px.
+
+    Returns:
+        f, which may be 0, and s, at least MIN_SIGMA_PX; after MAX_ROUNDS as they are.
+
+    Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.6 (iterated best
+    invariant quadratic unbiased estimation).
+    """
+    parts = np.stack([covariance, np.broadcast_to(np.eye(2), covariance.shape)])
+    squares = np.array([1.0, common_px**2])
+    for _ in range(MAX_ROUNDS):
+        C = np.einsum("p,pkab->kab", squares, parts)
+        adjustment = adjust_with(C)
+        used = ~adjustment.rejected
+        P = np.linalg.inv(C[used])
+        PV = P @ parts[:, used]
+        Pv = np.einsum("kab,kb->ka", P, adjustment.residuals[used])
+        redundancy = adjustment.redundancy_numbers[used].mean(axis=1)
+        S = np.einsum("k,pkab,qkba->pq", redundancy, PV, PV)
+        found = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
+        before, squares = squares, _not_negative(S, found)
+        change = np.sqrt(_median_trace(squares, parts) / _median_trace(before, parts)) - 1
+        share = squares[1] / _median_trace(squares, parts) - before[1] / _median_trace(before, parts)
+        if max(abs(change), abs(share)) <= SETTLED_PARTS:
+            break
+    factor, common = np.sqrt(squares).tolist()
+    return factor, max(common, MIN_SIGMA_PX)
+
+
+def _not_negative(S: FloatArray, found: FloatArray) -> FloatArray:
+    """Return the solution of two normal equations, of one alone where the other would be negative, (2,)."""
+    squares = np.linalg.solve(S, found)
+    for one, other in ((0, 1), (1, 0)):
+        if squares[one] < 0:
+            squares[one], squares[other] = 0.0, found[other] / S[other, other]
+    return np.asarray(squares)
+
+
+def _median_trace(squares: FloatArray, parts: FloatArray) -> float:
+    """Return the median variance of an image coordinate, px^2."""
+    C = np.einsum("p,pkab->kab", squares, parts)
+    return float(np.median(np.trace(C, axis1=1, axis2=2))) / 2
 
 
 def _as_weighted(adjustment: Adjustment) -> Adjustment:

@@ -45,7 +45,7 @@ class CoveringPoints:
     image_points: ImagePoints  # k of them, their points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
     residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
-    matched: int  # rays that were matched, of which these k agree with each other
+    matched: int  # rays of points that enough photographs matched, of which these k agree with each other
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,8 @@ def _agreeing(
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
     image_points = replace(seen.select(used), point=point.ravel())
     residuals = met.residuals[used] * c[:, None]
-    return CoveringPoints(image_points, met.points[kept], residuals, len(seen)), used
+    matched = int((np.bincount(seen.point, minlength=n) >= min_rays)[seen.point].sum())
+    return CoveringPoints(image_points, met.points[kept], residuals, matched), used
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:

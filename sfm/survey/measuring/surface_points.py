@@ -13,12 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray
+from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.variance_components import estimate_common_part
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
+from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike
 from sfm.matching.lsm.projected_points import pictures_of
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import read_photograph
+from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
@@ -34,6 +40,7 @@ TRIAL_RAYS = 100  # with fewer the window stays as it is
 TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
 # Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
 TOLERANCE_FACTOR = 6.0
+RAYS_OF_NOISE = 20_000  # from about so many the noise of matching is estimated: to half a percent
 MIN_CONTROL = 3  # points that place the photographs in the system of the control
 # Share of the matched rays that agree with each other below which many do so by chance: 0.91 and more on
 # rendered surfaces, 0.37 on photographs of a varnished floor from all sides
@@ -106,6 +113,9 @@ def cover_photographs(
         scale_bars=scale_bars(survey.scale_bars, points),
     )
     placed = replace(estimate, points=found.points)
+    covering = _with_common_part(
+        covering, placed, found.image_points.covariance[order], survey.adjust.sigma_px
+    )
     control = covering.control.complete
     if start.kind != "given" and len(control) >= MIN_CONTROL:  # the tie points had none to be placed on
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
@@ -118,6 +128,40 @@ def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
     if share >= MIN_AGREEING:
         return ()
     return (remark("windows_disagree", share=share),)
+
+
+def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray, sigma_px: float) -> Network:
+    """Return the network with the share of matching in its covariances as the residuals show it.
+
+    Their median stays: sigma0 goes on to say how much worse the image points are than was expected.
+
+    Args:
+        network: covering points, weighted as expected.
+        estimate: approximate values.
+        matching: covariance that matching states, px^2, (k, 2, 2).
+        sigma_px: expected of what matching does not state, px.
+    """
+    seen = network.image_points
+    every = max(1, len(seen) // RAYS_OF_NOISE)
+    some = np.arange(len(network.points)) % every == 0
+    images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(seen), dtype=bool)
+    part, start = reduce_network(without_given(network), estimate, images, some, rays)
+
+    def adjust_with(covariance: FloatArray) -> Adjustment:
+        nonlocal start
+        weighted = replace(part, image_points=replace(part.image_points, covariance=covariance))
+        found = adjust(weighted, start, alpha=level_of_single(FALSE_ALARM, 2 * len(covariance)))
+        start = found.estimate
+        return found
+
+    try:
+        factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], sigma_px)
+    except GeometryError:  # which the adjustment of the survey says, or mends
+        return network
+    shown = factor**2 * matching + common_px**2 * np.eye(2)
+    usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))
+    shown *= usual / np.median(np.trace(shown, axis1=1, axis2=2))
+    return replace(network, image_points=replace(seen, covariance=shown))
 
 
 def _fitting(network: Network, estimate: Estimate) -> BoolArray:
