@@ -57,6 +57,37 @@ def test_a_principal_point_far_from_the_centre_is_told() -> None:
     assert away.names("camera") == ("camera 1",) and away.number("share") == pytest.approx(0.12, abs=0.01)
 
 
+@pytest.mark.parametrize("name", ["b1", "b2"])
+def test_pixels_that_no_sensor_has_are_told(name: str) -> None:
+    network, truth = make_network(seed_of("no such pixels"), images=8, points=40, free=("c", "b1", "b2"))
+    a = adjust(network, truth, datum=Datum("free"))
+    camera = a.estimate.cameras[0]
+    for value, severity in ((0.005, None), (-0.02, "warning"), (0.4, "error")):
+        p = camera.parameters.copy()
+        p[camera.names.index(name)] = value
+        changed = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
+        found = of_kind(verdict_of(changed).remarks, "pixels_distorted")
+        assert [(one.severity, one.names("parameter")) for one in found] == (
+            [(severity, (name,))] if severity else []
+        )
+
+
+def test_focal_lengths_of_both_directions_show_the_shape_of_the_pixels() -> None:
+    network, truth = make_network(
+        seed_of("fx and fy"), images=8, points=40, model="opencv", free=("fx", "fy")
+    )
+    a = adjust(network, truth, datum=Datum("free"))
+    camera = a.estimate.cameras[0]
+    p = camera.parameters.copy()
+    p[camera.names.index("fy")] *= 1.03
+    changed = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
+    (found,) = of_kind(verdict_of(changed).remarks, "pixels_distorted")
+    assert found.names("parameter") == ("fy / fx - 1",) and found.number("share") == pytest.approx(
+        0.03, abs=1e-3
+    )
+    assert not of_kind(verdict_of(a).remarks, "pixels_distorted")
+
+
 @pytest.mark.parametrize(
     ("kind", "size"), [("exchanged", (1500, 2000)), ("halved", (1000, 750)), ("doubled", (2000, 1500))]
 )

@@ -93,11 +93,20 @@ ROWS = (
     ),
     Kind(
         "principal_point_far",
-        Grade("share", warning=0.1),  # of the diagonal; a decentred lens or sensor has 0.01 or 0.02
+        # of the diagonal; a decentred lens or sensor has 0.01 or 0.02, and 0.25 is half way to a corner
+        Grade("share", warning=0.1, error=0.25),
         "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
         "photograph.",
         "the network hardly determines it, or the photographs are cropped",
         "Hold it fixed, or add photographs turned by 90 degrees.",
+    ),
+    Kind(
+        "pixels_distorted",
+        # pixels of sensors are square to 1e-4, scans and pictures that were scaled to a percent
+        Grade("share", warning=0.01, error=0.05),
+        "The adjusted {parameter} of camera {camera} is {share:%}: no sensor has such pixels.",
+        "the network hardly determines it, or wrong matches that it fits",
+        "Hold b1 and b2 at 0 (fx and fy at the same value), or add photographs turned by 90 degrees.",
     ),
     Kind(
         "format_of_other_size",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.distortion.models import Role
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import SurveyResult
@@ -15,7 +16,7 @@ DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
     """Return the remarks on all cameras, where they are the result on how well they are known as such."""
     weak = _not_calibrated(calibrated) if calibrated else _hardly_determined(result)
-    return (*weak, *_principal_points(result))
+    return (*weak, *_principal_points(result), *_pixels(result))
 
 
 def _not_calibrated(calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
@@ -59,6 +60,25 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
                 remark("format_of_other_size", camera=camera.name, width=other[0], height=other[1])
             )
     return tuple(remarks)
+
+
+def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return adjusted affinity and shear of pixels where no sensor has them."""
+    found: list[Remark] = []
+    for camera in result.adjustment.estimate.cameras:
+        values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+        adjusted = camera.free & camera.plays(Role.AFFINITY, Role.SHEAR)
+        shares = {name: values[name] for name, one in zip(camera.names, adjusted, strict=True) if one}
+        if camera.free[camera.parts[0]].sum() == 2:  # of both directions
+            first, second = np.flatnonzero(camera.parts[0])
+            ratio = camera.parameters[second] / camera.parameters[first]
+            ratio *= camera.pixel_mm[1] / camera.pixel_mm[0]
+            shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
+        for name, value in shares.items():
+            found += unless_note(
+                remark("pixels_distorted", camera=camera.name, parameter=name, share=abs(value))
+            )
+    return tuple(found)
 
 
 def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] | None:

@@ -25,7 +25,7 @@ from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import read_photograph
 from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark
+from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
@@ -42,9 +42,6 @@ TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
 TOLERANCE_FACTOR = 6.0
 RAYS_OF_NOISE = 20_000  # from about so many the noise of matching is estimated: to half a percent
 MIN_CONTROL = 3  # points that place the photographs in the system of the control
-# Share of the matched rays that agree with each other below which many do so by chance: 0.91 and more on
-# rendered surfaces, 0.37 on photographs of a varnished floor from all sides
-MIN_AGREEING = 0.7
 
 
 @dataclass(frozen=True)
@@ -124,10 +121,7 @@ def cover_photographs(
 
 def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
     """Return the remark that many of the matched windows contradict each other, where they do."""
-    share = len(found.image_points) / max(found.matched, 1)
-    if share >= MIN_AGREEING:
-        return ()
-    return (remark("windows_disagree", share=share),)
+    return unless_note(remark("windows_disagree", share=1 - len(found.image_points) / max(found.matched, 1)))
 
 
 def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray, sigma_px: float) -> Network:
