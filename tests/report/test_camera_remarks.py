@@ -57,6 +57,20 @@ def test_a_principal_point_far_from_the_centre_is_told() -> None:
     assert away.names("camera") == ("camera 1",) and away.number("share") == pytest.approx(0.12, abs=0.01)
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.24, False), (0.26, True)])
+def test_a_principal_point_that_no_camera_has_is_an_error(share: float, told: bool) -> None:
+    """Where it is known; one that the photographs hardly determine is far by its error."""
+    network, truth = make_network(seed_of("outside"), images=8, points=40)
+    a = adjust(network, truth, datum=Datum("free"))
+    camera = a.estimate.cameras[0]
+    p = camera.parameters.copy()
+    p[camera.names.index("x0")] = share * np.hypot(10.0, 7.5)
+    moved = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
+    assert bool(of_kind(verdict_of(moved).remarks, "principal_point_outside")) is told
+    wide = replace(moved.covariance, interior=tuple(1e6 * one for one in moved.covariance.interior))
+    assert not of_kind(verdict_of(replace(moved, covariance=wide)).remarks, "principal_point_outside")
+
+
 @pytest.mark.parametrize("name", ["b1", "b2"])
 def test_pixels_that_no_sensor_has_are_told(name: str) -> None:
     network, truth = make_network(seed_of("no such pixels"), images=8, points=40, free=("c", "b1", "b2"))

@@ -37,7 +37,9 @@ def test_c_far_from_its_start_value_is_told(model: str) -> None:
     assert one.kind == "c_far_from_given" and one.names("camera") == ("synthetic",)
     assert [one.number(name) for name in ("given", "found", "change")] == pytest.approx([10, 2.2, -78])
     held = replace(estimate, cameras=(replace(far.cameras[0], free=name.free & False),))
-    assert far_principal_distances(survey, held, [0.01]) == ()
+    (one,) = far_principal_distances(survey, held, [0.01])
+    assert one.kind == "c_held_elsewhere" and one.severity == "error"
+    assert [one.number(name) for name in ("given", "found")] == pytest.approx([10, 2.2])
 
 
 def test_a_wrong_start_value_of_c_is_a_note_where_the_network_determines_c() -> None:

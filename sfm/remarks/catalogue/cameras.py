@@ -73,6 +73,14 @@ ROWS = (
         "Give c from a calibration, or add photographs from other distances.",
     ),
     Kind(
+        "c_held_elsewhere",
+        "error",
+        "c of camera {camera} was held at {found}, from which photographs can be oriented, and not at "
+        "{given}, which the survey states.",
+        "c_mm or pixel_mm is wrong, or photographs that do not belong together fit another camera by chance",
+        "Give c from a calibration, or add photographs, which determine it.",
+    ),
+    Kind(
         "camera_not_calibrated",
         # a warning where the 95 % value reaches a pixel, which nobody takes for the error of a calibrated
         # camera, an error where the standard deviation does
@@ -93,12 +101,20 @@ ROWS = (
     ),
     Kind(
         "principal_point_far",
-        # of the diagonal; a decentred lens or sensor has 0.01 or 0.02, and 0.25 is half way to a corner
-        Grade("share", warning=0.1, error=0.25),
+        Grade("share", warning=0.1),  # of the diagonal; a decentred lens or sensor has 0.01 or 0.02
         "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
         "photograph.",
         "the network hardly determines it, or the photographs are cropped",
         "Hold it fixed, or add photographs turned by 90 degrees.",
+    ),
+    Kind(
+        "principal_point_outside",
+        "error",
+        "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
+        "photograph (standard deviation {sigma:%}): no camera has it there.",
+        "a camera that the photographs only seem to determine, wrong matches, or cropped photographs",
+        "Hold it fixed, or give uncropped photographs.",
+        explains=("principal_point_far",),
     ),
     Kind(
         "pixels_distorted",

@@ -10,6 +10,8 @@ from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import SurveyResult
 
+SURE = 3.0  # standard deviations from which a camera is as the adjustment has it
+OUTSIDE = 0.25  # of the diagonal, half way to a corner: no principal point is farther from the centre
 DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 
@@ -46,7 +48,7 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
 def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
     """Return adjusted principal points where no lens has them, and the format of which they are centres."""
     remarks: list[Remark] = []
-    for camera in result.adjustment.estimate.cameras:
+    for number, camera in enumerate(result.adjustment.estimate.cameras):
         if not camera.free[camera.parts[1]].any():
             continue
         at, (width, height) = camera.principal_point_px, camera.size_px
@@ -54,6 +56,9 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
         far = unless_note(remark("principal_point_far", camera=camera.name, share=away))
         remarks += far
+        sigma = _principal_sigma_px(result, number) / diagonal
+        if away - SURE * sigma > OUTSIDE:
+            remarks.append(remark("principal_point_outside", camera=camera.name, share=away, sigma=sigma))
         other = _format_around(at, width, height) if far else None
         if other is not None:
             remarks.append(
@@ -62,18 +67,32 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
     return tuple(remarks)
 
 
+def _principal_sigma_px(result: SurveyResult, number: int) -> float:
+    """Return the larger standard deviation of the principal point of a camera, px; 0 where it is held."""
+    camera = result.adjustment.estimate.cameras[number]
+    sigma = np.nan_to_num(result.adjustment.interior_sigma(number)[camera.parts[1]], nan=0.0)
+    return float(sigma.max() / (np.mean(camera.pixel_mm) if camera.in_mm else 1.0))
+
+
 def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
     """Return adjusted affinity and shear of pixels where no sensor has them."""
     found: list[Remark] = []
-    for camera in result.adjustment.estimate.cameras:
+    for number, camera in enumerate(result.adjustment.estimate.cameras):
+        sigma = dict(zip(camera.names, result.adjustment.interior_sigma(number).tolist(), strict=True))
         values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         adjusted = camera.free & camera.plays(Role.AFFINITY, Role.SHEAR)
-        shares = {name: values[name] for name, one in zip(camera.names, adjusted, strict=True) if one}
+        shares = {
+            name: values[name]
+            for name, one in zip(camera.names, adjusted, strict=True)
+            if one and abs(values[name]) > SURE * sigma[name]
+        }
         if camera.free[camera.parts[0]].sum() == 2:  # of both directions
             first, second = np.flatnonzero(camera.parts[0])
             ratio = camera.parameters[second] / camera.parameters[first]
             ratio *= camera.pixel_mm[1] / camera.pixel_mm[0]
-            shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
+            of_ratio = np.hypot(*(sigma[camera.names[k]] / camera.parameters[k] for k in (first, second)))
+            if abs(ratio - 1) > SURE * of_ratio:
+                shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
         for name, value in shares.items():
             found += unless_note(
                 remark("pixels_distorted", camera=camera.name, parameter=name, share=abs(value))

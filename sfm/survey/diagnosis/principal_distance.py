@@ -19,7 +19,9 @@ FAR = 0.2  # relative change of c, as focusing from infinity to 1 : 5 makes it: 
 
 
 def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
-    """Return a remark for each adjusted principal distance that lies far from the one that the survey gives.
+    """Return a remark for each principal distance that lies far from the one that the survey gives.
+
+    One that was held there has been found by trial, and nothing has tested it.
 
     Args:
         survey: whose cameras state `c_mm`; those by EXIF data are not looked at, nor those that photograph a
@@ -33,10 +35,15 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
     remarks = []
     for camera, s in zip(estimate.cameras, sigma, strict=True):
         start = given.get(camera.name)
-        if start is None or not camera.free[0]:
+        if start is None:
             continue
         found = camera.c_px * float(np.mean(camera.pixel_mm))
-        if abs(found / start - 1) > FAR:
+        if abs(found / start - 1) <= FAR:
+            continue
+        if not camera.free[0]:
+            held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(found, "mm"))
+            remarks.append(held)
+        else:
             remarks.append(
                 remark(
                     "c_far_from_given",
