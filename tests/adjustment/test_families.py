@@ -347,7 +347,7 @@ def test_two_causes_at_most_of_a_standard_deviation_at_least(
     shifts: list[float] = []
     treated: list[str] = []
 
-    def best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause:
+    def best(plain: Adjustment, causes: tuple[Cause, ...], bodies: object) -> Cause:
         assert len(causes) == len(treated)
         treated.append("")
         return Cause(alternative(), Refit(replace(plain), np.ones(1), 1.0, shifts.pop(0), 1.0), ())

@@ -313,6 +313,57 @@ def moved_twice(seed: str) -> Adjustment:
     return solved(replace(network, image_points=replace(seen, xy=xy)), truth)
 
 
+def slipped_plates(*, noise_px: float = 0.05) -> tuple[Adjustment, tuple[tuple[str, ...], ...]]:
+    """Return six photographs of two plates, whose second one moves from the fourth on, and their points."""
+    rng = seed_of("slipped plates")
+    free = ("c", "x0", "y0", "K1", "K2")
+    network, truth = make_network(rng, images=6, points=80, planar=True, noise_px=noise_px, free=free)
+    X = truth.points.copy()
+    second = X[:, 0] > 0
+    X[second] = X[second] @ rotation_from_vector(np.array([0.0, -0.4, 0.1])).T
+    moved = X.copy()
+    turn = rotation_from_vector(np.array([0.0, 0.0, 1e-3]))
+    moved[second] = (X[second] - X[second].mean(axis=0)) @ turn.T + X[second].mean(axis=0) + [1e-3, 5e-4, 0.0]
+    seen = network.image_points
+    before, after = (
+        observed_anew(network, replace(truth, points=one), noise_px, rng).image_points.xy
+        for one in (X, moved)
+    )
+    xy = np.where(seen.image[:, None] >= 3, after, before)
+    names = np.array(network.points)
+    plates = tuple(names[~second].tolist()), tuple(names[second].tolist())
+    return solved(replace(network, image_points=replace(seen, xy=xy)), replace(truth, points=X)), plates
+
+
+def test_a_plate_that_moved_is_named_and_not_the_camera() -> None:
+    """Six parameters of one plate explain what nine of the camera in each photograph nearly take up."""
+    a, plates = slipped_plates()
+    assert "plate_moved" not in kinds_of(judge_alternatives(a).causes)
+    (found,) = judge_alternatives(a, unit="m", bodies=plates).causes
+    assert found.kind == "plate_moved" and found.severity == "error"
+    assert found.names("points") == plates[1]
+    assert found.names("from") == ("image 4",)
+    X = a.estimate.points[np.isin(a.network.points, plates[1])]
+    reach = float(np.linalg.norm((X - X.mean(axis=0))[:, :2], axis=1).max())
+    assert found.number("distance") == pytest.approx(np.hypot(1e-3, 5e-4) + 1e-3 * reach, rel=0.2)
+
+
+def test_of_two_bodies_the_motion_of_one_is_that_of_the_other() -> None:
+    a, (first, second) = slipped_plates()
+    names = np.array(a.network.points)
+
+    def tested(*bodies: tuple[str, ...]) -> list[list[str]]:
+        return [names[some].tolist() for some in hypotheses._moving_bodies(a, bodies)]
+
+    assert tested(first, second) == [list(second)]
+    three = first, second[:20], second[20:]
+    assert tested(*three) == [list(one) for one in three]
+    assert (
+        tested(tuple(names)) == tested(first[:2]) == tested(tuple(names[2:])) == []
+    )  # three points and more
+    assert tested(first[:3]) == [list(first[:3])] and hypotheses.MIN_OF_BODY == 3
+
+
 def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of most evidence, which are listed first."""
     every = [

@@ -173,7 +173,7 @@ def test_limits_of_all_grades_are_tested() -> None:
 
 
 def test_alternatives_that_shift_coordinates_have_one_grade() -> None:
-    assert len(SHIFTING) == 10 and "points_moved" in SHIFTING
+    assert len(SHIFTING) == 11 and "points_moved" in SHIFTING
     for kind in SHIFTING:
         severity = [
             Remark(kind, numbers={"shift": Quantity(shift), "rms": Quantity(rms)}).severity

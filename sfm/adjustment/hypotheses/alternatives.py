@@ -9,7 +9,7 @@ Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.special import gammaln
 
 from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.hypotheses.families import (
+    BODY,
     FORMAT,
     GIVEN,
     HELD,
@@ -60,23 +61,33 @@ OF_ONE = ("single", "pair")  # patterns of one photograph
 STARTS = 8  # photographs from which a group is grown
 
 
-def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
-    """Return all alternatives, the best evidence first."""
+def alternatives_of(
+    a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray] = ()
+) -> tuple[Alternative, ...]:
+    """Return all alternatives, the best evidence first.
+
+    Args:
+        a: adjustment of the image points alone.
+        reduced: its normal equations.
+        columns: its derivatives.
+        bodies: object points of each rigid body that may move against the others.
+    """
     found = [
         *interiors(a, reduced, HELD),
         *interiors(a, reduced, GIVEN),
         *_format(a, reduced),
         *_by_photographs(a, reduced, columns),
         *_moved_points(reduced),
+        *_moved_bodies(a, reduced, columns, bodies),
     ]
     return tuple(sorted(found, key=lambda one: -one.evidence))
 
 
-def count_alternatives(a: Adjustment) -> int:
+def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
     """Return how many alternatives are tested of an adjustment, but for some without any gain.
 
-    They are the held and given parameters, the families of photographs by their patterns, the format, and
-    points that moved.
+    They are the held and given parameters, the families of photographs by their patterns, the format,
+    points that moved, and so many bodies.
     """
     owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
     held = sum(len(one) + (len(one) > 1) for one in owners)
@@ -89,7 +100,7 @@ def count_alternatives(a: Adjustment) -> int:
             m = len(np.unique(run[among]))
             names = [name for name, _, _ in _patterns(m) if family.of_camera or name not in OF_ONE]
             patterns += len(names) + (m > 2 * MIN_GROUP)
-    return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, SHIFTED))
+    return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, SHIFTED)) + bodies
 
 
 def is_significant(one: Alternative, rows: int) -> bool:
@@ -481,6 +492,30 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     if best is not None:
         yield best
     yield from _shifted(reduced, factor, search, (movable, blocks, g))
+
+
+def _moved_bodies(
+    a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray]
+) -> Iterator[Alternative]:
+    """Return for each body that it moved, at the best place in the sequence.
+
+    One photograph gives the place of a body, so that it may move behind the first and before the last.
+    """
+    if reduced.photographs < 2 * MIN_GROUP:
+        return
+    run = _runs(np.zeros(reduced.photographs, dtype=np.int64))
+    m = int(run.max()) + 1
+    splits = (np.arange(m) >= np.arange(1, m)[:, None]).astype(float)
+    for points in bodies:
+        field = BODY.field(a.estimate.points, points)[a.network.image_points.point]
+        part = _Part(*reduced.project_by_run(reduced.whiten(columns.point @ field), run))
+        gains = [part.gain(factor) for factor in splits]
+        best = max(range(len(gains)), key=lambda k: gains[k].value)
+        spread = part.spread(splits[best], gains[best])
+        yield _made(
+            *(reduced, BODY, "split", splits[best][run], gains[best], float(np.log(m - 1)), spread),
+            points=points,
+        )
 
 
 def _log_sets(total: int, count: int) -> float:

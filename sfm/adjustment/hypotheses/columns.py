@@ -19,6 +19,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import rows_of
+from sfm.similarity import mean_distance
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 STRAIN, BENDING = 5, 18  # columns
@@ -109,6 +110,18 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
     terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=-1)
     bending = np.einsum("nt,cd->nctd", terms, np.eye(3)).reshape(len(points), 3, BENDING)
     return size * np.concatenate([strain, bending], axis=2), size
+
+
+def body_motions(points: FloatArray, some: IntArray) -> FloatArray:
+    """Return the displacement of points (n, 3) by the motions of a body that some of them are on, (n, 3, 6).
+
+    Three shifts, and three small rotations about its centre, which move its points by 1 as well.
+    """
+    away = points[some] - points[some].mean(axis=0)
+    moved = np.zeros((len(points), 3, 6))
+    moved[some, :, :3] = np.eye(3)
+    moved[some, :, 3:] = np.swapaxes(np.cross(np.eye(3), away[:, None]), 1, 2) / mean_distance(points[some])
+    return moved
 
 
 def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatArray:

@@ -18,6 +18,7 @@ from sfm.adjustment.hypotheses.columns import (
     CAMERA_PLACES,
     STRAIN_PLACES,
     Columns,
+    body_motions,
     interior_step,
     object_fields,
     shared_columns,
@@ -213,13 +214,13 @@ class ObjectFamily(OfPhotographs):
 
 @dataclass(frozen=True)
 class PointFamily(Family):
-    """Object points that moved: each by itself, or all by one vector."""
+    """Object points that moved: each by itself, all by one vector, or all as a body."""
 
-    together: bool
+    remark: str = "points_moved"
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""
-        return "points_moved"
+        return self.remark
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return what an alternative is a case of."""
@@ -228,27 +229,52 @@ class PointFamily(Family):
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points, px, (k, 2, q)."""
         seen = a.network.image_points
-        D = one.factor[seen.image][:, None, None] * columns.point
-        at = seen.point[:, None] == one.points  # (k, p)
-        if self.together:
-            return np.where(at.any(axis=1)[:, None, None], D, 0.0)
-        return np.asarray((at[:, None, :, None] * D[:, :, None]).reshape(len(seen), 2, -1))
+        field_ = self.field(a.estimate.points, one.points)[seen.point]
+        return np.asarray(one.factor[seen.image][:, None, None] * (columns.point @ field_))
 
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return how far points are from their mean where photographs differ most, (n, 3)."""
-        away = np.zeros_like(points)
-        away[one.points] = beta.reshape(-1, 3)
-        return away
+        return np.asarray(self.field(points, one.points) @ beta)
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return which points moved, how far at most, and the first photograph after."""
-        distance = float(np.linalg.norm(beta.reshape(-1, 3), axis=1).max())
+        away = self.displaced(one, a.estimate.points, beta)[one.points]
         return {
             "photographs": tuple(a.network.images[i] for i in one.photographs),
             "points": tuple(a.network.points[j] for j in one.points),
             "from": (a.network.images[int(np.flatnonzero(one.factor > 0)[0])],),
-            "distance": Quantity(distance, unit),
+            "distance": Quantity(float(np.linalg.norm(away, axis=1).max()), unit),
         }
+
+    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
+        """Return the displacements of points (n, 3) where some of them move, (n, 3, q)."""
+        own = np.zeros((len(points), 3, len(some), 3))
+        own[some, :, np.arange(len(some))] = np.eye(3)
+        return own.reshape(len(points), 3, -1)
+
+
+@dataclass(frozen=True)
+class ShiftedFamily(PointFamily):
+    """Object points that moved by one vector."""
+
+    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
+        """Return the displacements of points (n, 3) where some of them move, (n, 3, 3)."""
+        own = np.zeros((len(points), 3, 3))
+        own[some] = np.eye(3)
+        return own
+
+
+@dataclass(frozen=True)
+class BodyFamily(PointFamily):
+    """Object points of a rigid body that moved, by a vector and a small rotation."""
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of."""
+        return ("body", int(one.points[0]))
+
+    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
+        """Return the displacements of points (n, 3) where some of them move, (n, 3, 6)."""
+        return body_motions(points, some)
 
 
 @dataclass(frozen=True)
@@ -334,4 +360,5 @@ OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
 )
 HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)
 FORMAT = FormatFamily("format")
-MOVED, SHIFTED = PointFamily("moved", together=False), PointFamily("shifted", together=True)
+MOVED, SHIFTED = PointFamily("moved"), ShiftedFamily("shifted")
+BODY = BodyFamily("body", "plate_moved")

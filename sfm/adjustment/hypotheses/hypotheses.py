@@ -10,6 +10,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +37,7 @@ from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
@@ -47,6 +48,7 @@ MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
+MIN_OF_BODY = 3  # points that determine its six motions
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
 
@@ -72,12 +74,15 @@ class Judged:
     unchecked: tuple[Remark, ...] = ()  # on assumptions that are not tested, or weakly
 
 
-def judge_alternatives(final: Adjustment, *, unit: str = "") -> Judged:
+def judge_alternatives(
+    final: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
+) -> Judged:
     """Return what the image points say against the assumptions of an adjustment.
 
     Args:
         final: a finished adjustment with its covariance.
         unit: object unit, for the remarks.
+        bodies: names of the points of each rigid body, as a plate, that may move against the others.
     """
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
@@ -88,7 +93,8 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> Judged:
     if plain is None:
         return Judged(unchecked=(remark("assumptions_untested"),))
     try:
-        causes, unchecked = find_causes(plain), unchecked_assumptions(plain)
+        moving = _moving_bodies(plain, bodies)
+        causes, unchecked = find_causes(plain, moving), unchecked_assumptions(plain, len(moving))
     except np.linalg.LinAlgError:
         return Judged(unchecked=(remark("assumptions_untested"),))
     if len(photographs) < 2 * MIN_GROUP:
@@ -116,22 +122,34 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False
     )
 
 
-def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
+def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:
+    """Return the points of each body that may move against others; of two both motions are the same."""
+    names, known = plain.network.points, np.isfinite(plain.estimate.points).all(axis=1)
+    own = [known & np.isin(names, list(one)) for one in bodies]
+    own = [one for one in own if one.sum() >= MIN_OF_BODY and (known & ~one).sum() >= MIN_OF_BODY]
+    own = [
+        one for k, one in enumerate(own) if not any((one == known & ~other).all() for other in own[k + 1 :])
+    ]
+    return tuple(np.flatnonzero(one) for one in own)
+
+
+def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cause, ...]:
     """Return the alternatives that hold, the clearest first.
 
     Args:
         plain: adjustment of the image points alone, gross errors rejected.
+        bodies: object points of each rigid body that may move against the others.
     """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        found = _best(plain, causes)
+        found = _best(plain, causes, bodies)
         if found is None:
             break
         causes = _still_needed(plain, causes, found)
     return tuple(one for one in causes if not one.refit.shift < NAMED)  # one not known is as bad as can be
 
 
-def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
+def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArray] = ()) -> Cause | None:
     """Return the alternative that holds beside others: of those of most evidence the one that adjusts best.
 
     The score test is linear, and of a large error the alternative with most parameters has most evidence.
@@ -140,7 +158,7 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
     before = [(one.alternative, one.refit.beta) for one in causes]
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
-    every = alternatives_of(current, reduced, columns)
+    every = alternatives_of(current, reduced, columns, bodies)
     once: dict[tuple[object, ...], Alternative] = {}
     for one in every:
         if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA):

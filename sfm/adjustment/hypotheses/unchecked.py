@@ -42,18 +42,19 @@ from sfm.similarity import without_motions
 POWER = 0.80  # with which a detectable error is found; Baarda (1968)
 
 
-def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
+def unchecked_assumptions(a: Adjustment, bodies: int = 0) -> tuple[Remark, ...]:
     """Return which assumptions the tests hardly check, with the shift that an error may cause unnoticed.
 
     Args:
         a: adjustment of the image points alone, with its covariance.
+        bodies: bodies that are tested for having moved.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
     columns = columns_of(a)
     reduced = reduce_adjustment(a, columns)
-    number, rows = cameras_of_photographs(a), count_alternatives(a)
+    number, rows = cameras_of_photographs(a), count_alternatives(a, bodies)
     untested: tuple[Remark, ...] = ()
     if too_many_cameras(number):
         untested = (remark("cameras_untested", cameras=int(number.max()) + 1),)

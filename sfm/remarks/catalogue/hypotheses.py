@@ -104,6 +104,16 @@ ROWS = (
         short="points that moved",
     ),
     Kind(
+        "plate_moved",
+        SHIFT,
+        "A plate moved against the others from {from} on, by up to {distance}, {shift} standard deviations: "
+        f"that of {{points:point}} {{points}}.{INSTEAD}",
+        "a plate slipped between the photographs, or what carries the plates bent",
+        "Fix the plates to one another and photograph them anew, or adjust the photographs before and from "
+        "{from} on as two surveys.",
+        short="a plate that moved",
+    ),
+    Kind(
         "too_many_to_test",
         "note",
         "One camera for all photographs and one shape of the object are assumed, not tested: "

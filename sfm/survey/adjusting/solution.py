@@ -59,6 +59,7 @@ from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
+from sfm.targets.codes.plates import points_of_plates
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
@@ -131,7 +132,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
     unit = survey.unit if given else NO_SCALE
     report_step("testing the assumptions")
-    judged = judge_alternatives(final, unit=unit)
+    judged = judge_alternatives(final, unit=unit, bodies=_plates(survey, matched.naming, final.network))
     return Solution(
         final,
         solved.check,
@@ -151,6 +152,14 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         solved.given.tests,
         solved.others,
     )
+
+
+def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:
+    """Return the names of the points of each plate; none without plates."""
+    if naming is None:
+        return ()
+    plates = points_of_plates(survey.family, naming.codes(network))
+    return tuple(tuple(network.points[j] for j in one) for one in plates)
 
 
 @dataclass(frozen=True)

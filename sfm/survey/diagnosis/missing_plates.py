@@ -9,7 +9,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.targets.codes.dot_plates import MIN_DOTS
 from sfm.targets.codes.families import TargetFamily
-from sfm.targets.codes.plates import plates_of
+from sfm.targets.codes.plates import plates_of, points_of_plates
 from sfm.targets.flags import Flag
 
 NOT_FOUND = {  # kinds of remarks by the codes of a board; that on dots of any grid is another
@@ -60,6 +60,6 @@ def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[R
     """
     return tuple(
         remark("plate_not_in_result", codes=plate.name, size=f"{plate.rows} x {plate.columns}")
-        for plate in plates_of(family)
-        if not ((code >= plate.first_point) & (code <= plate.last_point)).any()
+        for plate, points in zip(plates_of(family), points_of_plates(family, code), strict=True)
+        if not len(points)
     )

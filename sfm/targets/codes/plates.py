@@ -153,6 +153,19 @@ def plates_of(family: object) -> tuple[PlateFamily, ...]:
     return (family,) if isinstance(family, PlateFamily) else ()
 
 
+def points_of_plates(family: object, code: IntArray) -> tuple[IntArray, ...]:
+    """Return which of some points are on each plate.
+
+    Args:
+        family: codes of a survey.
+        code: of each point, -1 without one, (n,).
+    """
+    return tuple(
+        np.flatnonzero((code >= plate.first_point) & (code <= plate.last_point))
+        for plate in plates_of(family)
+    )
+
+
 def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
     """Return plates as a group, with the numbers that their points then have.
 
