@@ -133,6 +133,14 @@ class CheckPoint:
     sigma: FloatArray  # stated standard deviations, object unit, (3,)
 
 
+@dataclass(frozen=True)
+class SeenPlate:
+    """A calibration plate of which the result has points."""
+
+    points: IntArray  # of the network of the result, (n,)
+    sigma: float  # standard deviation of its coordinates, object unit
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class SurveyResult:
     """Result of a survey: the adjustment and what a person must know to judge it.
@@ -161,6 +169,7 @@ class SurveyResult:
     given_tests: tuple[GivenTest, ...] = ()  # of control and scale bars against the image points alone
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
+    plates: tuple[SeenPlate, ...] = ()  # whose points are known to one another
     check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
     balance_radius_mm: tuple[tuple[str, float], ...] = ()  # R0 of the cameras given in AICON's form
     exterior_correlations: ExteriorCorrelations | None = None  # of camera parameters, all of them

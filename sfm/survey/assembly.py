@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.adjustment.quality.correlations import exterior_correlations, strong_correlations
+from sfm.conventions import IntArray
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.result import CheckPoint, FailedImage, StageTime, SurveyResult
+from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import Correspondences, Solution
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
@@ -14,6 +15,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import SurveyComparison
 from sfm.survey.told_settings import told_settings
+from sfm.targets.codes.plates import points_of_plates
 
 
 def assemble_result(
@@ -64,6 +66,7 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,
+        plates=_plates(survey, code),
         check_points=_check_points(survey),
         balance_radius_mm=tuple(
             (one.name, dict(one.balanced)["R0"]) for one in survey.cameras if one.balanced
@@ -72,6 +75,15 @@ def assemble_result(
         orientation_correlations=strong_correlations(correlations),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
+
+
+def _plates(survey: Survey, code: IntArray) -> tuple[SeenPlate, ...]:
+    """Return the plates of a survey with their points in the result."""
+    plates = points_of_plates(survey.family, code)
+    if not plates:
+        return ()
+    sigma = [one.plate_sigma or 0.0 for one in (survey.targets, *survey.plates)]
+    return tuple(SeenPlate(*one) for one in zip(plates, sigma, strict=True))
 
 
 def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:

@@ -19,7 +19,7 @@ from sfm.report.findings import camera_remarks
 from sfm.report.findings.calibrated_cameras import camera_is_result
 from sfm.report.findings.findings import findings_of
 from sfm.report.phrases import words_of_calibration
-from sfm.result import SurveyResult
+from sfm.result import SeenPlate, SurveyResult
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
@@ -180,3 +180,15 @@ def test_the_camera_is_the_result_of_a_survey_of_known_points() -> None:
         a = adjust(network, truth, datum=Datum("control"))
         assert camera_is_result(a) == calibrates
         assert bool(of_kind(verdict_of(a).remarks, "camera_not_calibrated")) == calibrates
+
+
+def test_the_points_of_a_further_plate_are_known_to_one_another() -> None:
+    """Before, a calibration by two plates was judged by the points of the second one."""
+    known, truth = plate_photographs("frontal 3", 0.02)
+    a = adjust(known.with_control(known.points[:30], truth.points[:30]), truth, datum=Datum("control"))
+    second = np.arange(30, 60)
+    for points, sigma, calibrates in ((second, 0.0, True), (second, 0.01, False), (second[:20], 0.0, False)):
+        plates = SeenPlate(np.arange(30), 0.0), SeenPlate(points, sigma)
+        assert camera_is_result(a, plates) == calibrates
+        result = SurveyResult("c", "m", 6, (), a, np.full(60, -1), None, plates=plates)
+        assert bool(findings_of(result).calibrated) == calibrates

@@ -12,6 +12,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import Role
 from sfm.report.findings.interior_parameters import InteriorOrientation, InteriorParameter
 from sfm.report.findings.precision import root_mean_square
+from sfm.result import SeenPlate, SurveyResult
 
 OF_CAMERA = (Role.FOCAL, Role.X0, Role.Y0)
 
@@ -27,17 +28,25 @@ class CalibratedCamera:
     projection_largest_px: float  # its largest value, px; likewise
 
 
-def camera_is_result(adjustment: Adjustment) -> bool:
+def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ()) -> bool:
     """Return whether a survey calibrates its cameras: it adjusts as much of them as of unknown coordinates.
 
     The coordinates of a point are known if all three are given, to better than a pixel as its photographs
     see it. Standard deviations that small, as of a plate, differ from a fixed point in no way that matters.
+    The points of a further plate are known to one another; its place is no more a result than that of a
+    photograph.
+
+    Args:
+        adjustment: finished.
+        plates: plates of the survey, with those that are control.
     """
     network, known = adjustment.network, np.zeros(len(adjustment.network.points), dtype=bool)
     if adjustment.datum != "control" or not adjustment.unknown_counts[1]:
         return False
     given, seen = network.control.complete, network.image_points.select(~adjustment.rejected)
     sigma = np.full(len(known), np.inf)
+    for plate in plates:
+        sigma[plate.points] = plate.sigma
     sigma[given.point] = np.sqrt(np.trace(given.covariance, axis1=1, axis2=2) / 3)
     c = np.array([one.c_px for one in adjustment.estimate.cameras])[network.camera[seen.image]]
     away = adjustment.estimate.points[seen.point] - adjustment.estimate.position[seen.image]
@@ -47,9 +56,10 @@ def camera_is_result(adjustment: Adjustment) -> bool:
     return bool(3 * (unknown & ~known).sum() <= adjustment.unknown_counts[1])
 
 
-def calibrated_cameras(adjustment: Adjustment, interior: InteriorOrientation) -> tuple[CalibratedCamera, ...]:
+def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> tuple[CalibratedCamera, ...]:
     """Return the adjusted cameras of a survey that calibrates them; none of another survey."""
-    if not camera_is_result(adjustment):
+    adjustment = result.adjustment
+    if not camera_is_result(adjustment, result.plates):
         return ()
     found = []
     for f, family in enumerate(interior.families):

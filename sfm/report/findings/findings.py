@@ -93,7 +93,7 @@ def findings_of(result: SurveyResult) -> Findings:
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
     consistency, edges = consistency_of(a), edges_of(result.photographs)
     geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
-    calibrated = calibrated_cameras(a, interior)
+    calibrated = calibrated_cameras(result, interior)
     remarks = (
         *adjustment_remarks(a),
         *photograph_remarks(result),
