@@ -212,7 +212,7 @@ ROWS = (
         "{confirmed:condition} of its points {confirmed:confirms|confirm} the network, {against} of its "
         "points "
         "{against:contradicts|contradict} it.",
-        "another object, a mirrored picture or wrong codes",
+        "another object, a mirrored picture, wrong codes, or matches of a repeated pattern",
         "Leave it out, or survey it by itself.",
     ),
     Kind(
