@@ -19,12 +19,16 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
-from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.april_grids import read_april_tags
+from sfm.targets.codes.boards import find_crossings, reduced
 from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
 from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plate_search import (
+    KALIBR_TAGS,
+    MIN_DOTS_OF_PLATE,
+    part_of_checkerboard,
     search_april_grids,
     search_charuco,
     search_checkerboard,
@@ -41,13 +45,16 @@ from sfm.targets.codes.tags import (
     read_dictionaries,
     smallest_dictionary,
 )
-from sfm.targets.detect import Targets
+from sfm.targets.detect import Targets, find_targets
 from sfm.targets.measure import shape_from_axes
 from sfm.targets.outlines import as_bytes, scale_of
 
 TRIED, PLATES_TRIED = 3, 8  # photographs, spread over the folder
-MIN_READABLE = 2
+MIN_READABLE = 2  # photographs
+MIN_CODES = 2  # of a family in one picture, which chance seldom reads
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
+LOOK_PX = 900  # longer side of the pictures of a first look
+LARGE = 3.0  # pixels of a photograph over those of such a picture beyond which a first look saves time
 MANY_TARGETS = 12  # circles in a photograph that are no chance finds
 
 
@@ -89,8 +96,15 @@ def try_targets(
         GeometryError: fewer than two of them can be decoded.
     """
     progress.stage("trial", TRIED + 5)
-    tried, plain, unreadable = _readable(paths, store, progress)
-    photographs = [read_photograph(path) for path in tried]
+    tried, photographs, unreadable = _readable(paths, progress)
+    names = tuple(path.name for path in tried)
+    if min(one.size for one in photographs) > LARGE * LOOK_PX**2:
+        greys = [_as_bytes(photograph) for photograph in photographs]
+        looks = [_look(grey) for grey in greys]
+        if not any(look.shows_targets for look in looks) and search_checkerboard(greys) is None:
+            circles = float(np.median([look.circles for look in looks]))
+            return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
+    plain = [_measure(path, "none", store) for path in tried]
     counts: dict[str, tuple[int, ...]] = {}
     for families in (RINGS, NECKLACES):  # which have no parity, and so read the rings of others too
         if all(len(codes) < MIN_REPEATED for codes in counts.values()):
@@ -135,7 +149,7 @@ def try_targets(
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
         float(np.median([np.isfinite(one.axes_covariance[:, 0, 0]).sum() for one in measured])),
         _blur(measured),
-        tuple(path.name for path in tried),
+        names,
         plates,
         left_out,
         unreadable,
@@ -236,18 +250,52 @@ def _spread(count: int, tried: int) -> list[int]:
     return sorted({round(i * (count - 1) / max(tried - 1, 1)) for i in range(tried)})
 
 
+@dataclass(frozen=True)
+class _Look:
+    """What a photograph shows at first sight."""
+
+    shows_targets: bool  # codes, plates, or many circles
+    circles: int
+
+
+def _look(grey: AnyArray) -> _Look:
+    """Look for targets where they are fast to find: in the whole at low resolution, in the middle in full.
+
+    Targets of a photograph are of about one size. Large ones are seen in the whole, and of small ones, which
+    are many, some are in the middle.
+    """
+    height, width = grey.shape
+    top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
+    whole, middle = reduced(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
+    circles = 0
+    for picture in (whole, np.ascontiguousarray(middle)):
+        targets = find_targets(picture)
+        circles = max(circles, len(targets))
+        rings = (*RINGS, *NECKLACES)
+        if (
+            len(targets) >= MANY_TARGETS
+            or any((_ring_codes(family, picture, targets) >= 0).sum() >= MIN_CODES for family in rings)
+            or any(len(number) >= MIN_CODES for number, _ in read_dictionaries(picture).values())
+            or any(len(codes) for codes in read_resolved(picture).values())
+        ):
+            return _Look(True, circles)
+    part = part_of_checkerboard(grey)
+    board = part is not None and part[0][0] * part[0][1] >= MIN_DOTS_OF_PLATE
+    return _Look(board or len(read_april_tags(whole, KALIBR_TAGS)[0]) >= MIN_CODES, circles)
+
+
 def _readable(
-    paths: Sequence[Path], store: MeasuredStore | None, progress: Progress
-) -> tuple[list[Path], list[Targets], tuple[tuple[str, str], ...]]:
-    """Return photographs spread over the folder and their targets, and which cannot be decoded and why."""
-    tried: dict[int, Targets] = {}
+    paths: Sequence[Path], progress: Progress
+) -> tuple[list[Path], list[AnyArray], tuple[tuple[str, str], ...]]:
+    """Return photographs spread over the folder and what they hold, and which cannot be decoded and why."""
+    tried: dict[int, AnyArray] = {}
     refused: dict[int, tuple[str, str]] = {}
     for place in _spread(len(paths), TRIED):
         for k in sorted(range(len(paths)), key=lambda k: abs(k - place)):
             if k in tried or k in refused:
                 continue
             try:
-                tried[k] = _measure(paths[k], "none", store)
+                tried[k] = read_photograph(paths[k])
             except PhotographError as error:
                 refused[k] = paths[k].name, str(error).removeprefix(f"{paths[k].name}: ")
                 continue

@@ -42,23 +42,32 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     Source: Duda and Frese (2018), in OpenCV, for boards of any size.
     """
     whole, parts = Counter[tuple[int, int]](), list[tuple[tuple[int, int], tuple[bool, bool]]]()
-    for grey in photographs:
-        small, _ = reduced(grey, SEARCHED_PX)
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
-        if not found or meta is None or min(meta.shape[:2]) < MIN_SIDE:
-            continue
-        place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
-        ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
-        is_cut = not all(ends[0]), not all(ends[1])
-        parts.append((meta.shape[:2], is_cut))
+    for part in filter(None, map(part_of_checkerboard, photographs)):
+        parts.append(part)
+        size, is_cut = part
         if not any(is_cut):
-            whole[min(meta.shape[:2]), max(meta.shape[:2])] += 1
+            whole[min(size), max(size)] += 1
     for (rows, columns), _ in whole.most_common():
         plate = PlateFamily("checkerboard", rows, columns)
         showing = sum(_is_part(*part, plate) for part in parts)
         if showing > 1 and plate.count >= MIN_CROSSINGS and _named(photographs, plate, whole[rows, columns]):
             return plate
     return None
+
+
+def part_of_checkerboard(grey: AnyArray) -> tuple[tuple[int, int], tuple[bool, bool]] | None:
+    """Return the crossings of a checkerboard in rows and columns, and along which of them the border cuts it.
+
+    Args:
+        grey: photograph, uint8, (H, W).
+    """
+    small, _ = reduced(grey, SEARCHED_PX)
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
+    if not found or meta is None or min(meta.shape[:2]) < MIN_SIDE:
+        return None
+    place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
+    ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
+    return meta.shape[:2], (not all(ends[0]), not all(ends[1]))
 
 
 def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
