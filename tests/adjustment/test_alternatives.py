@@ -418,6 +418,13 @@ def test_of_two_photographs_of_a_camera_neither_is_blamed() -> None:
         assert abs(len(every) - alternatives.count_alternatives(a)) <= 5
 
 
+@pytest.mark.parametrize("which", [6, 7])
+def test_a_zoomed_photograph_of_two_is_told_from_a_camera_that_varies(which: int) -> None:
+    """Before, image 7 was not: c moved no distortion, whose errors c of every photograph took up."""
+    cause = hypotheses.find_causes(zoomed_pair(which))[0]
+    assert cause.alternative.kind == "two_cameras" and cause.as_well == ()
+
+
 def test_alternatives_are_counted_by_cameras() -> None:
     """Before, 30 were assumed of any network; eight cameras of five photographs have 202."""
     rng = seed_of("many")

@@ -14,6 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import pixel_from_tangents, project
 from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.distortion.models import Role
 from tests.synthetic import make_network, seed_of
 
 
@@ -25,8 +26,8 @@ def a() -> Adjustment:
 
 def test_camera_columns_by_hand() -> None:
     x, y, r2 = 0.5, -0.2, 0.29
-    across = [x, 1, 0, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [y, 0, 1, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, 0, 0]
+    across = [1, 0, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [0, 1, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, 0, 0]
     np.testing.assert_allclose(columns._camera(np.array([[x, y]])), [[across, -np.array(down)]])
 
 
@@ -127,5 +128,24 @@ def test_the_edge_of_the_longer_side_is_the_unit_of_the_camera_columns(a: Adjust
         i = seen.image[row]
         U, V, W = estimate.rotation[i].T @ (estimate.points[seen.point[row]] - estimate.position[i])
         c_px = estimate.cameras[a.network.camera[i]].c_px
-        assert found.freedoms[row, 0, 0] == pytest.approx(-U / W * c_px / 1000)
-        assert found.freedoms[row, 1, 0] == pytest.approx(V / W * c_px / 1000)
+        assert found.freedoms[row, 0, 7] == pytest.approx(-U / W * c_px / 1000)
+        assert found.freedoms[row, 1, 3] == pytest.approx(
+            V / W * c_px / 1000 * (U**2 + V**2) / W**2 * (c_px / 1000) ** 2
+        )
+
+
+@pytest.mark.parametrize("model", ["brown", "opencv"])
+def test_c_moves_image_points_as_its_camera_does(model: str) -> None:
+    """Distortion included, that of the place where the ray is then; with two focal lengths, of both."""
+    network, truth = make_network(seed_of("c moves"), images=4, points=10, model=model, free=())
+    found = columns_of(adjust(network, truth, datum=Datum("free"), reject="none"))
+    camera, focal = truth.cameras[0], truth.cameras[0].plays(Role.FOCAL)
+    longer = camera.with_parameters(camera.parameters * np.where(focal, 1 + 1e-6, 1.0))
+    seen = network.image_points
+    for i in range(4):
+        rows = seen.image == i
+        at, away = (
+            project(one, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+            for one in (camera, longer)
+        )
+        np.testing.assert_allclose(found.freedoms[rows, :, 0], (away - at) / 1e-6 / 1000, atol=1e-3)

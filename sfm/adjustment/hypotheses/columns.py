@@ -1,9 +1,9 @@
 """The columns that alternatives add: how each freedom moves an image point.
 
-Camera: what c, principal point, radial, decentring and affine distortion do to an image point, for every
-model alike. Strain: a homogeneous deformation of the object without scale, which a photograph takes for its
-distance. Bending: a displacement that is quadratic in the coordinates. Interior: the derivatives of the
-camera's model.
+Camera: what c does to an image point in the camera's model, distortion included; and what principal point,
+radial, decentring and affine distortion do to it, for every model alike. Strain: a homogeneous deformation of
+the object without scale, which a photograph takes for its distance. Bending: a displacement that is quadratic
+in the coordinates. Interior: the derivatives of the camera's model.
 
 Source: Brown (1971), Close-range camera calibration, Photogramm. Eng. 37(8); Foerstner and Wrobel (2016),
 Photogrammetric Computer Vision, sec. 4.6.4 (systematic errors), 12.2 (small rotations).
@@ -18,6 +18,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distortion.models import Role
 from sfm.network import rows_of
 from sfm.similarity import mean_distance
 
@@ -50,13 +51,14 @@ def columns_of(a: Adjustment) -> Columns:
     U, V, W = UVW.T
     uv = -UVW[:, :2] / W[:, None]
     k = len(seen)
-    J, flat = np.zeros((k, 2, 2)), np.zeros((k, 2))
+    J, flat, by_c = np.zeros((k, 2, 2)), np.zeros((k, 2)), np.zeros((k, 2))
     for camera, rows in zip(
         estimate.cameras, rows_of(network.camera[seen.image], len(estimate.cameras)), strict=True
     ):
         if len(rows):
             J[rows] = pixel_jacobian(camera, seen.xy[rows])
             flat[rows] = uv[rows] * camera.c_px / (max(camera.size_px) / 2)
+            by_c[rows] = _scaled(camera, uv[rows])
     # d (u, v) / d (U, V, W) = -(1, 0, u) / W
     by_axes = -np.concatenate([np.tile(np.eye(2), (k, 1, 1)), uv[:, :, None]], axis=2) / W[:, None, None]
     by_axes = J @ by_axes
@@ -68,22 +70,43 @@ def columns_of(a: Adjustment) -> Columns:
     exterior = np.concatenate([-point, by_axes @ turned], axis=2)
     by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
     usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
-    found = Columns(exterior, point, np.concatenate([_camera(flat), by_object], axis=2), usable)
+    found = Columns(
+        exterior, point, np.concatenate([by_c[:, :, None], _camera(flat), by_object], axis=2), usable
+    )
     for part in (found.exterior, found.point, found.freedoms):
         part[~usable] = 0.0
     return found
 
 
+def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
+    """Return what the focal lengths of a camera do to image points, 1 px at the edge, (k, 2).
+
+    A lens of another c takes the same rays through other parts of its distortion.
+
+    Args:
+        camera: camera.
+        uv: tangents of the rays, (k, 2).
+    """
+    step, focal = SMALL_MOVE_PX / (max(camera.size_px) / 2), camera.plays(Role.FOCAL)
+
+    def seen(factor: float) -> FloatArray:
+        return pixel_from_tangents(
+            camera.with_parameters(np.where(focal, factor, 1.0) * camera.parameters), uv
+        )
+
+    return np.nan_to_num((seen(1 + step) - seen(1 - step)) / (2 * SMALL_MOVE_PX))
+
+
 def _camera(flat: FloatArray) -> FloatArray:
-    """Return what the freedoms of a camera do to image points, 1 px at the edge, (k, 2, 9).
+    """Return what the freedoms of a camera but c do to image points, 1 px at the edge, (k, 2, 8).
 
     Args:
         flat: tangents over that of half the longer side, y up, (k, 2).
     """
     x, y = flat.T
     r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
-    across = [x, one, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [y, zero, one, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
+    across = [one, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [zero, one, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
     return np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
 
 
