@@ -50,13 +50,16 @@ class Grade:
     warning: float = -np.inf
     error: float = np.inf
     also: Grade | None = None  # of another number; the more serious of the two counts
+    at_most: Grade | None = None  # likewise; the less serious of the two counts
 
     def severity_of(self, one: Remark) -> Severity:
         """Return the severity of a remark."""
         found = self.of(one.number(self.number))
-        if self.also is None:
-            return found
-        return min(found, self.also.severity_of(one), key=SEVERITIES.index)
+        if self.at_most is not None:
+            found = max(found, self.at_most.severity_of(one), key=SEVERITIES.index)
+        if self.also is not None:
+            found = min(found, self.also.severity_of(one), key=SEVERITIES.index)
+        return found
 
     def of(self, value: float) -> Severity:
         """Return the severity of a value; a number that is not known is as bad as can be."""

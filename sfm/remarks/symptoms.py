@@ -64,6 +64,8 @@ def _severity(kind: Kind) -> str:
         for name, limit in (("warning", grade.warning), ("error", grade.error)):
             if limit < float("inf"):
                 text = name if limit == -float("inf") else f"{name} from {grade.number} {limit:g}"
+                if grade.at_most is not None and name == "error":
+                    text += f" and {grade.at_most.number} {grade.at_most.error:g}"
                 limits.setdefault(name, text)
         grade = grade.also
     return ", ".join(limits.values())

@@ -167,6 +167,17 @@ def test_limits_of_severity(kind: str) -> None:
         assert severity(0.99 * error) == "warning" and severity(1.01 * error) == "error"
 
 
+def test_an_imprecise_calibration_is_an_error_where_its_image_points_are_more_precise() -> None:
+    def severity(rms: float, times: float) -> str:
+        numbers = {"rms": Quantity(rms), "times": Quantity(times)}
+        return Remark("camera_not_calibrated", numbers=numbers).severity
+
+    inf, nan = float("inf"), float("nan")
+    assert severity(1.01, 4.99) == severity(1e3, 4.99) == severity(0.99, inf) == "warning"
+    assert severity(1.01, 5.01) == severity(inf, inf) == severity(1.01, nan) == "error"
+    assert severity(0.5, 0.1) == severity(0.5, 100.0) == "note" and severity(0.52, 0.1) == "warning"
+
+
 def test_limits_of_all_grades_are_tested() -> None:
     graded = {name for name, row in KINDS.items() if isinstance(row.severity, Grade)}
     assert graded == {*LIMITS, *SHIFTING}

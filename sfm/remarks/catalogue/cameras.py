@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
 ROWS = (
     Kind(
@@ -83,10 +83,11 @@ ROWS = (
     Kind(
         "camera_not_calibrated",
         # a warning where the 95 % value reaches a pixel, which nobody takes for the error of a calibrated
-        # camera, an error where the standard deviation does
-        Grade("rms", warning=0.51, error=1.0),
+        # camera; an error where the standard deviation does, and image points measured as precisely as those
+        # of the calibration would contradict the camera: imprecise ones from all sides are a weak calibration
+        Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", error=WRONG_SIGMAS)),
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "
-        "photograph (1 sigma).",
+        "photograph (1 sigma)[[, {times} times sigma0]].",
         "photographs from the front, whose distance takes up an error of c, or few and imprecise ones",
         "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
     ),

@@ -17,16 +17,17 @@ DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
     """Return the remarks on all cameras, where they are the result on how well they are known as such."""
-    weak = _not_calibrated(calibrated) if calibrated else _hardly_determined(result)
+    weak = _not_calibrated(result, calibrated) if calibrated else _hardly_determined(result)
     return (*weak, *_principal_points(result), *_pixels(result))
 
 
-def _not_calibrated(calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
+def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
     """Return the cameras of a calibration that do not know where a direction is seen in the photograph."""
-    found: list[Remark] = []
+    sigma, found = result.adjustment.sigma0_px, list[Remark]()
     for one in calibrated:
         rms = one.projection_rms_px
-        found += unless_note(remark("camera_not_calibrated", camera=one.name, rms=(rms, "px")))
+        times = rms / sigma if sigma > 0 and np.isfinite(rms) else None
+        found += unless_note(remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times))
     return tuple(found)
 
 
