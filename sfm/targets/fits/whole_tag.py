@@ -8,12 +8,12 @@ blur, and c(i, j) = 1 for black modules:
     I = B + A sum_ij c(i, j) W_i(u) W_j(v),   W_i(u) = Phi((u - i) / s_u) - Phi((u - i - 1) / s_u)
 
 s_u = s |grad u| is the blur in modules. Distortion does not bend edges of so few px. Uneven light (shadows,
-highlights) is estimated with them as a random field, by its values in the middle of modules. A wrong code, or
-a picture that is no tag, leaves modules off what light does to the levels of the code: the fit confirms the
-reading as well.
+highlights) is estimated with them as a random field, by its values in the middle of modules. The fit confirms
+the reading as well: the code in uneven light must be far likelier than clutter of the same contrast.
 
 Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, chapters 2 and 5, for the
-field, its likelihood and the prediction of each value by all others.
+field and its likelihood; Kass and Raftery (1995), Journal of the American Statistical Association 90(430),
+for the ratio of likelihoods.
 """
 
 from __future__ import annotations
@@ -43,17 +43,20 @@ from sfm.targets.flags import Flag
 # Tags are printed with one clear module around them. What is behind it acts up to so many blurs into it.
 BEHIND_BLURS = 2.0
 # Light on a tag is a random field that forgets itself over so many modules: it changes what is reflected by a
-# share, that of shadows of 40 %, and adds a share of the step (glare).
-LIGHT_SIGMA, GLARE_SIGMA, LIGHT_MODULES = 0.4, 0.05, 3.0
+# share, that of levels of 1 and 0.6 about their mean (a shadow of 40 %), and adds one of the step (glare).
+LIGHT_SIGMA, GLARE_SIGMA, LIGHT_MODULES = 0.25, 0.05, 3.0
 # Light that modules do not resolve, in steps, for each pixel; the likeliest of these strengths is estimated.
 PIXEL_SIGMA, STRENGTHS = 0.1, (1.0, 0.3, 0.1, 0.03)
 LIGHT_ROUNDS = 2  # of estimating it, each with the levels of the one before
 MIN_SEEN = 0.3  # share of the usual weight of a module with which one beside the tag counts
-# How uneven print may be, in steps, and the largest RMS of what modules are off their prediction by all
-# others, in standard deviations of light, print and noise. Of 800 tags of 15 to 120 px under the edges of
-# shadows of 30 and 40 % and under highlights the largest is 0.94; the least of 90 letters and plates 1.03.
-# The limits were chosen on these. Of 120 fits to other letters 4 are below; one letter of 7 px passes.
-PRINT_SIGMA, MAX_MISFIT = 0.03, 0.98
+# How uneven print may be, in steps. Clutter is a random field of black and clear, half the step about their
+# middle, whose strokes are a module wide.
+PRINT_SIGMA, CLUTTER_SIGMA, CLUTTER_MODULES = 0.03, 0.5, 1.0
+# Least logarithm of the likelihood of the code over that of clutter. It must exceed the number of codes and
+# placements tried: about 8 for 1000 codes in 4 turns, 16 for positions in 1 MP and 20 for shapes. Largest of
+# 66 letters that OpenCV reads in 40 pages: 31; least of 160 tags of 15 to 60 px under shadows and highlights:
+# 56; of 530 tags of 10 to 23 px: 59.
+MIN_EVIDENCE = 43.0
 # Largest number of steps; the last one is less than this for each corner, px.
 STEPS, LAST_STEP_PX = 200, 1e-3
 # In a tilted tag the blur acts on u and v with a correlation. That part is a blur along one direction, summed
@@ -144,7 +147,7 @@ def _fit_tag(
         light = _describe_light(theta, P, residual, used, noise, black)
     assert light is not None
     row = fits.theta[i]
-    if light.misfit(residual) > MAX_MISFIT:
+    if light.evidence < MIN_EVIDENCE:
         return Flag.POOR_FIT.value
     row[:, :2] = corners_px
     row[:, BACKGROUND], row[:, CONTRAST], row[:, BLUR] = theta[_B], theta[_A], theta[_S] * scale
@@ -170,21 +173,12 @@ class _Light:
     """covariances of the light at pixels with that at modules, (n, q)"""
     weights: FloatArray
     """what takes residuals summed over `pixels` to the coefficients of the most probable field, (q, q)"""
-    modules: FloatArray
-    """what takes residuals to the mean of each module, (n, q)"""
-    inverse: FloatArray
-    """inverse of the covariance of these means, (q, q)"""
-    judged: BoolArray
-    """which of the modules are those of the tag, not around it, (q,)"""
+    evidence: float
+    """logarithm of the likelihood of the code in this light over that of clutter"""
 
     def without(self, values: FloatArray) -> FloatArray:
         """Return values at pixels, (n,) or (n, k), without the most probable light in them."""
         return np.asarray(values - self.pixels @ (self.weights @ (self.pixels.T @ values)))
-
-    def misfit(self, residual: FloatArray) -> float:
-        """Return the RMS of what modules are off their prediction by all others, in its sigmas."""
-        errors = self.inverse @ (self.modules.T @ residual)
-        return math.sqrt(float((errors**2 / np.diag(self.inverse))[self.judged].mean()))
 
 
 def _iterate(
@@ -323,9 +317,10 @@ def _describe_light(
     level = np.asarray(theta[_B] + theta[_A] * printed, dtype=float)
 
     def covariance(at: FloatArray, level_at: FloatArray) -> FloatArray:
-        distance = np.hypot(*(at[:, None] - place[None]).transpose(2, 0, 1))
         shade = LIGHT_SIGMA**2 * np.outer(level_at, level)
-        return np.asarray((shade + (GLARE_SIGMA * step) ** 2) * np.exp(-distance / LIGHT_MODULES))
+        return np.asarray(
+            (shade + (GLARE_SIGMA * step) ** 2) * np.exp(-_distances(at, place) / LIGHT_MODULES)
+        )
 
     K = covariance(place, level)
     pixels = covariance(uv, level_px) * used[:, None]
@@ -338,10 +333,43 @@ def _describe_light(
         unlikely = len(P) * math.log(left) + np.linalg.slogdet(N + R)[1] - np.linalg.slogdet(R)[1]
         if unlikely < likeliest:
             likeliest, weights = unlikely, inverse
-    mixed = modules.T @ share
-    errors = mixed @ K @ mixed.T
-    errors += noise**2 * modules.T @ modules + (PRINT_SIGMA * step) ** 2 * np.eye(len(K))
-    return _Light(pixels, weights, modules, np.linalg.inv(errors), judged)
+    mixed, unseen = modules.T @ share, noise**2 * modules.T @ modules
+    unseen += (PRINT_SIGMA * step) ** 2 * np.eye(len(K))
+    clutter = (CLUTTER_SIGMA * step) ** 2 * np.exp(-_distances(place, place) / CLUTTER_MODULES)
+    off, middle = modules.T @ residual, theta[_B] + theta[_A] / 2
+    in_light = mixed @ K @ mixed.T + unseen
+    evidence = _ln_likelihood(off, in_light, judged) - _ln_likelihood(
+        off + mixed @ (level - middle), mixed @ clutter @ mixed.T + unseen, judged
+    )
+    if _has_wrong_module(off, mixed * np.where(printed, -theta[_A], theta[_A]), in_light, judged):
+        evidence = -math.inf
+    return _Light(pixels, weights, evidence)
+
+
+def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)))
+
+
+def _has_wrong_module(
+    off: FloatArray, inverted: FloatArray, covariance: FloatArray, judged: BoolArray
+) -> bool:
+    """Return whether the code is likelier with one of its modules in the other colour.
+
+    Args:
+        off: intensities of modules less those of the code, (q,).
+        inverted: what each module (column) in its other colour would change of them, (q, q).
+        covariance: of `off`, (q, q).
+        judged: modules of the tag, (q,).
+    """
+    h = inverted[np.ix_(judged, judged)]
+    weighted = np.linalg.solve(covariance[np.ix_(judged, judged)], h)
+    return bool((weighted.T @ off[judged] > 0.5 * (h * weighted).sum(axis=0)).any())
+
+
+def _ln_likelihood(values: FloatArray, covariance: FloatArray, judged: BoolArray) -> float:
+    """Return the logarithm of the density of values that are judged, without its constant."""
+    values, covariance = values[judged], covariance[np.ix_(judged, judged)]
+    return -0.5 * float(values @ np.linalg.solve(covariance, values) + np.linalg.slogdet(covariance)[1])
 
 
 def _intensity(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
