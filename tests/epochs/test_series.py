@@ -51,7 +51,8 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
     page = write_epochs(found, tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "manifest.json"}
     text = page.read_text(encoding="utf-8")
-    assert verdict_of_epochs(found).remarks[0].text in text and "span" in text and "Series" in text
+    said = verdict_of_epochs(found).remarks[0].text
+    assert said in text.replace("\xa0", " ") and "span" in text and "Series" in text
     with (tmp_path / "out/displacements.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * POINTS and sum(int(row["moved"]) for row in rows) == 8

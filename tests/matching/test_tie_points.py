@@ -308,7 +308,8 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     wrong = find_covering_points(photographs, apart, camera, ties, window_px=15, side_px=15)
     assert wrong.matched > 100
     (found_wrong,) = remarks_on_disagreement(wrong)
-    assert found_wrong.number("share") == pytest.approx(len(wrong.residuals) / wrong.matched)
+    assert found_wrong.number("share") == pytest.approx(1 - len(wrong.residuals) / wrong.matched)
+    assert found_wrong.severity == "error"
 
 
 def test_tie_points_of_three_photographs() -> None:

@@ -54,9 +54,12 @@ def projection_covariance(
         xy: where the directions are seen, px, (n, 2).
 
     Returns:
-        px^2, (n, 2, 2); NaN where the camera model cannot be inverted.
+        px^2, (n, 2, 2); NaN where the camera model cannot be inverted, infinite where a parameter is not
+        determined.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    if np.isinf(sigma).any():
+        return np.full((len(xy), 2, 2), np.inf)
     known = np.flatnonzero(sigma > 0)
     if not len(known):
         return np.zeros((len(xy), 2, 2))
