@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from sfm.adjustment.quality.projection import projection_covariance, projection_map
+from sfm.adjustment.quality.projection import observed_part, projection_covariance, projection_map
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, rotation_from_vector
 from tests.synthetic import seed_of
@@ -58,3 +58,15 @@ def test_a_shift_of_the_principal_point_is_nearly_a_rotation() -> None:
     middle = sigma[len(y) // 2, len(x) // 2]
     assert sigma[0, 0] > 20 * middle  # the rotation is no shift of all places alike
     assert not projection_covariance(camera, np.zeros((1, 1)), seen, seen).any()
+
+
+def test_image_points_cover_their_convex_hull() -> None:
+    triangle, places = (
+        np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 50.0]]),
+        np.array([[10.0, 10.0], [60.0, 40.0]]),
+    )
+    area, inside = observed_part(triangle, places)
+    assert np.isclose(area, 2500) and inside.tolist() == [True, False]
+    for some in (triangle[:2], np.outer(np.arange(4.0), [1, 2])):
+        area, inside = observed_part(some, places)
+        assert area == 0 and not inside.any()

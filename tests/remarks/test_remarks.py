@@ -142,6 +142,7 @@ LIMITS: dict[
     "c_far_from_given": ("share", 5e-4, None),
     "c_hardly_determined": ("share", 0.05, 1 / 3),
     "camera_not_calibrated": ("rms", 0.51, 1.0),
+    "margin_not_calibrated": ("rms", 0.51, 1.0),
     "principal_point_far": ("share", 0.1, None),
     "pixels_distorted": ("share", 0.01, 0.05),
     "windows_disagree": ("share", 0.3, 0.6),

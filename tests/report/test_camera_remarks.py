@@ -164,12 +164,29 @@ def test_imprecise_photographs_from_all_sides_calibrate_fairly(seed: int) -> Non
         known, truth = plate_photographs(f"frontal {seed}", tilt, noise_px=0.3)
         a = adjust(known, truth, datum=Datum("control"))
         found = verdict_of(a)
-        (one,) = of_kind(found.remarks, "camera_not_calibrated")
+        margin = () if level == "bad" else ("margin_not_calibrated",)
+        (one,) = of_kind(found.remarks, "camera_not_calibrated", *margin)
         assert found.level == level
         assert one.number("times") == pytest.approx(one.number("rms") / a.sigma0_px)
         if level == "fair":
             error = a.estimate.cameras[0].parameters - truth.cameras[0].parameters
             assert np.abs(error[:3] / a.interior_sigma(0)[:3]).max() < 4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_margin_without_image_points_is_told_from_photographs_from_the_front(seed: int) -> None:
+    """Before, photographs tilted by all angles were to be tilted, and their points were in the middle."""
+    rng = seed_of(f"margin {seed}")
+    free = ("c", "x0", "y0", "K1", "K2")
+    network, truth = make_network(rng, images=8, points=80, planar=True, free=free)
+    truth = replace(truth, points=0.3 * truth.points)
+    seen = observed_anew(network, truth, 0.05, rng)
+    a = adjust(seen.with_control(seen.points, truth.points), truth, datum=Datum("control"))
+    (one,) = (
+        r for r in verdict_of(a).remarks if r.kind in ("margin_not_calibrated", "camera_not_calibrated")
+    )
+    assert one.kind == "margin_not_calibrated" and one.number("observed") < 0.4
+    assert one.severity == "error" or one.number("rms") < 1.0
 
 
 def test_a_parameter_that_a_null_vector_leaves_open_has_no_standard_deviation() -> None:

@@ -11,9 +11,10 @@ Source: law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 
 CELLS = 24  # of the grid along the longer side of the photograph
 
@@ -40,6 +41,24 @@ def projection_map(
     Q = projection_covariance(camera, covariance, seen, grid)
     sigma = np.sqrt(np.einsum("kii->k", Q) / 2)
     return x, y, sigma.reshape(len(y), len(x))
+
+
+def observed_part(seen: FloatArray, xy: FloatArray) -> tuple[float, BoolArray]:
+    """Return the area that image points cover, their convex hull, px^2, and which places are in it.
+
+    Args:
+        seen: image points, px, (k, 2).
+        xy: places, px, (n, 2).
+
+    Returns:
+        The area, 0 of image points on one line, and whether each place is inside, (n,).
+    """
+    try:
+        hull = ConvexHull(seen)
+    except (QhullError, ValueError):  # on one line, or fewer than three
+        return 0.0, np.zeros(len(xy), dtype=bool)
+    inside = (xy @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)
+    return float(hull.volume), np.asarray(inside)
 
 
 def projection_covariance(

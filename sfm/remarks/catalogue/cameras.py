@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
+# a warning where the 95 % value reaches a pixel, which nobody takes for the error of a calibrated
+# camera; an error where the standard deviation does, and image points measured as precisely as those
+# of the calibration would contradict the camera: imprecise ones from all sides are a weak calibration
+NOT_CALIBRATED = Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", error=WRONG_SIGMAS))
+
 ROWS = (
     Kind(
         "parameters_freed",
@@ -82,14 +87,19 @@ ROWS = (
     ),
     Kind(
         "camera_not_calibrated",
-        # a warning where the 95 % value reaches a pixel, which nobody takes for the error of a calibrated
-        # camera; an error where the standard deviation does, and image points measured as precisely as those
-        # of the calibration would contradict the camera: imprecise ones from all sides are a weak calibration
-        Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", error=WRONG_SIGMAS)),
+        NOT_CALIBRATED,
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "
         "photograph (1 sigma)[[, {times} times sigma0]].",
         "photographs from the front, whose distance takes up an error of c, or few and imprecise ones",
         "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+    ),
+    Kind(
+        "margin_not_calibrated",
+        NOT_CALIBRATED,
+        "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "
+        "photograph (1 sigma)[[, {times} times sigma0]]: its image points cover {observed:%} of the format.",
+        "no image points in the margin of the photographs, where distortion then is extrapolated",
+        "Add photographs that show the plate in the corners and along the sides of the format.",
     ),
     Kind(
         "c_hardly_determined",

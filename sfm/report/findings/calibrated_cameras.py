@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.quality.projection import projection_map
+from sfm.adjustment.quality.projection import observed_part, projection_map
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import Role
@@ -26,6 +26,8 @@ class CalibratedCamera:
     projection_rms_px: float  # projection uncertainty, 1 sigma, over the whole photograph, px; infinite where
     # a parameter is not determined
     projection_largest_px: float  # its largest value, px; likewise
+    observed_rms_px: float  # projection uncertainty between the image points, px; likewise
+    observed: float  # part of the photograph that the image points cover together, their convex hull
 
 
 def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ()) -> bool:
@@ -67,11 +69,20 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
         parameters = tuple(one for one in family.parameters if one.parameter.role in OF_CAMERA)
         if projection is None and not any(np.isinf(one.sigma) for one in family.parameters):
             continue  # held
-        rms = largest = np.inf
+        rms = largest = inner = np.inf
+        seen = adjustment.network.image_points.select(~adjustment.rejected)
+        xy = seen.xy[(interior.family == f)[seen.image]]
+        area = observed_part(xy, xy)[0] / float(np.prod(family.camera.size_px))
         if projection is not None:
-            known = projection[2][np.isfinite(projection[2])]
-            rms, largest = root_mean_square(known), float(known.max()) if known.size else np.nan
-        found.append(CalibratedCamera(family.name, parameters, rms, largest))
+            x, y, sigma = projection
+            inside = observed_part(xy, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[1]
+            known = np.isfinite(sigma)
+            rms, largest = (
+                root_mean_square(sigma[known]),
+                float(sigma[known].max()) if known.any() else np.nan,
+            )
+            inner = root_mean_square(sigma[known & inside.reshape(sigma.shape)])
+        found.append(CalibratedCamera(family.name, parameters, rms, largest, inner, area))
     return tuple(found)
 
 

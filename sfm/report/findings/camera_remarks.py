@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import SurveyResult
 
@@ -22,12 +24,19 @@ def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...
 
 
 def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
-    """Return the cameras of a calibration that do not know where a direction is seen in the photograph."""
+    """Return the cameras of a calibration that do not know where a direction is seen in the photograph.
+
+    It is the margin of the photograph that lacks image points where between these the camera is known.
+    """
     sigma, found = result.adjustment.sigma0_px, list[Remark]()
     for one in calibrated:
         rms = one.projection_rms_px
         times = rms / sigma if sigma > 0 and np.isfinite(rms) else None
-        found += unless_note(remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times))
+        weak = remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times)
+        if remark("camera_not_calibrated", rms=one.observed_rms_px, times=times).severity == "note":
+            numbers = {**weak.numbers, "observed": Quantity(one.observed)}
+            weak = replace(weak, kind="margin_not_calibrated", numbers=numbers)
+        found += unless_note(weak)
     return tuple(found)
 
 
