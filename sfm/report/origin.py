@@ -19,7 +19,7 @@ class Origin:
 
     def written(self, out: Path) -> dict[str, str]:
         """Return the paths from the folder of the result, which stay true where all are moved together."""
-        return {"survey_at": _path_from(out, self.file), "images_at": _path_from(out, self.images)}
+        return {"survey_at": path_from(out, self.file), "images_at": path_from(out, self.images)}
 
 
 def read_origin(out: Path) -> Origin | None:
@@ -51,9 +51,10 @@ def refuse_other_origin(out: Path, own: Origin) -> None:
             )
 
 
-def _path_from(out: Path, path: Path) -> str:
-    out, path = Path(os.path.realpath(out)), Path(os.path.realpath(path))
+def path_from(folder: Path, path: Path) -> str:
+    """Return a path from a folder, which stays true where both are moved together."""
+    folder, path = Path(os.path.realpath(folder)), Path(os.path.realpath(path))
     try:
-        return os.path.relpath(path, out)
+        return os.path.relpath(path, folder)
     except ValueError:  # on another drive
         return str(path)

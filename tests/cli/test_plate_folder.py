@@ -13,7 +13,7 @@ import pytest
 from sfm.cli import main
 from sfm.cli.commands import drafting
 from sfm.cli.commands.starting import stopped_once
-from sfm.errors import KolinearError, SurveyFileError
+from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.survey.drafting.draft import Draft, draft_survey
 
 FOUR_LINES = """
@@ -65,6 +65,30 @@ def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pyte
         with pytest.raises(KolinearError, match=r"targets\.pitch"):
             drafting.drafted_beside(tmp_path, out, 12.5)
         assert drafting.drafted_beside(tmp_path, out, None)[0] == file
+
+
+def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the run failed and left no result, and after all was moved together."""
+    monkeypatch.setattr(drafting, "_draft", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
+    first, second = tmp_path / "all" / 'b "1"' / "plate", tmp_path / "all" / "c" / "plate"
+    for folder in (first, second):
+        folder.mkdir(parents=True)
+    out = tmp_path / "all" / "out" / "plate"
+    with stopped_once():
+        file, _ = drafting.drafted_beside(first, out, None)
+        file.write_text(file.read_text(encoding="utf-8") + "# mine\n", encoding="utf-8")
+        edited = file.read_bytes()
+        for overwrite in (False, True):
+            with pytest.raises(OutputError, match="plate"):
+                drafting.drafted_beside(second, out, None, overwrite=overwrite)
+            assert drafting.drafted_beside(first, out, None, overwrite=overwrite)[0] == file
+            assert file.read_bytes() == edited
+    (tmp_path / "all").rename(tmp_path / "moved")
+    moved = tmp_path / "moved"
+    with stopped_once():
+        drafting.drafted_beside(moved / 'b "1"' / "plate", moved / "out" / "plate", None)
 
 
 def test_a_pitch_for_a_survey_file_is_refused(

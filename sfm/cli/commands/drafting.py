@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from sfm.remarks.remark import Remark
     from sfm.survey.drafting.draft import Draft
 
+PHOTOGRAPHS = "# Photographs: "  # the comment that states their folder, from that of the file, as in JSON
 
 Pitch = Annotated[
     float | None,
@@ -55,7 +58,7 @@ def init(
     file = photographs / "survey.toml" if out is None else out
     refuse_existing(file)
     draft = _draft(photographs, pitch)
-    _write(draft, file)
+    _write(draft, photographs, file)
     beside = file.parent.resolve() == photographs.resolve()
     print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
 
@@ -69,14 +72,14 @@ def drafted_beside(
         photographs: the folder.
         out: folder of the result, None for out/NAME OF THE FOLDER.
         pitch: of a plate, mm; None to assume it.
-        overwrite: whether a file of other photographs is drafted anew.
+        overwrite: whether a result of other photographs is replaced; the survey file never is.
 
     Returns:
         The survey file, and the folder of the result.
 
     Raises:
-        KolinearError: no photographs, a pitch beside a file that has one, a result of other photographs, or
-            the file cannot be written.
+        KolinearError: no photographs, a pitch beside a file that has one, a survey file or a result of other
+            photographs, or the file cannot be written.
     """
     with loading():
         from sfm.files.open_folders import refuse_links
@@ -86,17 +89,34 @@ def drafted_beside(
     out = Path("out") / folder_name(photographs.resolve().name) if out is None else out
     file = out.parent / f"{out.name}.toml"
     refuse_links(file)
+    if file.exists():
+        earlier = read_origin(out)
+        drafted_of = _photographs_of(file) or (earlier.images if earlier else photographs)
+        if drafted_of.resolve() != photographs.resolve():
+            raise OutputError(
+                f"{file}: is the survey file of the photographs in {os.path.normpath(drafted_of)} and is "
+                "left alone; --out names another folder, or remove it to draft a new one"
+            )
     if not overwrite:
         refuse_other_origin(out, Origin(file, photographs))
-    earlier = read_origin(out)
-    is_other = earlier is not None and earlier.images.resolve() != photographs.resolve()
-    if file.exists() and not is_other:
+    if file.exists():
         refuse_pitch(pitch, file)
         print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
         return file, out
-    draft = _draft(photographs, pitch)
-    _write(draft, file, replaces=is_other)
+    _write(_draft(photographs, pitch), photographs, file)
     return file, out
+
+
+def _photographs_of(file: Path) -> Path | None:
+    """Return the folder of photographs that a drafted survey file states; None where it states none."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    line = next((one for one in text.splitlines() if one.startswith(PHOTOGRAPHS)), None)
+    if line is None:
+        return None
+    try:
+        return file.parent / str(json.loads(line.removeprefix(PHOTOGRAPHS)))
+    except ValueError:  # changed by hand
+        return None
 
 
 def refuse_pitch(pitch: float | None, file: Path) -> None:
@@ -128,15 +148,17 @@ def _draft(photographs: Path, pitch: float | None = None) -> Draft:
     return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
-def _write(draft: Draft, file: Path, *, replaces: bool = False) -> None:
-    """Write a drafted survey, and tell on stderr what was found."""
+def _write(draft: Draft, photographs: Path, file: Path) -> None:
+    """Write a drafted survey with the folder of its photographs, and tell on stderr what was found."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.remarks.verdict import lines_of
+    from sfm.report.origin import path_from
 
-    with whole_file(file, replaces=replaces) as part:
+    stated = PHOTOGRAPHS + json.dumps(path_from(file.parent, photographs))
+    with whole_file(file) as part:
         try:
-            part.write_text(draft.text, encoding="utf-8")
+            part.write_text(f"{stated}\n{draft.text}", encoding="utf-8")
         except UnicodeEncodeError as error:
             raise OutputError(f"{file}: a name in it is no text in UTF-8") from error
     for subject, finding in draft.found:

@@ -45,7 +45,11 @@ Out = Annotated[
 ]
 Overwrite = Annotated[
     bool,
-    typer.Option("--overwrite", help="Replace a result of another survey file or of other photographs."),
+    typer.Option(
+        "--overwrite",
+        help="Replace the folder of a result of another survey file or of other photographs; survey files "
+        "are never replaced.",
+    ),
 ]
 Jobs = Annotated[
     int | None,
