@@ -18,7 +18,7 @@ from sfm.camera import Camera
 from sfm.comparison.baseline import BaselineComparison
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
-from sfm.display import html_table, text_table
+from sfm.display import counted, html_table, text_table
 from sfm.errors import GeometryError
 from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
@@ -324,7 +324,7 @@ class SurveyResult:
         unused = self.unused_image_points
         if not unused:
             return words
-        points = f"of {len(self.left_out)} points" if self.left_out else "of photographs"
+        points = f"of {counted(len(self.left_out), 'point')}" if self.left_out else "of photographs"
         return f"{words}, {unused} not in the result ({points})"
 
     @property

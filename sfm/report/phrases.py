@@ -136,7 +136,8 @@ def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     for one in camera.parameters:
         value, sigma = with_exponent(one.value, one.sigma)
         state = NOT_DETERMINED if np.isinf(one.sigma) else "" if one.sigma > 0 else "held"
-        values.append(f"{one.name}{NO_BREAK}{value} {one.unit}")
+        value = state if np.isinf(one.sigma) else f"{value} {one.unit}"
+        values.append(f"{one.name}{NO_BREAK}{value}")
         sigmas.append(state or f"{sigma} {one.unit}")
         within.append(state or f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
     rms, largest = camera.projection_rms_px, camera.projection_largest_px

@@ -24,9 +24,9 @@ ROWS = (
     Kind(
         "rank_defect",
         "error",
-        "The rank defect is {defect}, expected {expected}[[; not determined: {undetermined}]].",
+        "The rank defect is {defect}, expected {expected}[[; not determined ({undetermined})]].",
         "no observation determines something",
-        "Remove the parameter named from free, or add photographs that show the point named.",
+        "Hold what is not determined, or add photographs: of points with few rays, or tilted ones.",
     ),
     Kind(
         "sigma0_high",
