@@ -34,7 +34,8 @@ ROWS = (
         "Sigma0 is {ratio} times the expected standard deviation of an image coordinate ({stated}).",
         "the camera, the names of points or given values contradict the photographs, or sigma_px is too "
         "small",
-        "Look at the largest residuals; if they are small everywhere, set sigma_px to what they show.",
+        "Look for a camera that changed between photographs, wrong names and wrong given values; set "
+        "sigma_px to what the residuals show only where none is found.",
     ),
     Kind(
         "sigma_px_cautious",
