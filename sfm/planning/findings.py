@@ -35,7 +35,6 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
     unknown = p.adjustment.undetermined
     if unknown:
         yield remark("plan_undetermined", unknown=unknown[:1], more=len(unknown) - 1 or None)
-    if unknown:
         for group in plan.groups[1:]:
             yield remark("plan_not_connected", photographs=group, others=plan.groups[0], needed=MIN_POINTS)
     if not p.determined.all():

@@ -72,17 +72,23 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
         rms = largest = inner = np.inf
         seen = adjustment.network.image_points.select(~adjustment.rejected)
         xy = seen.xy[(interior.family == f)[seen.image]]
-        area = observed_part(xy, xy)[0] / float(np.prod(family.camera.size_px))
+        places = np.zeros((0, 2))
         if projection is not None:
-            x, y, sigma = projection
-            inside = observed_part(xy, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[1]
+            places = np.stack(np.meshgrid(*projection[:2]), axis=-1).reshape(-1, 2)
+        area, inside = observed_part(xy, places)
+        if projection is not None:
+            sigma = projection[2]
             known = np.isfinite(sigma)
             rms, largest = (
                 root_mean_square(sigma[known]),
                 float(sigma[known].max()) if known.any() else np.nan,
             )
             inner = root_mean_square(sigma[known & inside.reshape(sigma.shape)])
-        found.append(CalibratedCamera(family.name, parameters, rms, largest, inner, area))
+        found.append(
+            CalibratedCamera(
+                family.name, parameters, rms, largest, inner, area / float(np.prod(family.camera.size_px))
+            )
+        )
     return tuple(found)
 
 
