@@ -34,8 +34,11 @@ MIN_PROBABILITY = 1e-3  # smaller ones are written as less than it
 EXPECTED_SIGMAS = 3.0
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
+    "cameras": "Parameters of the camera",
     "centres": "the projection centres",
     "control": "the control points",
+    "coordinates": "Coordinates",
+    "coordinates without control": "Coordinates of the network without the control points",
     "lengths": "the given lengths",
 }
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")

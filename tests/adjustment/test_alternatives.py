@@ -503,10 +503,11 @@ def test_moved_points_are_found_with_their_evidence(dense: Dense) -> None:
 
 
 @pytest.mark.parametrize(
-    ("images", "patterns"), [(3, set()), (4, {"single", "split", "linear", "alternating"})]
+    ("images", "patterns"),
+    [(2, {"pair"}), (3, {"single"}), (4, {"single", "split", "linear", "alternating"})],
 )
 def test_of_few_photographs_there_are_fewer_patterns(images: int, patterns: set[str]) -> None:
-    """A group of two of four is a split or as good as one; of three nothing is a part."""
+    """A group of two of four is a split or as good as one; of fewer only one photograph may differ."""
     network, truth = make_network(seed_of("few photographs"), images=images, points=14, free=())
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     every = columns_of(a)

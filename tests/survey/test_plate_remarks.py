@@ -93,11 +93,11 @@ def test_an_assumed_pitch_is_a_note_of_the_result(tmp_path: Path) -> None:
     assert note.numbers["pitch"].value == 8.0 and note.numbers["pitch"].unit == "mm"
 
 
-def test_shifts_are_those_of_the_network_without_fixed_control() -> None:
-    """Nothing of a result shifts whose coordinates are all fixed."""
-    for sigma, without in ((0.0, ("control",)), (1e-4, ())):
+def test_of_given_points_the_camera_shifts() -> None:
+    """Coordinates that are given do not."""
+    for sigma in (0.0, 1e-4):
         causes = judge_alternatives(adjusted(8, sigma=sigma, other=1.01)).causes
-        assert causes and all(one.names("without") == without for one in causes)
+        assert causes and all(one.names("of") == ("cameras",) for one in causes)
 
 
 @pytest.mark.parametrize("codes", [*BOARDS, "grid"])

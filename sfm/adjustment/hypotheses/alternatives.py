@@ -67,11 +67,15 @@ def alternatives_of(
     """Return all alternatives, the best evidence first.
 
     Args:
-        a: adjustment of the image points alone.
+        a: adjustment of the image points alone; or with control, beside which only a change of the camera is
+            looked for, and what a wrong shape of the control explains as well.
         reduced: its normal equations.
         columns: its derivatives.
         bodies: object points of each rigid body that may move against the others.
     """
+    if a.datum == "control":
+        found = [*_by_photographs(a, reduced, columns), *_shapes_of_control(reduced, columns)]
+        return tuple(sorted(found, key=lambda one: -one.evidence))
     found = [
         *interiors(a, reduced, HELD),
         *interiors(a, reduced, GIVEN),
@@ -91,7 +95,7 @@ def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
     """
     owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
     held = sum(len(one) + (len(one) > 1) for one in owners)
-    if len(a.network.images) < 2 * MIN_GROUP:
+    if len(a.network.images) < MIN_GROUP:
         return held + 1
     camera = cameras_of_photographs(a)
     run, patterns = _runs(camera), 0
@@ -232,14 +236,11 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     Of more than MAX_RUNS photographs those next to one another in the sequence are taken together. A camera
     changes in some of its own photographs, an object in some of all.
     """
-    photographs = reduced.photographs
-    if photographs < 2 * MIN_GROUP:
-        return
     camera = cameras_of_photographs(a)
     run = _runs(camera)
     m = int(run.max()) + 1
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
-    if not too_many_cameras(camera):
+    if m >= 2 * MIN_GROUP and not too_many_cameras(camera):
         yield from _each(reduced, H, g, squares, run)
     for family in OF_PHOTOGRAPHS:
         some = np.array(family.places)
@@ -266,6 +267,15 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                     spread, search = part.spread(members, gain), (len(runs) - 1) * np.log(2)
                     factor = _of_photographs(members, runs, run, m)
                     yield _made(reduced, family, "group", factor, gain, search, spread, among=among)
+
+
+def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+    """Return the alternatives of control that is strained or bent, as all photographs show it."""
+    for family in OF_PHOTOGRAPHS:
+        if not family.of_camera:
+            D = reduced.whiten(columns.freedoms[:, :, list(family.places)])
+            every = np.ones(reduced.photographs)
+            yield _made(reduced, family, "all", every, gain_of(*reduced.project(D)), 0.0)
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:

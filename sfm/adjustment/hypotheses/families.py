@@ -187,7 +187,8 @@ class ObjectFamily(OfPhotographs):
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""
-        return "object_deforming" if pattern == "linear" else "object_deformed"
+        kinds = {"linear": "object_deforming", "all": "shape_of_control"}
+        return kinds.get(pattern, "object_deformed")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return what an alternative is a case of."""
@@ -202,9 +203,10 @@ class ObjectFamily(OfPhotographs):
         """Return the largest displacement of a point over the size of the object."""
         field_, size = self._field(a.estimate.points)
         away = np.linalg.norm(field_ @ beta, axis=1) / size
+        change = 1.0 if one.pattern == "all" else float(np.ptp(one.factor))
         return {
             "photographs": tuple(a.network.images[i] for i in one.photographs),
-            "deformation": (1000 * float(np.nanmax(away) * np.ptp(one.factor)), "‰ of the object"),
+            "deformation": (1000 * change * float(np.nanmax(away)), "‰ of the object"),
         }
 
     def _field(self, points: FloatArray) -> tuple[FloatArray, float]:

@@ -49,6 +49,7 @@ MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evid
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 MIN_OF_BODY = 3  # points that determine its six motions
+OF_FREE_POINTS = ("assumptions_untested", "photographs_untested")  # that given points make untrue
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
 
@@ -89,9 +90,21 @@ def judge_alternatives(
         return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
-    plain = free_network(final)
+    found = _judge_free(free_network(final), unit, bodies, fixed=not final.unknown_counts[2])
+    if not _is_calibration(final):
+        return found
+    cause = cause_in_calibration(final)
+    causes = found.causes if cause is None else (remark_of(final, cause, unit),)
+    return Judged(causes, tuple(one for one in found.unchecked if one.kind not in OF_FREE_POINTS))
+
+
+def _judge_free(
+    plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], *, fixed: bool
+) -> Judged:
+    """Return what the image points alone say; None if they determine no network."""
     if plain is None:
         return Judged(unchecked=(remark("assumptions_untested"),))
+    photographs = plain.network.images
     try:
         moving = _moving_bodies(plain, bodies)
         causes, unchecked = find_causes(plain, moving), unchecked_assumptions(plain, len(moving))
@@ -100,8 +113,33 @@ def judge_alternatives(
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)
-    fixed = not final.unknown_counts[2]
     return Judged(tuple(remark_of(plain, one, unit, fixed=fixed) for one in causes), unchecked)
+
+
+def _is_calibration(final: Adjustment) -> bool:
+    """Return whether most of its points are given, and nothing else is.
+
+    Those that are not may be given ones that were left out, as a changed camera moves them.
+    """
+    network = final.network
+    given, seen = network.control.complete.point, network.image_points.point[~final.rejected]
+    beside = len(network.scale_bars) or len(network.exterior)
+    return bool(final.datum == "control" and not beside and 2 * len(given) > len(np.unique(seen)))
+
+
+def cause_in_calibration(final: Adjustment) -> Cause | None:
+    """Return what given points show: another camera in some photographs, or control of another shape.
+
+    Image points alone say little of the cameras of a few photographs, or of many of a plane.
+
+    Args:
+        final: a finished adjustment of photographs of points most of which are given.
+    """
+    try:
+        cause = _best(final, ())
+    except np.linalg.LinAlgError:
+        return None
+    return None if cause is None or cause.refit.shift < NAMED else cause
 
 
 def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False) -> Remark:
@@ -116,10 +154,10 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False
     one, found = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
     parts = one.family.parts(one, found.adjustment, found.beta, unit)
-    without = "control" if fixed else None
-    return remark(
-        one.kind, shift=found.shift, rms=found.rms, without=without, instead=instead or None, **parts
-    )
+    of = "cameras" if plain.datum == "control" else "coordinates"
+    if fixed and of == "coordinates":
+        of = "coordinates without control"
+    return remark(one.kind, of=of, shift=found.shift, rms=found.rms, instead=instead or None, **parts)
 
 
 def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:

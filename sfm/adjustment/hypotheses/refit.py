@@ -91,7 +91,7 @@ def _stepped(
             found = adjust(
                 replace(plain.network, image_points=points),
                 start.estimate,
-                datum=Datum("free"),
+                datum=Datum("control" if plain.datum == "control" else "free"),
                 image_sigma_factor=plain.image_sigma_factor,
                 reject="tau",
                 alpha=plain.test_alpha,
@@ -131,7 +131,9 @@ def log_likelihood(a: Adjustment, freed: int = 0) -> float:
 def shifts_of(
     plain: Adjustment, before: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
 ) -> tuple[float, float]:
-    """Return the largest and the RMS change of coordinates after a similarity, in standard deviations.
+    """Return the largest and the RMS change of what a survey determines, in standard deviations.
+
+    It is that of coordinates after a similarity; with control, which is given them, of the cameras.
 
     Args:
         plain: states the standard deviations.
@@ -140,6 +142,8 @@ def shifts_of(
         one: the alternative.
         beta: its parameters, (q,).
     """
+    if plain.datum == "control":
+        return _shifts_of_cameras(plain, before, other)
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
@@ -153,3 +157,14 @@ def shifts_of(
     away = one.family.displaced(one, plain.estimate.points, beta)[known] / sigma[known]
     largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
     return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
+
+
+def _shifts_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> tuple[float, float]:
+    """Return the largest and the RMS change of determined interior parameters, in standard deviations."""
+    change = [np.zeros(0)]
+    for k, (one, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
+        sigma = plain.interior_sigma(k)
+        known = np.isfinite(sigma) & (sigma > 0)
+        change.append((changed.parameters - one.parameters)[known] / sigma[known])
+    every = np.concatenate(change)
+    return float(np.abs(every).max(initial=0.0)), float(np.sqrt((every**2).mean())) if len(every) else 0.0

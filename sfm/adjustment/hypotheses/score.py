@@ -21,7 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
 from sfm.network import rows_of
 
@@ -146,7 +146,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     """Return the accepted image points of a free adjustment with everything in it eliminated.
 
     Args:
-        a: adjustment of image points, and weighted interior parameters at most; no control, no scale bars.
+        a: adjustment of image points, alone or with control; no scale bars, no observed orientation.
         columns: derivatives of its image points.
 
     Raises:
@@ -154,12 +154,16 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     """
     network, m, n = a.network, len(a.network.images), len(a.network.points)
     seen = network.image_points
-    used = np.flatnonzero(~a.rejected & columns.usable & np.isfinite(a.residuals).all(axis=1))
+    weight, slope_of_given, fixed = _given_points(a)
+    usable = ~a.rejected & columns.usable & np.isfinite(a.residuals).all(axis=1)
+    several = np.bincount(seen.point[usable], minlength=n) > 1
+    usable &= (several | fixed.any(axis=1) | weight.any(axis=(1, 2)))[seen.point]
+    used = np.flatnonzero(usable)
     P = np.linalg.inv(a.image_covariance[used]) / a.sigma0**2
     F = np.swapaxes(np.linalg.cholesky(P), 1, 2)
     image, point = seen.image[used], seen.point[used]
     v = np.einsum("kab,kb->ka", F, a.residuals[used])
-    B = F @ columns.point[used]
+    B = np.where(fixed[point][:, None], 0.0, F @ columns.point[used])
     interior, prior, slope = _free_interior(a)
     A = np.concatenate([F @ columns.exterior[used], F @ interior[used]], axis=2)
     size = 6 * m + interior.shape[2]
@@ -167,20 +171,19 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     Bt = np.swapaxes(B, 1, 2)
     np.add.at(V, point, Bt @ B)
     np.add.at(gp, point, np.einsum("kab,kb->ka", Bt, v))
-    seen_points = np.bincount(point, minlength=n) > 1
-    V[~seen_points] = np.eye(3)
+    V, gp = V + weight, gp + slope_of_given
+    V[~V.any(axis=2)] += np.tile(np.eye(3), (n, 1, 1))[~V.any(axis=2)]  # fixed, or not seen
     L = np.linalg.inv(np.linalg.cholesky(V))
-    W = points_by_cameras(Bt @ A, point, image, n, m)
-    W[~seen_points] = 0.0
-    gp[~seen_points] = 0.0
-    W, y = L @ W, np.einsum("nab,nb->na", L, gp)
+    W = L @ points_by_cameras(Bt @ A, point, image, n, m)
+    y = np.einsum("nab,nb->na", L, gp)
     flat = W.reshape(3 * n, size)
     S, t = _camera_normals(A, image, v, m, size)
     S[6 * m :, 6 * m :] += prior
     t[6 * m :] += slope
     S -= flat.T @ flat
     t = t - flat.T @ y.ravel()
-    S += _constraints(a, S, m)
+    if a.datum != "control":
+        S += _constraints(a, S, m)
     idle = np.diagonal(S) == 0  # photographs without accepted image points
     S[idle, idle] = 1.0
     scale = 1 / np.sqrt(np.diagonal(S))
@@ -188,6 +191,21 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
     )
+
+
+def _given_points(a: Adjustment) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return weight (n, 3, 3) and slope (n, 3) of control, and which coordinates are fixed, (n, 3)."""
+    n, control = len(a.network.points), a.network.control
+    weight, slope, fixed = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3), dtype=bool)
+    if a.datum != "control":
+        return weight, slope, fixed
+    for j, xyz, stated in zip(control.point.tolist(), control.xyz, control.covariance, strict=True):
+        variance = np.diagonal(stated)
+        fixed[j], weighted = variance == 0, np.isfinite(variance) & (variance > 0)
+        P = np.linalg.inv(stated[np.ix_(weighted, weighted)]) / a.sigma0**2
+        weight[j][np.ix_(weighted, weighted)] = P
+        slope[j][weighted] = P @ (a.estimate.points[j] - xyz)[weighted]
+    return weight, slope, fixed
 
 
 def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, m: int) -> FloatArray:

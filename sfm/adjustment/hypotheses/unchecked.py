@@ -97,7 +97,7 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     for family in (*CAMERA_FAMILIES, STRAIN):
         for among in photographs_among(family, camera):
             m = int(among.sum())
-            if m < MIN_GROUP or reduced.photographs < 2 * MIN_GROUP:
+            if m < MIN_GROUP or (m < 2 * MIN_GROUP and not family.of_camera):
                 continue
             if m < 2 * MIN_GROUP:
                 pattern, first, tried = ("single", m - 1, m) if m > MIN_GROUP else ("pair", 1, 1)

@@ -6,11 +6,9 @@ from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 # Standard deviations by which a coordinate shifts with the alternative.
 SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
-SHIFTED = (
-    "Coordinates[[ of the network without {without:@}]] shift by up to {shift} standard deviations, "
-    "{rms} RMS."
-)
+SHIFTED = "{of:@} shift by up to {shift} standard deviations, {rms} RMS."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
+OF_GIVEN = ("given_contradicted", "given_strained")  # a camera that changed bends the network against them
 
 ROWS = (
     Kind(
@@ -23,6 +21,7 @@ ROWS = (
         "Give {photographs:this photograph|these photographs} another camera in the survey file, or set "
         "per_photograph.",
         short="another camera in some photographs",
+        explains=OF_GIVEN,
     ),
     Kind(
         "two_cameras",
@@ -32,6 +31,7 @@ ROWS = (
         "zoom, focus or camera changed between the two, or one was cropped or resampled; nothing says which",
         "Give each a camera in the survey file, or set per_photograph.",
         short="another camera in one of two photographs",
+        explains=OF_GIVEN,
     ),
     Kind(
         "camera_varies",
@@ -41,6 +41,7 @@ ROWS = (
         "autofocus, a stabiliser, a rolling shutter or a loose lens",
         "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
         short="a camera that differs from photograph to photograph",
+        explains=OF_GIVEN,
     ),
     Kind(
         "camera_drift",
@@ -50,6 +51,7 @@ ROWS = (
         "the camera warmed up, or its focus crept",
         "Set per_photograph for c, and let the camera warm up before the survey.",
         short="a camera that changes steadily",
+        explains=OF_GIVEN,
     ),
     Kind(
         "held_parameter",
@@ -95,6 +97,14 @@ ROWS = (
         short="an object that deforms steadily",
     ),
     Kind(
+        "shape_of_control",
+        SHIFT,
+        f"The control points have another shape than stated, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
+        "coordinates of a print or a scan, a plate that is bent, or axes of different scale",
+        "Measure the control points, or state standard deviations that cover the difference.",
+        short="control points of another shape",
+    ),
+    Kind(
         "points_moved",
         SHIFT,  # a few points leave the RMS of all small
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
@@ -132,9 +142,8 @@ ROWS = (
     Kind(
         "photographs_untested",
         "note",
-        "One camera and one shape of the object are assumed for all of {photographs:photograph}: "
-        "a test of it needs {needed}.",
-        "too few photographs to show which of them differ",
+        "The object is assumed to keep its shape in all of {photographs:photograph}: a test needs {needed}.",
+        "too few photographs to show in which of them the object differs",
         "Take more photographs.",
     ),
     Kind(

@@ -57,7 +57,8 @@ ROWS = (
         "camera_per_photograph",
         "warning",
         "{photograph} does not fit camera {camera} ({rejected} of {points:point} rejected); with "
-        "{parameters} per photograph, c {change:+}, residuals are {rms}.",
+        "{parameters} per photograph, c {change:+}, residuals are {rms}.[[ It may be "
+        "{other}, the other photograph of this camera, that changed.]]",
         "zoomed, focused anew, cropped or resampled",
         "Give this photograph a camera in the survey file, or leave it out.",
     ),

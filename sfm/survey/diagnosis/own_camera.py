@@ -42,6 +42,7 @@ from sfm.remarks.remark import Remark, remark
 LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
 TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of what fits with c to 2.5 %
+PAIR = 2  # photographs of a camera, of which nothing says which one changed
 OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
 
 
@@ -108,6 +109,7 @@ def treat_lost(
         cameras.append(camera)
         position[i], rotation[i] = found.estimate.position[0], found.estimate.rotation[0]
         with_own.append(name)
+        same = np.flatnonzero(network.camera == network.camera[i])
         remarks.append(
             remark(
                 "camera_per_photograph",
@@ -118,6 +120,7 @@ def treat_lost(
                 parameters=[n for n, group in zip(camera.names, camera.shared, strict=True) if not group],
                 change=(100 * (camera.c_px / before.c_px - 1), "%"),
                 rms=(float(np.sqrt(np.mean(found.residuals[~found.rejected] ** 2))), "px"),
+                other=[network.images[k] for k in same if k != i] if len(same) == PAIR else None,
             )
         )
     if with_own:
