@@ -16,6 +16,7 @@ from sfm.cli.console import tell_result
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.html.report_page import report_page
 from sfm.report.numbers import significant
@@ -81,6 +82,35 @@ def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.Capt
     assert page.count("<td>fixed</td>") == 3 * len(findings.points)
     assert "Precision of a point" not in page and "Precision of a point" in page_of_free_points(findings)
     assert np.abs(off(result)).max() < 4
+
+
+def zoomed(picture: np.ndarray, factor: float) -> np.ndarray:
+    """Return a photograph as one of longer c shows it."""
+    h, w = picture.shape
+    A = np.array([[factor, 0, (w - 1) / 2 * (1 - factor)], [0, factor, (h - 1) / 2 * (1 - factor)]])
+    return cv2.warpAffine(picture, A, (w, h), flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+
+
+@pytest.mark.parametrize(
+    ("count", "stations", "kinds"),
+    [
+        (2, "e2e 1", {"calibrated_from_two"}),  # before, good with c wrong by 11 standard deviations
+        (3, "e2e 1", {"other_camera"}),  # before, the plate was strained
+        (6, "e2e 2", {"camera_per_photograph"}),  # before, an error of the network
+    ],
+)
+def test_a_zoom_while_a_plate_is_photographed_is_said(
+    tmp_path: Path, count: int, stations: str, kinds: set[str]
+) -> None:
+    pictures = plate_pictures(GRID, seed_of(stations), count)
+    which = int(stations[-1]) % count
+    pictures[which] = zoomed(pictures[which], 1.02)
+    result = run_survey(read_survey(write_plate_survey(tmp_path, GRID, seed_of("z"), pictures=pictures)))
+    verdict = findings_of(result).verdict
+    assert verdict.level != "good" and kinds <= set(kinds_of(verdict.remarks))
+    assert "given_strained" not in kinds_of(verdict.remarks)
+    if "camera_per_photograph" in kinds:
+        assert np.abs(off(result)).max() < 4
 
 
 def page_of_free_points(findings: Findings) -> str:

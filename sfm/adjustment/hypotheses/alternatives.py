@@ -274,8 +274,12 @@ def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternati
     for family in OF_PHOTOGRAPHS:
         if not family.of_camera:
             D = reduced.whiten(columns.freedoms[:, :, list(family.places)])
-            every = np.ones(reduced.photographs)
-            yield _made(reduced, family, "all", every, gain_of(*reduced.project(D)), 0.0)
+            H, g, squares = reduced.project(D)
+            gain = gain_of(H, g, squares)
+            if gain.rank:
+                step = D @ gain.beta
+                spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
+                yield _made(reduced, family, "all", np.ones(reduced.photographs), gain, 0.0, spread)
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
@@ -391,6 +395,7 @@ class _Part:
             np.tensordot(np.tensordot(factor, self.H, (0, 0)), factor, (1, 0)),
             factor @ self.g,
             factor**2 @ self.squares,
+            least_share(self.g.shape[1]),
         )
 
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:

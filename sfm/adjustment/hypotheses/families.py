@@ -29,6 +29,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.remarks.remark import Quantity
 from sfm.similarity import without_motions
 
+SEEN_PX = 1e-3  # change of an image coordinate that no measurement shows
 CELLS = 5  # of the format in each direction
 
 Parts = dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | None]
@@ -157,12 +158,13 @@ class CameraFamily(OfPhotographs):
         largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
         parts: Parts = {
             "photographs": tuple(a.network.images[i] for i in photographs),
-            "change": (100 * sign * largest * float(beta[0]) / half, "%"),
         }
+        if abs(largest * float(beta[0])) > SEEN_PX:
+            parts["change"] = (100 * sign * largest * float(beta[0]) / half, "%")
         if one.among is not None and not one.among.all():
             camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
             parts["camera"] = camera.shared_name
-        if len(beta) > 2 and not linear:
+        if len(beta) > 2 and not linear and np.hypot(beta[1], beta[2]) > SEEN_PX:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
         return parts
 

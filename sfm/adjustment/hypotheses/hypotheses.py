@@ -32,7 +32,7 @@ from sfm.adjustment.hypotheses.score import (
     reduce_adjustment,
     squares_gained,
 )
-from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
+from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions, unchecked_calibration
 from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
@@ -93,9 +93,17 @@ def judge_alternatives(
     found = _judge_free(free_network(final), unit, bodies, fixed=not final.unknown_counts[2])
     if not _is_calibration(final):
         return found
-    cause = cause_in_calibration(final)
-    causes = found.causes if cause is None else (remark_of(final, cause, unit),)
-    return Judged(causes, tuple(one for one in found.unchecked if one.kind not in OF_FREE_POINTS))
+    try:
+        cause, weak = cause_in_calibration(final), unchecked_calibration(final)
+    except np.linalg.LinAlgError:
+        return found
+    if cause is not None:
+        found = replace(found, causes=(remark_of(final, cause, unit),))
+        weak = ()
+    if len(final.network.images) == MIN_GROUP:
+        weak = (remark("calibrated_from_two"),)
+    unchecked = (one for one in found.unchecked if one.kind not in OF_FREE_POINTS)
+    return replace(found, unchecked=(*weak, *unchecked))
 
 
 def _judge_free(
@@ -117,29 +125,33 @@ def _judge_free(
 
 
 def _is_calibration(final: Adjustment) -> bool:
-    """Return whether most of its points are given, and nothing else is.
+    """Return whether cameras are adjusted, most points are given, and nothing else is.
 
     Those that are not may be given ones that were left out, as a changed camera moves them.
     """
     network = final.network
     given, seen = network.control.complete.point, network.image_points.point[~final.rejected]
     beside = len(network.scale_bars) or len(network.exterior)
-    return bool(final.datum == "control" and not beside and 2 * len(given) > len(np.unique(seen)))
+    adjusted = final.datum == "control" and final.unknown_counts[1]
+    return bool(adjusted and not beside and 2 * len(given) > len(np.unique(seen)))
 
 
 def cause_in_calibration(final: Adjustment) -> Cause | None:
-    """Return what given points show: another camera in some photographs, or control of another shape.
+    """Return what given points show: another camera in some photographs, or control that is strained.
 
-    Image points alone say little of the cameras of a few photographs, or of many of a plane.
+    Image points alone say little of the cameras of a few photographs, or of many of a plane. Control that is
+    bent takes up what targets of a plate have in common as well, and is no more than what no camera explains.
 
     Args:
         final: a finished adjustment of photographs of points most of which are given.
+
+    Raises:
+        numpy.linalg.LinAlgError: the network is not determined.
     """
-    try:
-        cause = _best(final, ())
-    except np.linalg.LinAlgError:
+    cause = _best(final, ())
+    if cause is None or cause.alternative.family.name == "bending" or cause.refit.shift < NAMED:
         return None
-    return None if cause is None or cause.refit.shift < NAMED else cause
+    return cause
 
 
 def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False) -> Remark:

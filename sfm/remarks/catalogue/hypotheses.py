@@ -14,9 +14,8 @@ ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "{photographs} {photographs:fits|fit} another camera than the others[[ of camera {camera}]] (c "
-        "{change:+}"
-        f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
+        "{photographs} {photographs:fits|fit} another camera than the others[[ of camera {camera}]]"
+        f"[[, c {{change:+}}]][[, principal point {{away}} away]]. {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
         "Give {photographs:this photograph|these photographs} another camera in the survey file, or set "
         "per_photograph.",
@@ -26,8 +25,8 @@ ROWS = (
     Kind(
         "two_cameras",
         SHIFT,
-        "{photographs}, taken as one camera[[ {camera}]], are not of one: from the first to the second, c "
-        f"changes by {{change:+}}[[ and the principal point by {{away}}]]. {SHIFTED}{INSTEAD}",
+        "{photographs}, taken as one camera[[ {camera}]], are not of one[[: from the first to the second c "
+        f"changes by {{change:+}}]][[, the principal point by {{away}}]]. {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed between the two, or one was cropped or resampled; nothing says which",
         "Give each a camera in the survey file, or set per_photograph.",
         short="another camera in one of two photographs",
@@ -160,6 +159,23 @@ ROWS = (
         "before a test shows it.",
         "few photographs, or all from about the same directions",
         "Take more photographs from more directions, some of them rolled by 90 degrees.",
+    ),
+    Kind(
+        "calibration_weakly_tested",
+        "note",
+        "Zoom or focus may change between the photographs and shift the camera by up to {sigmas} standard "
+        "deviations before a test shows it.",
+        "few photographs, or none that is tilted against the plate",
+        "Take more photographs, tilted by 30 to 45 degrees and rolled by 90 degrees.",
+        explains=("camera_weakly_tested",),
+    ),
+    Kind(
+        "calibrated_from_two",
+        "warning",
+        "Two photographs calibrate the camera: hardly anything shows whether it changed between them, or "
+        "whether the given points are as stated.",
+        "nothing tells how much photographs of this camera differ anyhow",
+        "Take four photographs or more, tilted by 30 to 45 degrees and rolled by 90 degrees.",
     ),
     Kind(
         "shape_weakly_tested",

@@ -314,7 +314,8 @@ def _solved(start: _Prepared) -> _Solved:
         factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
         task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
-        free = None  # what they give alone is no start either
+        free = None  # what they give alone is no start either, nor are the cameras that it gave photographs
+        task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate, ready, accepted = start.estimate, None, None
     iterations, treated = 0, None
     if free is not None:
@@ -378,7 +379,7 @@ def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven
     if given.placing is not None and task.datum.kind == "control":
         found = given.placing.apply_estimate(found)
     elif task.datum.kind == "control":
-        return before
+        return replace(before, cameras=found.cameras)  # photographs may have got cameras of their own
     lost = task.needed == 1  # control that one photograph sees is determined by its coordinates
     points = np.where((lost & ~found.determined)[:, None], before.points, found.points)
     return replace(found, points=points)
