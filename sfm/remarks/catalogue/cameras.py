@@ -94,6 +94,19 @@ ROWS = (
         "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
     ),
     Kind(
+        "calibration_failed",
+        "error",
+        "Camera {camera} is not calibrated: c was held fixed at {held}, as the photographs do not determine "
+        "it.",
+        "photographs from the front, whose distance takes up an error of c, or too few of them",
+        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+        explains=(
+            *("interior_held", "held_to_converge", "held_parameter", "c_held_contradicted"),
+            *("held_weakly_tested", "camera_varies", "camera_weakly_tested", "given_weakly_checked"),
+            *("given_not_exact", "scale_contradicted", "sigma0_high", "points_with_large_residuals"),
+        ),
+    ),
+    Kind(
         "margin_not_calibrated",
         NOT_CALIBRATED,
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "

@@ -15,6 +15,7 @@ from sfm.report.findings.precision import root_mean_square
 from sfm.result import SeenPlate, SurveyResult
 
 OF_CAMERA = (Role.FOCAL, Role.X0, Role.Y0)
+CALIBRATION_FAILED = "calibration_failed"  # kind of remark
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,21 @@ def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ())
 
 
 def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> tuple[CalibratedCamera, ...]:
-    """Return the adjusted cameras of a survey that calibrates them; none of another survey."""
+    """Return the adjusted cameras of a survey that calibrates them; none of another survey.
+
+    One whose c was held at a start value is not among them: its projection uncertainty would be that of a
+    camera whose c is known.
+    """
     adjustment = result.adjustment
+    failed = {
+        name for one in result.remarks if one.kind == CALIBRATION_FAILED for name in one.names("camera")
+    }
     if not camera_is_result(adjustment, result.plates):
         return ()
     found = []
     for f, family in enumerate(interior.families):
+        if family.name in failed:
+            continue
         projection = projection_of(adjustment, interior.family == f)
         parameters = tuple(one for one in family.parameters if one.parameter.role in OF_CAMERA)
         if projection is None and not any(np.isinf(one.sigma) for one in family.parameters):

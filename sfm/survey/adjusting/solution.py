@@ -49,7 +49,11 @@ from sfm.survey.adjusting.settling import (
 )
 from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
-from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
+from sfm.survey.diagnosis.principal_distance import (
+    contradicted,
+    far_principal_distances,
+    not_calibrated,
+)
 from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
@@ -141,6 +145,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             *start.remarks,
             *solved.remarks,
             *_remarks(start.task.survey, told, len(whole.points), final),
+            *not_calibrated(survey, final.estimate),
             *_handedness(start.task.survey, solved.given),
             *judged.causes,
             *judged.unchecked,

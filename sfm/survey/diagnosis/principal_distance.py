@@ -1,4 +1,4 @@
-"""Whether adjusted principal distances are near the given ones, and whether held ones are contradicted.
+"""Whether adjusted principal distances are near the given ones, and what held ones are worth.
 
 Few photographs of a flat object let the principal distance run away along with the distance from it, to a
 false minimum with a small standard deviation; nothing but its start value tells.
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sfm.distortion.models import MODELS
 from sfm.network import Estimate
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.plate import plate_family
@@ -29,7 +30,7 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
         estimate: adjusted cameras.
         sigma: standard deviation of the principal distance of each, in its unit.
     """
-    if plate_family(survey.targets) is not None and survey.datum.kind == "control":
+    if _calibrates(survey):
         return ()
     given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
     remarks = []
@@ -62,3 +63,28 @@ def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Rem
     if not held or not causes:
         return ()
     return (remark("c_held_contradicted", cameras=held),)
+
+
+def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
+    """Return a remark for each camera that photographs of a plate should calibrate, with c held after all.
+
+    Args:
+        survey: says what is free of its cameras, or leaves it to the photographs.
+        estimate: adjusted cameras; those of single photographs are named by these behind that of the survey.
+    """
+    if not _calibrates(survey):
+        return ()
+    remarks = []
+    for one in survey.cameras:
+        name = MODELS[one.model].names[0]
+        own = [camera for camera in estimate.cameras if f"{camera.name} ".startswith(f"{one.name} ")]
+        held = next((camera for camera in own if not camera.free[0]), None)
+        if name in one.may_be_free and held is not None:
+            value = held.c_px * float(np.mean(held.pixel_mm))
+            remarks.append(remark("calibration_failed", camera=one.name, held=(value, "mm")))
+    return tuple(remarks)
+
+
+def _calibrates(survey: Survey) -> bool:
+    """Return whether the points of a survey are those of a plate of known coordinates."""
+    return plate_family(survey.targets) is not None and survey.datum.kind == "control"
