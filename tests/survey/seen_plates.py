@@ -51,17 +51,18 @@ class Plates:
 def plates_survey(
     folder: Path, count: int = 2, lines: Sequence[str] = (), free: str = FREE, c_mm: float = 8.0
 ) -> Survey:
-    """Return a survey of AprilGrids, with lines more for each."""
-    more = (*lines, *[""] * count)
+    """Return a survey of AprilGrids, with lines more for each, their pitch among them if not PITCH."""
+    more = [*lines, *[""] * count]
+    more = [one if "pitch" in one else f"pitch = {PITCH}\n{one}" for one in more]
     text = SURVEY.format(
-        name="plates", polarity="dark", pixel=PIXEL_MM, datum="control", pitch=f"{PITCH}\n{TAGS}{more[0]}",
+        name="plates", polarity="dark", pixel=PIXEL_MM, datum="control", pitch=f"{PITCH}\n{TAGS}",
         codes="aprilgrid", rows=8, columns=10, marks=[],
-    ).replace("marks = []\n", "").replace(FREE, free).replace("c_mm = 8.0", f"c_mm = {c_mm}")  # fmt: skip
+    ).replace("marks = []\n", "").replace(FREE, free)  # fmt: skip
+    text = text.replace("c_mm = 8.0", f"c_mm = {c_mm}").replace(f"pitch = {PITCH}\n", f"{more[0]}\n")
     first = 20
     for k, (rows, columns) in enumerate(SIZES[1:count], 1):
         text += f'[[plate]]\ncodes = "aprilgrid"\nrows = {rows}\ncolumns = {columns}\n'
-        pitch = "" if "pitch" in more[k] else f"pitch = {PITCH}\n"
-        text += f"{pitch}{TAGS}first_tag = {first}\n{more[k]}\n"
+        text += f"{TAGS}first_tag = {first}\n{more[k]}\n"
         first += rows * columns // 4
     (folder / "survey.toml").write_text(text, encoding="utf-8")
     return read_survey(folder / "survey.toml")

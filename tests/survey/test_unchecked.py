@@ -184,12 +184,12 @@ def test_a_grid_of_a_plate_is_not_rounded() -> None:
     at = np.arange(8)
     control = ObjectPoints(at, np.round(truth.points[:8], 3), np.zeros((8, 3, 3)))
     free = adjust(network, truth, datum=Datum("free"))
-    for of_plate, kind in ((False, "given_rounded"), (True, "given_not_exact")):
+    for plates, kind in (((), "given_rounded"), ((network.points[:8],), "given_not_exact")):
         judged = judge_given(
-            replace(network, control=control), free, Datum("control"), unit="m", of_plate=of_plate
+            replace(network, control=control), free, Datum("control"), unit="m", plates=plates
         )
         assert kind in kinds_of(judged.remarks)
-        assert ("scale_unchecked" in kinds_of(judged.remarks)) is not of_plate
+        assert ("scale_unchecked" in kinds_of(judged.remarks)) is not bool(plates)
 
 
 def test_a_wrong_point_among_rounded_control_is_left_out() -> None:

@@ -8,7 +8,7 @@ Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984),
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb, log
@@ -492,6 +492,14 @@ def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, e
     rows = np.zeros(free.shape)
     rows[end], rows[start] = -apart / found**2, apart / found**2
     return GivenScale(length / found, rows.ravel(), sigma / found)
+
+
+def mean_scale(scales: Sequence[GivenScale]) -> GivenScale:
+    """Return the geometric mean of scales by independent lengths."""
+    scale = float(np.exp(np.mean([np.log(one.scale) for one in scales])))
+    relative = np.array([one.sigma / one.scale for one in scales])
+    rows = np.mean([one.rows for one in scales], axis=0)
+    return GivenScale(scale, rows, scale * float(np.linalg.norm(relative)) / len(scales))
 
 
 def scale_of_points(

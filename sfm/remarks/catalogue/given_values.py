@@ -5,6 +5,7 @@ from __future__ import annotations
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
+WRONG_SIZE = "pitch is mistyped or nominal, or a plate was printed to another scale"
 # What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
 DETECTED = Grade("shift", error=WRONG_SIGMAS)
 # Held or weighted coordinates of a wrong shape pull image points, points and photographs away.
@@ -40,6 +41,24 @@ ROWS = (
         "{unit_factor}, as between {finer} and {coarser}]].",
         CHECK_THE_LIST,
         "Check these lengths and their unit; a third length shows which one is wrong.",
+    ),
+    Kind(
+        "plate_size_left_out",
+        "warning",
+        "The size of {given} [[differs by {off:+} from]][[is {times} times]] that by the other given values, "
+        "{sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} and "
+        "{coarser}]]. It was left out.",
+        WRONG_SIZE,
+        "Correct pitch of this plate, or state plate_sigma.",
+    ),
+    Kind(
+        "plate_sizes_contradict",
+        "error",
+        "No dependable scale: sizes of {given}[[ and of {others}]] contradict one another by "
+        "[[{off}]][[a factor of {times}]], {sigmas} standard deviations[[; nearly a factor of "
+        "{unit_factor}, as between {finer} and {coarser}]].",
+        WRONG_SIZE,
+        "Measure each plate from its first to its last row and column; correct pitch, or state plate_sigma.",
     ),
     Kind(
         "datum_contradicted",

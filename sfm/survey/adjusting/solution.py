@@ -122,7 +122,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         GeometryError: too little is left to adjust, or control is asked for and not seen.
     """
     start = _prepared(survey, matched)
-    solved = _solved(start)
+    solved = _solved(start, _plates(survey, matched.naming, matched.network))
     final, settled, whole = solved.final, solved.settled, start.whole
     left_out = left_out_points(
         whole,
@@ -272,8 +272,10 @@ def _has_no_identity(survey: Survey) -> bool:
     return plate is not None and plate.is_ambiguous
 
 
-def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
-    """Return the task with what was given as far as the image points confirm it."""
+def _judged(
+    start: _Prepared, free: _Free | None, plates: tuple[tuple[str, ...], ...]
+) -> tuple[Task, JudgedGiven]:
+    """Return the task with what was given, as on plates, as far as the image points confirm it."""
     task = start.task
     network = task.network
     if free is not None:  # photographs may have got cameras of their own
@@ -295,7 +297,7 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
         task.datum,
         unit=task.survey.unit,
         rescale=task.survey.adjust.weights == "components",
-        of_plate=is_plate_control(task.survey.control, plate),
+        plates=plates if is_plate_control(task.survey.control, plate) else (),
     )
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":
@@ -305,7 +307,7 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
     return replace(task, survey=survey, datum=given.datum, network=given.network, needed=needed), given
 
 
-def _solved(start: _Prepared) -> _Solved:
+def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
     """Adjust the image points, judge what was given by them, and adjust all that is left together."""
     try:
         free = _free_network(start)
@@ -313,7 +315,7 @@ def _solved(start: _Prepared) -> _Solved:
         if start.task.datum.kind != "control":
             raise
         free = None  # control may connect and calibrate what the photographs alone do not
-    task, given = _judged(start, free)
+    task, given = _judged(start, free, plates)
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.settled.adjustment
         factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))

@@ -6,7 +6,7 @@ touches is believed. The rest takes part in the adjustment.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,7 +54,7 @@ def judge_given(
     *,
     unit: str,
     rescale: bool = True,
-    of_plate: bool = False,
+    plates: Sequence[Collection[str]] = (),
 ) -> JudgedGiven:
     """Return which given values may take part in an adjustment, and remarks on the others.
 
@@ -64,8 +64,9 @@ def judge_given(
         datum: that was asked for.
         unit: object unit.
         rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
-        of_plate: whether control is a grid: fixed coordinates are not rounded to decimals, and the scale is
-            that of the plate, as asked for.
+        plates: names of the points of each plate where control is the first of them: fixed coordinates of a
+            grid are not rounded to decimals, and the scale is that of the plate, as asked for; bars between
+            points of another plate are its size.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
@@ -76,7 +77,7 @@ def judge_given(
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    return _judged(Task(network, places, datum, unit, rescale, of_plate))
+    return _judged(Task(network, places, datum, unit, rescale, tuple(map(frozenset, plates))))
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +44,17 @@ class Task:
     datum: Datum  # that was asked for
     unit: str
     rescale: bool
-    of_plate: bool  # whether control is the grid of a plate
+    plates: tuple[frozenset[str], ...] = ()  # points of each, the first of which is control; none without
+
+    @property
+    def of_plate(self) -> bool:
+        """Whether control is the grid of a plate."""
+        return bool(self.plates)
+
+    def plate_at(self, points: Collection[str]) -> str | None:
+        """Return the name of the plate that has all these points, None without one."""
+        on = (plate_name(k) for k, plate in enumerate(self.plates) if plate.issuperset(points))
+        return next(on, None)
 
     @property
     def level(self) -> float:
@@ -120,6 +130,11 @@ class Group:
             return covariance
         factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
         return np.where(known, factor**2 * covariance, covariance)
+
+
+def plate_name(k: int) -> str:
+    """Return the name of a plate by its place in the survey file, that of the targets being the first."""
+    return f"plate {k + 1}"
 
 
 def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm.adjustment.quality.given_points import (
     GivenScale,
+    mean_scale,
     scale_model,
     scale_of_length,
     scale_of_points,
@@ -27,7 +28,7 @@ from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import ScaleBars
 from sfm.remarks.kind import significant
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
+from sfm.survey.hypotheses.given_groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.units import find_unit
 
 MAX_PERCENT = 2.0  # factor of lengths beyond which it is reported as such, and not in per cent
@@ -46,23 +47,25 @@ class JudgedScales:
 def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     """Judge the scales of bars and of dependable points against one another."""
     bars, places = task.network.scale_bars, task.places
-    scales: list[GivenScale] = []
-    names: list[str] = []
-    lengths: list[_Length] = []
+    found: dict[str, list[tuple[_Length, GivenScale]]] = {}
     for one in _lengths(bars):
         b = one.bars[0]
         ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
         at = [places.of_point.get(name, -1) for name in ends]
         if min(at) >= 0 and at[0] != at[1]:
-            scales.append(scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1]))
+            scale = scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1])
             given = f" ({significant(one.length)} {task.unit})" if one.contradicted else ""
-            names.append(f"{ends[0]} - {ends[1]}{given}")
-            lengths.append(one)
+            name = task.plate_at(ends) or f"{ends[0]} - {ends[1]}{given}"
+            found.setdefault(name, []).append((one, scale))
+    names, of = list(found), list[str]()
+    lengths = [tuple(b for one, _ in some for b in one.bars) for some in found.values()]
+    scales = [mean_scale([scale for _, scale in some]) for some in found.values()]
     for group in groups:
-        found = _scale_of(task, group)
-        if found is not None:
-            scales.append(found)
-            names.append(group.of)
+        own = _scale_of(task, group)
+        if own is not None:
+            scales.append(own)
+            of.append(group.of)
+            names.append(plate_name(0) if task.of_plate and group.of == "control" else group.of)
     if not scales:
         return JudgedScales(bars)
     model = scale_model(tuple(scales), places.joint, places.redundancy)
@@ -78,11 +81,16 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
         said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
         return JudgedScales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
     on_points = task.datum.kind == "control"
-    out, remarks = _contradicting_scales(model, judgement, names, len(lengths), on_points=on_points)
+    plates = {plate_name(k) for k in range(len(task.plates))}.intersection(names)
+    out, remarks = _contradicting_scales(
+        model, judgement, names, len(lengths), on_points=on_points, plates=plates
+    )
     keep: BoolArray = np.ones(len(bars), dtype=bool)
-    keep[[b for k in out if k < len(lengths) for b in lengths[k].bars]] = False
+    keep[[b for k in out if k < len(lengths) for b in lengths[k]]] = False
     kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return JudgedScales(kept, remarks, tests, frozenset(names[k] for k in out if k >= len(lengths)))
+    return JudgedScales(
+        kept, remarks, tests, frozenset(of[k - len(lengths)] for k in out if k >= len(lengths))
+    )
 
 
 def _scale_of(task: Task, group: Group) -> GivenScale | None:
@@ -107,20 +115,27 @@ def _scale_of(task: Task, group: Group) -> GivenScale | None:
 
 
 def _contradicting_scales(
-    model: GivenModel, judgement: Judgement, names: list[str], bars: int, *, on_points: bool
+    model: GivenModel,
+    judgement: Judgement,
+    names: list[str],
+    bars: int,
+    *,
+    on_points: bool,
+    plates: Collection[str] = (),
 ) -> tuple[tuple[int, ...], tuple[Remark, ...]]:
     """Return which scales the others identify as wrong, or all where nothing shows which are, and remarks.
 
     Args:
         model: differences of the scales, those of bars first.
         judgement: what is wrong of them.
-        names: of the bars, and kinds of the given points.
+        names: of the bars and plates, and kinds of the given points.
         bars: how many of them are lengths of bars.
         on_points: whether given points hold the datum. Bars, which may share their unit, do not replace them.
+        plates: names of those that are plates.
     """
     wrong, every = judgement.wrong, range(model.items)
     if wrong and not (on_points and max(wrong) >= bars and {*every[bars:]} <= {*wrong}):
-        return wrong, tuple(_left_out(model, wrong, names, k, bars) for k in wrong)
+        return wrong, tuple(_left_out(model, wrong, names, k, bars, plates) for k in wrong)
     which = sorted(wrong or judgement.doubtful or every, key=lambda k: (k < bars, k))
     if wrong:
         off, sigma = _difference(model, wrong, which[0])
@@ -131,15 +146,24 @@ def _contradicting_scales(
         off = float(v[high] - v[low])
         sigma = float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high]))
         agreeing = None
-    given = [names[k] for k in which]
-    said = remark("scale_contradicted", given=given, agreeing=agreeing, **_by(abs(off), sigma))
+    by = _by(abs(off), sigma)
+    if plates:
+        given = [one if one in plates else f"bar {one}" for one in (names[k] for k in which)]
+        others = [names[k] for k in every if k not in which] or None
+        said = remark("plate_sizes_contradict", given=given, others=others, **by)
+    else:
+        said = remark("scale_contradicted", given=[names[k] for k in which], agreeing=agreeing, **by)
     return (*every[:bars], *(k for k in which if k >= bars)), (said,)
 
 
-def _left_out(model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, bars: int) -> Remark:
-    """Return the remark that a bar, or given points by their scale, were left out."""
+def _left_out(
+    model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, bars: int, plates: Collection[str]
+) -> Remark:
+    """Return the remark that a bar, a plate, or given points by their scale, were left out."""
     off, sigma = _difference(model, wrong, k)
-    return remark("bar_left_out" if k < bars else "scale_left_out", given=names[k], **_by(off, sigma))
+    kind = "bar_left_out" if k < bars else "scale_left_out"
+    kind = "plate_size_left_out" if names[k] in plates else kind
+    return remark(kind, given=names[k], **_by(off, sigma))
 
 
 def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
