@@ -12,7 +12,7 @@ from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.diagnosis.codes_found import small_codes
-from sfm.survey.diagnosis.missing_plates import missing_plates
+from sfm.survey.diagnosis.missing_plates import missing_plates, sides_not_found
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
@@ -60,6 +60,7 @@ def measure_targets(
         (
             *small_codes(photographs.targets),
             *missing_plates(survey.family, photographs),
+            *sides_not_found(survey.family, photographs),
         ),
     )
 

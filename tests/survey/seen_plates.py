@@ -85,6 +85,25 @@ def about(
     return poses
 
 
+def seen_targets(
+    xyz: Sequence[FloatArray],
+    position: FloatArray,
+    rotation: FloatArray,
+    rng: np.random.Generator,
+    *,
+    seen: BoolArray | None = None,
+) -> Targets:
+    """Return the image points of plates in one photograph, with noise of SIGMA_PX; of those seen at all."""
+    points = np.concatenate(list(xyz))
+    xy = project(camera(), position, rotation, points) + SIGMA_PX * rng.standard_normal((len(points), 2))
+    inside = ((xy > 4) & (xy < np.array(SIZE_PX) - 5)).all(axis=1)
+    if seen is not None:
+        inside &= seen
+    k = int(inside.sum())
+    saddles = Saddles(xy[inside], np.tile(SIGMA_PX**2 * np.eye(2), (k, 1, 1)), np.ones(k), np.ones(k))
+    return _of_crossings(saddles, np.flatnonzero(inside))
+
+
 def run_plates(
     survey: Survey,
     plates: Plates,
@@ -106,25 +125,16 @@ def run_plates(
         slip: by how much, mm, (3,).
         seen: points that are seen at all.
     """
-    truth = camera()
     start = camera_from_values(
         "small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=survey.cameras[0].c_mm,
         free=survey.cameras[0].may_be_free,
     )  # fmt: skip
     names = tuple(f"{k}.png" for k in range(len(poses)))
     found: list[Targets] = []
-    for k, (position, rotation) in enumerate(poses):
+    for k, pose in enumerate(poses):
         *others, last = plates.xyz
-        xyz = np.concatenate([*others, last + (slip if k in slipped and slip is not None else 0.0)])
-        xy = project(truth, position, rotation, xyz) + SIGMA_PX * rng.standard_normal((len(xyz), 2))
-        inside = ((xy > 4) & (xy < np.array(SIZE_PX) - 5)).all(axis=1)
-        if seen is not None:
-            inside &= seen
-        count = int(inside.sum())
-        saddles = Saddles(
-            xy[inside], np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1)), np.ones(count), np.ones(count)
-        )
-        found.append(_of_crossings(saddles, np.flatnonzero(inside)))
+        moved = last + (slip if k in slipped and slip is not None else 0.0)
+        found.append(seen_targets((*others, moved), *pose, rng, seen=seen))
     paths, of_camera = tuple(Path(name) for name in names), np.zeros(len(names), dtype=np.int64)
     photographs = MeasuredPhotographs(names, paths, of_camera, (start,), tuple(found), ())
     naming = name_coded(photographs)

@@ -121,6 +121,15 @@ ROWS = (
         explains=("photograph_with_few_points",),
     ),
     Kind(
+        "plate_side_not_found",
+        "warning",
+        "Nothing was found of the {sides} of the {codes} of {size}; "
+        "{views:photograph} {views:shows|show} the place.",
+        "rows, columns or the first tag of the plate are others, so that points have wrong names, or this "
+        "side is hidden",
+        "Check rows and columns, and first_tag of a plate with tags.",
+    ),
+    Kind(
         "plane_ambiguous",
         "error",
         "The common points of {photographs} lie in a plane, and two orientations fit them alike.",
