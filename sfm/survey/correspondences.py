@@ -24,6 +24,7 @@ from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
     ContestedCodes,
     find_contested_codes,
+    plates_elsewhere,
     remarks_on_contested,
 )
 from sfm.survey.diagnosis.own_camera import treat_lost
@@ -113,12 +114,15 @@ def _without_other_objects(
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
     found = find_contested_codes(photographs, matched.naming)
+    moved = plates_elsewhere(found, photographs, survey.family)
     reasons = tuple((photographs.names[i], reason) for i, reason in sorted(found.left_out.items()))
     if found.left_out or found.main.keys() - matched.naming.code[list(found.main.values())]:
         estimate = _without_contested(photographs, matched.naming, matched.estimate, found)
         matched = _match_and_adjust(survey, photographs, matched.naming, replace(start, estimate=estimate))
         found = find_contested_codes(photographs, matched.naming)
-    return matched, reasons, remarks_on_contested(found, photographs, matched.naming)
+        for plate, images in plates_elsewhere(found, photographs, survey.family).items():
+            moved[plate] = images | moved.get(plate, frozenset())
+    return matched, reasons, remarks_on_contested(found, photographs, matched.naming, moved)
 
 
 def _without_contested(

@@ -65,6 +65,15 @@ def test_nothing_is_explained_where_nothing_was_rejected_or_known(clean: Adjustm
     X = clean.estimate.points[3] + (0.1, 0.0, 0.05)
     a = with_rejected(clean, {row: at(clean, row, X) for row in rows})
     assert kinds_of(explain_rejections(a)) == ("points_moved",)
+    (found,) = explain_rejections(a)
+    own, others = set(found.names("points")), set(a.network.points) - set(found.names("points"))
+    larger = own | set(sorted(others)[: len(own)])
+    for bodies, kind in (
+        ([own, others], "plate_moved"),
+        ([own], "points_moved"),
+        ([larger, others - larger], "points_moved"),
+    ):
+        assert kinds_of(explain_rejections(a, bodies=bodies)) == (kind,)
     assert explain_rejections(replace(a, sigma0=0.0)) == ()
     assert explain_rejections(replace(a, undetermined=("X of point 3",))) == ()
 

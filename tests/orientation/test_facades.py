@@ -12,6 +12,7 @@ from sfm.depth_reversal import reverse_depth
 from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental import misfits
 from sfm.orientation.incremental.growth import residual_lengths
+from sfm.orientation.incremental.misfits import _Resected
 from sfm.orientation.incremental.rivals import bounded_costs
 from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity
@@ -133,13 +134,23 @@ def test_facades_from_twenty_start_situations(relief, arc_deg, sigma_px):
     assert all(oriented == 8 and worst < 0.1 and rms < 0.2 for oriented, worst, rms in found)
 
 
-@pytest.mark.parametrize(("turned", "mirrored"), [(0.7, True), (1.0, False), (300.0, False)])
+@pytest.mark.parametrize(
+    ("turned", "before", "fitting", "mirrored"),
+    [
+        *((0.7, np.inf, 4, True), (1.0, np.inf, 4, False), (300.0, np.inf, 4, False)),
+        *((0.7, 6.0, 20, True), (0.7, 6.0, 19, False)),  # of 20 that fit as it is, some lie on a plane
+    ],
+)
 def test_what_fits_turned_over_by_chance_is_no_mirrored_picture(
-    turned: float, mirrored: bool, monkeypatch: pytest.MonkeyPatch
+    turned: float, before: float, fitting: int, mirrored: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Names of another scene: no resection as it is, and one of some points turned over."""
     monkeypatch.setattr(
-        misfits, "_median_px", lambda *_, turned_over=False: turned if turned_over else np.inf
+        misfits,
+        "_resected",
+        lambda *_, turned_over=False: (
+            _Resected(turned, fitting) if turned_over else _Resected(before, 20 if np.isfinite(before) else 0)
+        ),
     )
     monkeypatch.setattr(misfits, "_medians_px", lambda _: np.array([np.nan, 0.1, 0.1, 0.2]))
     growth: Any = SimpleNamespace(reasons={})

@@ -9,6 +9,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,8 +38,16 @@ class SecondPlace:
     images: IntArray  # that show it there
 
 
-def explain_rejections(a: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
-    """Return what explains the rejected image points of an adjustment; the object unit is for the remarks."""
+def explain_rejections(
+    a: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
+) -> tuple[Remark, ...]:
+    """Return what explains the rejected image points of an adjustment.
+
+    Args:
+        a: finished.
+        unit: object unit, for the remarks.
+        bodies: names of the points of each rigid body, as a plate, that may move against the others.
+    """
     if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
         return ()
     misnamed = _other_points(a)
@@ -62,7 +71,7 @@ def explain_rejections(a: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
             )
         )
     used = set(rest) | {row for row, q in misnamed.items() if _key(a, row, q) in pairs}
-    return (*remarks, *_of_places(a, _second_places(a, used), unit))
+    return (*remarks, *_of_places(a, _second_places(a, used), unit, bodies))
 
 
 def _other_points(a: Adjustment) -> dict[int, int]:
@@ -127,8 +136,13 @@ def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
     return places
 
 
-def _of_places(a: Adjustment, places: list[SecondPlace], unit: str) -> list[Remark]:
-    """Return a remark on points that moved together at one place in the sequence, and on each other point."""
+def _of_places(
+    a: Adjustment, places: list[SecondPlace], unit: str, bodies: Sequence[Collection[str]] = ()
+) -> list[Remark]:
+    """Return a remark on points that moved together at one place in the sequence, and on each other point.
+
+    Most of the points of one of several bodies, and no others, are that body.
+    """
     names = a.network.images
     together: dict[int, list[SecondPlace]] = defaultdict(list)
     alone = []
@@ -138,9 +152,15 @@ def _of_places(a: Adjustment, places: list[SecondPlace], unit: str) -> list[Rema
             together[int(max(one.images.min(), others.min()))].append(one)
         else:
             alone.append(one)
+    moved = {start: {a.network.points[one.point] for one in some} for start, some in together.items()}
+    of_body = {
+        start
+        for start, points in moved.items()
+        if len(bodies) > 1 and any(points <= set(one) and 2 * len(points) > len(one) for one in bodies)
+    }
     remarks = [
         remark(
-            "points_moved",
+            "plate_moved" if start in of_body else "points_moved",
             points=tuple(a.network.points[one.point] for one in some),
             distance=(max(one.distance for one in some), unit),
             shift=max(one.over_sigma for one in some),

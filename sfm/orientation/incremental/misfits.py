@@ -7,6 +7,8 @@ they fit each other, once these are adjusted without it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sfm.camera import tangents_from_pixel
@@ -45,7 +47,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         if not np.isfinite(waiting[i]):
             break
         looked_at[i] = True
-        if _median_px(growth, i, turned_over=True) < medians[i]:
+        if _resected(growth, i, turned_over=True).median_px < medians[i]:
             with_it = growth.estimate
             growth.release(np.array([i]))
             growth.refined(refine)
@@ -57,18 +59,30 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
 
 
 def _is_mirrored(growth: Growth, i: int) -> bool:
-    """Return whether a photograph fits the others far better turned over, and give that as its reason."""
-    as_it_is, turned = _median_px(growth, i), _median_px(growth, i, turned_over=True)
+    """Return whether a photograph fits the others far better turned over, and give that as its reason.
+
+    No fewer of its image points do so: those on a plane alone fit turned over as well, seen from behind.
+    """
+    as_it_is, turned = _resected(growth, i), _resected(growth, i, turned_over=True)
+    before, after = as_it_is.median_px, turned.median_px
     others = np.delete(_medians_px(growth), i)
-    mirrored = FAR_BETTER * turned < as_it_is and bool(turned < FAR_BETTER * np.nanmedian(others))
+    mirrored = FAR_BETTER * after < before and bool(after < FAR_BETTER * np.nanmedian(others))
+    mirrored &= turned.fitting >= as_it_is.fitting
     if mirrored:
-        before = (as_it_is, "px") if np.isfinite(as_it_is) else None
-        growth.reasons[i] = remark("photograph_mirrored", before=before, turned=(turned, "px"))
+        stated = (before, "px") if np.isfinite(before) else None
+        growth.reasons[i] = remark("photograph_mirrored", before=stated, turned=(after, "px"))
     return mirrored
 
 
-def _median_px(growth: Growth, i: int, *, turned_over: bool = False) -> float:
-    """Return the median residual of a photograph resected on the present points, px; inf if it is not.
+class _Resected(NamedTuple):
+    """How a photograph fits the present points."""
+
+    median_px: float  # residual, infinite where it is not resected
+    fitting: int  # image points within the tolerance
+
+
+def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected:
+    """Return how a photograph fits the present points, resected on them.
 
     Args:
         growth: gives points and interior orientation.
@@ -82,9 +96,10 @@ def _median_px(growth: Growth, i: int, *, turned_over: bool = False) -> float:
     known = np.isfinite(uv).all(axis=1)
     found = growth.resection(i, own[known], uv[known])
     if not found.found:
-        return float(np.inf)
+        return _Resected(np.inf, 0)
     lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px
-    return float(np.median(np.where(np.isnan(lengths), np.inf, lengths)))
+    median = float(np.median(np.where(np.isnan(lengths), np.inf, lengths)))
+    return _Resected(median, int(found.inliers.sum()))
 
 
 def _medians_px(growth: Growth) -> FloatArray:

@@ -121,6 +121,13 @@ ROWS = (
         "Remove one of the targets, or survey the states by themselves.",
     ),
     Kind(
+        "plate_elsewhere",
+        "warning",
+        "A plate is elsewhere in {photographs} than in the others: that of {points:point} {points}.",
+        "a plate slipped between the photographs, or what carries the plates bent",
+        "Fix the plates to one another and photograph them anew, or survey the states by themselves.",
+    ),
+    Kind(
         "code_rays_apart",
         "warning",
         "The rays to code {code} from {photographs} do not meet.",

@@ -136,7 +136,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
     unit = survey.unit if given else NO_SCALE
     report_step("testing the assumptions")
-    judged = judge_alternatives(final, unit=unit, bodies=_plates(survey, matched.naming, final.network))
+    plates = _plates(survey, matched.naming, final.network)
+    judged = judge_alternatives(final, unit=unit, bodies=plates)
     return Solution(
         final,
         solved.check,
@@ -149,7 +150,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             *_handedness(start.task.survey, solved.given),
             *judged.causes,
             *judged.unchecked,
-            *explain_rejections(final, unit=unit),
+            *explain_rejections(final, unit=unit, bodies=plates),
             *contradicted(solved.c_held, judged.causes),
         ),
         left_out,

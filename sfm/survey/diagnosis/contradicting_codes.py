@@ -8,11 +8,16 @@ those that do not agree with the largest group leave, and what is contested afte
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
+from sfm.targets.codes.families import TargetFamily
+from sfm.targets.codes.plates import PlateFamily, plates_of
 from sfm.targets.codes.tags import CORNERS
 
 MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread
@@ -29,6 +34,8 @@ class ContestedCodes:
     """photographs that show another object, with the reason"""
     main: dict[int, int]
     """point that is the place of a code in the largest group, where it has one"""
+    elsewhere: dict[int, frozenset[int]]
+    """of each photograph outside this group, the codes that it shows elsewhere"""
 
 
 def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> ContestedCodes:
@@ -59,15 +66,55 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
         left_out[image] = _foreign(codes, others)
     main = {code: place for code, places in contested.items() if (place := _most(places, own)) != UNNAMED}
-    return ContestedCodes(contested, left_out, main)
+    away = {image: frozenset(codes) for image, codes in elsewhere.items()}
+    return ContestedCodes(contested, left_out, main, away)
+
+
+def plates_elsewhere(
+    found: ContestedCodes, photographs: MeasuredPhotographs, family: TargetFamily | None
+) -> dict[PlateFamily, frozenset[int]]:
+    """Return plates that were moved against the others, with the photographs that show them elsewhere.
+
+    A photograph shows a plate elsewhere if it shows most of its points there.
+
+    Args:
+        found: codes that are read at several places.
+        photographs: all measured targets.
+        family: codes of the survey.
+    """
+    moved: dict[PlateFamily, frozenset[int]] = {}
+    plates = plates_of(family)
+    for plate in plates if len(plates) > 1 else ():
+        own = range(plate.first_point, plate.last_point + 1)
+        images = frozenset(
+            image
+            for image, codes in found.elsewhere.items()
+            if 2 * len(codes.intersection(own)) > np.isin(photographs.targets[image].code, own).sum()
+        )
+        if images:
+            moved[plate] = images
+    return moved
 
 
 def remarks_on_contested(
-    found: ContestedCodes, photographs: MeasuredPhotographs, naming: Naming
+    found: ContestedCodes,
+    photographs: MeasuredPhotographs,
+    naming: Naming,
+    moved: Mapping[PlateFamily, frozenset[int]],
 ) -> tuple[Remark, ...]:
-    """Return where each contested code was read."""
-    remarks = []
+    """Return the remarks on plates that moved against the others, and where each other code was read."""
+    remarks = [
+        remark(
+            "plate_elsewhere",
+            photographs=[photographs.names[i] for i in sorted(images)],
+            points=[str(code) for code in range(plate.first_point, plate.last_point + 1)],
+        )
+        for plate, images in moved.items()
+    ]
+    of_moved = {code for plate in moved for code in range(plate.first_point, plate.last_point + 1)}
     for code, places in sorted(found.places.items()):
+        if code in of_moved:
+            continue
         number = str(_number(code, naming))
         main = found.main.get(code, UNNAMED)
         away = sorted(image for image, at in places.items() if main not in at or len(at) > 1)
