@@ -5,10 +5,12 @@
 
 Object points are halved in four ways: by chance, as a checkerboard and in stripes over the object, and into
 near and far ones. Neighbours share errors that are smooth over a photograph; by chance both halves have them
-in common, in the other ways they do not. Each half is adjusted anew with what is free in the result, and
-the projection centres of both are compared after a similarity. Points are halved by their rays: two
-intersections of each point from alternate photographs with the orientation of the whole. A ratio of 1 says
-that differences are what their standard deviations say.
+in common, in the other ways they do not. Each half of the accepted image points is adjusted anew with what is
+free in the result, and the projection centres of both are compared after a similarity. What is predicted for
+their difference has the correlation of errors that the residuals of the whole show, between the halves, too.
+Points are halved by their rays: two intersections of each point from alternate photographs with the
+orientation of the whole. A ratio of 1 says that differences are what their standard deviations say; a few
+directions decide the centres, so that one pair of halves leaves it uncertain, which is printed beside it.
 """
 
 from __future__ import annotations
@@ -21,8 +23,11 @@ from pathlib import Path
 import numpy as np
 
 import sfm
-from benchmarks.textured import covariance_on_centres
-from sfm.adjustment.result import Adjustment
+from benchmarks.textured import onto_centres
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.engine.correlated import correlated_sum
+from sfm.adjustment.quality.error_correlation import estimate_error_correlation
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network, without_given
@@ -37,7 +42,7 @@ SEEDS = 3  # halves by chance, of which the root mean square is printed
 CELLS = 8  # of the checkerboard along the longer side of the object
 STRIPES = 4
 MIN_RAYS = 2  # of a point in each half of its rays
-HEAD = "result            way        points       ppm  predicted   ratio"
+HEAD = "result            way        points       ppm  predicted   ratio  sigma"
 
 
 def main() -> None:
@@ -55,48 +60,70 @@ def main() -> None:
             seen = network.image_points
             alike = np.tile(0.01 * np.eye(2), (len(seen), 1, 1))
             network = replace(network, image_points=replace(seen, covariance=alike))
+        whole = adjust(network, estimate, reject="none", redundancy_numbers=False)
+        correlation = estimate_error_correlation(whole)
+        if correlation is not None:
+            s_px = whole.sigma0_px * correlation.common**0.5
+            print(f"{path.name[-17:]:<18}common to neighbours {s_px:.3f} px, falls to 1/e in ", end="")
+            print(f"{correlation.length_px:.0f} px; each image point alone ", end="")
+            print(f"{whole.sigma0_px * correlation.alone**0.5:.3f} px")
         for way in arguments.ways:
-            _print(path.name, way, *_of_centres(network, estimate, way))
-        _print(path.name, "rays", *_of_points(network, estimate))
+            _print(path.name, way, *_of_centres(network, estimate, correlation, way))
+        _print(path.name, "rays", *_of_points(network, estimate, whole.sigma0))
 
 
-def _print(name: str, way: str, points: int, found: float, predicted: float) -> None:
+def _print(
+    name: str, way: str, points: int, found: float, predicted: float, sigma: float | None = None
+) -> None:
     """Print one row of the table."""
     row = f"{name[-17:]:<18}{way:<10}{points:>7}{1e6 * found:>10.1f}{1e6 * predicted:>11.1f}"
-    print(f"{row}{found / predicted:>8.2f}", flush=True)
+    print(f"{row}{found / predicted:>8.2f}{'' if sigma is None else f'{sigma:>7.2f}'}", flush=True)
 
 
-def _of_centres(network: Network, estimate: Estimate, way: str) -> tuple[int, float, float]:
-    """Return the number of points, and the RMS difference of the centres and what is predicted for it.
+def _of_centres(
+    network: Network, estimate: Estimate, correlation: ErrorCorrelation | None, way: str
+) -> tuple[int, float, float, float]:
+    """Return the number of points, the RMS difference of the centres, what is predicted, sigma of the ratio.
 
     Both relative to the mean distance of the centres from the middle of the object.
     """
-    squares = []
+    seen, squares = network.image_points, []
     for half in _halves(estimate.points, estimate.position, way):
         one, other = (_adjusted(network, estimate, points) for points in (half, ~half))
         a, b = one.estimate, other.estimate
         placed = fit_similarity(b.position, a.position)
         moved = placed.apply_estimate(b)
         scale = np.linalg.norm(a.position - np.nanmean(a.points, axis=0), axis=1).mean()
-        found = ((moved.position - a.position) ** 2).sum(axis=1).mean()
-        predicted = _variance(one) + placed.scale**2 * _variance(other)
-        squares.append((found / scale**2, predicted / scale**2))
-    found, predicted = np.sqrt(np.mean(squares, axis=0)).tolist()
-    return len(network.points), found, predicted
+        Z = np.zeros((len(seen), 2, 3 * len(a.position)))
+        Z[half[seen.point]] = _influence(one)
+        Z[~half[seen.point]] = (
+            -placed.scale * _influence(other) @ np.kron(np.eye(len(a.position)), placed.rotation.T)
+        )
+        covariance = np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
+        if correlation is not None:
+            covariance += correlated_sum(seen.image, seen.xy, Z, correlation)
+        found = ((moved.position - a.position) ** 2).sum()
+        squares.append((found / scale**2, np.trace(covariance) / scale**2, (covariance**2).sum() / scale**4))
+    found, predicted, spread = np.mean(squares, axis=0).tolist()
+    m = len(network.images)
+    sigma = (spread / 2) ** 0.5 / predicted  # of the root of a quadratic form with mean 1
+    return len(network.points), (found / m) ** 0.5, (predicted / m) ** 0.5, sigma
 
 
-def _variance(adjustment: Adjustment) -> float:
-    """Return the mean variance of a centre in the datum on all centres, object unit^2."""
-    m = len(adjustment.estimate.position)
-    variance = np.diagonal(covariance_on_centres(adjustment)).reshape(m, 6)
-    return float(variance[:, :3].sum(axis=1).mean())
+def _influence(adjustment: Adjustment) -> FloatArray:
+    """Return d centres / d errors of one standard deviation in the datum on the centres, (k, 2, 3 m)."""
+    marginal, m = marginal_of(adjustment, cross=False), len(adjustment.estimate.position)
+    Z = marginal.influence.of(np.arange(6 * m), np.zeros(0, dtype=np.int64)) @ onto_centres(adjustment).T
+    Z = Z.reshape(len(Z), 2, m, 6)[..., :3].reshape(len(Z), 2, 3 * m)
+    return np.asarray(adjustment.sigma0 * Z[np.argsort(marginal.layout.order)])
 
 
 def _adjusted(network: Network, estimate: Estimate, points: BoolArray) -> Adjustment:
     """Return the adjustment of some of the points, all photographs in it."""
     everything = np.ones(len(network.image_points), dtype=bool)
     images = np.ones(len(network.images), dtype=bool)
-    return adjust(*reduce_network(network, estimate, images, points, everything), redundancy_numbers=False)
+    part, start = reduce_network(network, estimate, images, points, everything)
+    return adjust(part, start, reject="none", redundancy_numbers=False)
 
 
 def _halves(xyz: FloatArray, centres: FloatArray, way: str) -> Iterator[BoolArray]:
@@ -118,7 +145,7 @@ def _halves(xyz: FloatArray, centres: FloatArray, way: str) -> Iterator[BoolArra
         yield depth < np.median(depth)
 
 
-def _of_points(network: Network, estimate: Estimate) -> tuple[int, float, float]:
+def _of_points(network: Network, estimate: Estimate, sigma0: float) -> tuple[int, float, float]:
     """Return the same of points that are intersected from alternate rays, each with its covariance."""
     seen = network.image_points
     rank = np.zeros(len(seen), dtype=np.int64)
@@ -133,7 +160,6 @@ def _of_points(network: Network, estimate: Estimate) -> tuple[int, float, float]
     J = np.stack(slope, axis=2)  # d (tangents) / d (px)
     weights = np.linalg.inv(J @ seen.covariance @ J.transpose(0, 2, 1))
     several = network.rays() >= 2 * MIN_RAYS
-    factor = adjust(network, estimate, redundancy_numbers=False).sigma0
     found = []
     for part in (0, 1):
         rays = several[seen.point] & (rank % 2 == part)
@@ -147,7 +173,7 @@ def _of_points(network: Network, estimate: Estimate) -> tuple[int, float, float]
     trace = np.einsum("nii->n", of_a + of_b)
     usual = trace < np.quantile(trace, 0.99)  # a few along their rays would decide it
     square = ((a - b) ** 2).sum(axis=1)[usual].mean()
-    predicted = factor**2 * trace[usual].mean()
+    predicted = sigma0**2 * trace[usual].mean()
     return int(usual.sum()), float(np.sqrt(square) / scale), float(np.sqrt(predicted) / scale)
 
 

@@ -150,9 +150,16 @@ def covariance_on_centres(adjustment: Adjustment) -> FloatArray:
     The errors are those after a similarity onto the true centres; a datum on the points predicts more.
     Source: Baarda (1973), S-transformations.
     """
+    m = len(adjustment.estimate.position)
+    covariance = marginal_of(adjustment).joint(np.arange(6 * m), np.zeros(0, dtype=np.int64))
+    S = onto_centres(adjustment)
+    return np.asarray(S @ covariance @ S.T)
+
+
+def onto_centres(adjustment: Adjustment) -> FloatArray:
+    """Return the S-transformation of X0 and small rotations to the datum on the centres, (6m, 6m)."""
     estimate = adjustment.estimate
     m = len(estimate.position)
-    covariance = marginal_of(adjustment).joint(np.arange(6 * m), np.zeros(0, dtype=np.int64))
     from_middle = estimate.position - estimate.position.mean(axis=0)
     G = np.zeros((m, 6, 7))
     G[:, :3, :3] = np.eye(3)
@@ -162,8 +169,7 @@ def covariance_on_centres(adjustment: Adjustment) -> FloatArray:
     of_centres = G.copy()
     of_centres[:, 3:] = 0.0
     G, of_centres = G.reshape(6 * m, 7), of_centres.reshape(6 * m, 7)
-    S = np.eye(6 * m) - G @ np.linalg.solve(of_centres.T @ of_centres, of_centres.T)
-    return np.asarray(S @ covariance @ S.T)
+    return np.asarray(np.eye(6 * m) - G @ np.linalg.solve(of_centres.T @ of_centres, of_centres.T))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ Source: Baarda (1973), S-transformations and criterion matrices.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
 from sfm.adjustment.engine.cofactors import ZERO, Cofactors, cofactors, marginal_covariance, without_held
+from sfm.adjustment.engine.correlated import CorrelatedPart, Influence, correlated_part, influence_of
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
@@ -21,7 +23,7 @@ from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
 from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
@@ -41,6 +43,28 @@ class Marginal:
     def names(self) -> list[tuple[str, str]]:
         """Return (parameter, of what) of each reduced unknown: X0 ... of photographs, then interior ones."""
         return reduced_names(self.layout, self.adjustment.network, self.adjustment.estimate)
+
+    @cached_property
+    def influence(self) -> Influence:
+        """How the errors of image points move the unknowns."""
+        weight = np.ascontiguousarray(self.adjustment.weights[self.layout.order])
+        return influence_of(self.optimum, self.layout, weight)
+
+    @cached_property
+    def correlated(self) -> CorrelatedPart | None:
+        """What the correlation of the errors adds; None where they are independent."""
+        correlation = self.adjustment.error_correlation
+        return None if correlation is None else correlated_part(self.influence, correlation)
+
+    def of_independent_errors(self) -> Covariance:
+        """Return the covariance of points, exterior and interior orientation without the correlated part."""
+        found = marginal_covariance(self.optimum, self.layout, self.cofactors, self.adjustment.sigma0**2)
+        return without_held(found, self.layout, self.optimum)
+
+    def covariance(self) -> Covariance:
+        """Return the covariance of points, exterior and interior orientation, each by itself."""
+        found, variance = self.of_independent_errors(), self.adjustment.sigma0**2
+        return found if self.correlated is None else self.correlated.added_to(found, variance, self.optimum)
 
     def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
         """Return the joint covariance of some reduced unknowns and some object points.
@@ -92,6 +116,8 @@ class Marginal:
         )
         half = H @ F
         cofactor = cofactor - half - half.T + H @ Q.G @ H.T
+        if self.correlated is not None:
+            cofactor += self.correlated.joint(unknowns, np.asarray(points))
         limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
         fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= ZERO * limiting)  # by the datum
         cofactor[fixed] = 0.0
@@ -156,10 +182,31 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
         raise GeometryError(f"change_datum: {type(adjustment).__name__}, expected an Adjustment")
     with own_threads():
         m = marginal_of(adjustment, datum=datum, cross=False)
-        covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)
+        changed = _with_covariance(m)
     kind, points = datum.resolve(adjustment.network)
-    covariance = without_held(covariance, m.layout, m.optimum)
-    return replace(adjustment, datum=kind, datum_points=points, covariance=covariance)
+    return replace(changed, datum=kind, datum_points=points)
+
+
+def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation) -> Adjustment:
+    """Return the adjustment with a covariance that knows that errors of neighbouring image points agree.
+
+    The estimate stays, which is that of independent errors; residuals and tests stay, too.
+
+    Args:
+        adjustment: what `adjust` returned.
+        correlation: of the errors, as `estimate_error_correlation` finds it in the residuals.
+
+    Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.2.
+    """
+    correlated = replace(adjustment, error_correlation=correlation)
+    with own_threads():
+        return _with_covariance(marginal_of(correlated, cross=False))
+
+
+def _with_covariance(m: Marginal) -> Adjustment:
+    """Return the adjustment with the covariance in the datum of its marginal."""
+    independent = None if m.correlated is None else m.of_independent_errors()
+    return replace(m.adjustment, covariance=m.covariance(), independent=independent)
 
 
 def determines_cameras(marginal: Marginal) -> bool:

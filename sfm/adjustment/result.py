@@ -31,6 +31,28 @@ class Covariance:
     points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
 
 
+@dataclass(frozen=True)
+class ErrorCorrelation:
+    """Errors of image points that neighbours in a photograph have in common, and those that each has alone.
+
+    In units of the standard deviations a posteriori, x and y alike, their covariance in one photograph is
+    `common` exp(-d / length_px) at distance d, and `alone` more for an image point by itself.
+    """
+
+    alone: float  # variance over sigma0^2
+    common: float
+    length_px: float  # distance at which the common part has fallen to 1/e
+
+    def sigmas_px(self, sigma0_px: float) -> tuple[float, float]:
+        """Return the standard deviations of what an image coordinate has alone and of the common part, px."""
+        return self.alone**0.5 * sigma0_px, self.common**0.5 * sigma0_px
+
+    @property
+    def variance_change(self) -> float:
+        """Variance of an image point over sigma0^2, less 1: residuals show little of long waves."""
+        return self.alone + self.common - 1.0
+
+
 @dataclass(frozen=True, repr=False)
 class Adjustment:
     """Result of a least-squares adjustment of a network.
@@ -78,11 +100,21 @@ class Adjustment:
     # coordinate; Baarda's usual one where none was
     start_sigma0: float = float("nan")  # as sigma0, at the start values
     remarks: tuple[Remark, ...] = ()  # what of the robust test could not be carried through
+    error_correlation: ErrorCorrelation | None = None  # of neighbours, that the covariance has in it
+    independent: Covariance | None = None  # covariance without that correlation, None where there is none
 
     @property
     def vPv(self) -> float:
         """Weighted sum of squared residuals of all observations, a priori unit weight."""
         return (self.sigma0 / self.inflation) ** 2 * self.redundancy
+
+    @property
+    def cofactors(self) -> Covariance:
+        """Covariance of independent errors for sigma0 = 1, which the weights of the adjustment mean."""
+        c, unit = self.covariance if self.independent is None else self.independent, self.sigma0**2
+        return Covariance(
+            c.points / unit, c.exterior / unit, tuple(Q / unit for Q in c.interior), c.points_limiting / unit
+        )
 
     @property
     def reweighted(self) -> bool:

@@ -19,6 +19,7 @@ from sfm.report.phrases import (
     words_left_out,
     words_of_calibration,
     words_of_check,
+    words_of_neighbours,
     words_of_precision,
     words_of_sigma0,
     words_of_test,
@@ -128,6 +129,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
     ]
+    if a.error_correlation is not None:
+        rows.append(("correlation", words_of_neighbours(a)))
     if not findings.calibrated:
         rows.append(("point precision", told))
     if findings.check is not None:

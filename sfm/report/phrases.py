@@ -29,6 +29,18 @@ def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
     return f"{sigma0.px:.4f} px", f"{times}; {own}" if sigma0.differs else times
 
 
+def words_of_neighbours(a: Adjustment) -> str:
+    """Return how far the errors of neighbouring image points agree; empty where they are independent."""
+    found = a.error_correlation
+    if found is None:
+        return ""
+    alone, common = (significant(sigma) for sigma in found.sigmas_px(a.sigma0_px))
+    return (
+        f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e in "
+        f"{significant(found.length_px)} px; each has {alone} px alone; standard deviations contain both"
+    )
+
+
 def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
     """Return what a global test says, with what would fit where the stated values are too cautious.
 
@@ -245,7 +257,15 @@ def _covered(one: Coverage) -> str:
 PHRASES = {
     one.__name__: one
     for one in (
-        *(words_of_sigma0, words_of_test, words_of_weights, words_of_check, words_of_w, words_of_limiting),
+        *(
+            words_of_sigma0,
+            words_of_neighbours,
+            words_of_test,
+            words_of_weights,
+            words_of_check,
+            words_of_w,
+            words_of_limiting,
+        ),
         *(
             words_of_calibration,
             words_of_fixed,

@@ -125,7 +125,7 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
     T[:, :3, :3] = np.eye(3)
     T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
     C = T @ C.reshape(m, 6, i)
-    exterior = np.einsum("mpp->mp", adjustment.covariance.exterior) / adjustment.sigma0**2
+    exterior = np.einsum("mpp->mp", adjustment.cofactors.exterior)
     half = H[inner] @ F[:, inner]  # 0 but for null vectors that are none of the motions of the network
     interior = np.diagonal(Q.border[:i, :i] - half - half.T + H[inner] @ G @ H[inner].T)
     square = exterior[:, :, None] * interior

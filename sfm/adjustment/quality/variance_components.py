@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.adjustment.engine.observed_unknowns import exterior_misclosure, weighted_of
 from sfm.adjustment.engine.unknowns import unknowns_of
-from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment, Covariance
+from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
@@ -102,7 +102,8 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     w = weighted_of(network, layout, use_control=use_control)
     whole = np.zeros(len(a.rejected), dtype=np.int64)
     image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
-    Q_points, Q_exterior = a.covariance.points[w.point], a.covariance.exterior[w.image]
+    cofactors = a.cofactors
+    Q_points, Q_exterior = cofactors.points[w.point], cofactors.exterior[w.image]
     dX = state.points[w.point] - w.xyz
     e = exterior_misclosure(w, state)
     dp = state.parameters[w.camera, w.parameter] - w.value
@@ -115,29 +116,28 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     for c in np.unique(w.camera):  # values of different cameras are not correlated
         of_camera = np.flatnonzero(w.camera == c)
         rows = where[of_camera]
-        Q_interior[np.ix_(of_camera, of_camera)] = a.covariance.interior[c][np.ix_(rows, rows)]
+        Q_interior[np.ix_(of_camera, of_camera)] = cofactors.interior[c][np.ix_(rows, rows)]
     bars = network.scale_bars
     ends = a.estimate.points[bars.end[layout.bars]] - a.estimate.points[bars.start[layout.bars]]
     length = np.linalg.norm(ends, axis=1) - w.length
-    unit = a.sigma0**2  # the covariances are a posteriori
     kinds = [
         (
             "control points",
             int((np.diagonal(w.point_weight, axis1=1, axis2=2) > 0).sum()),
             float(np.einsum("pa,pab,pb->", dX, w.point_weight, dX)),
-            float(np.einsum("pab,pba->", w.point_weight, Q_points)) / unit,
+            float(np.einsum("pab,pba->", w.point_weight, Q_points)),
         ),
         (
             "exterior orientation",
             int((np.diagonal(w.exterior_weight, axis1=1, axis2=2) > 0).sum()),
             float(np.einsum("ea,eab,eb->", e, w.exterior_weight, e)),
-            float(np.einsum("eab,eba->", w.exterior_weight, Q_exterior)) / unit,
+            float(np.einsum("eab,eba->", w.exterior_weight, Q_exterior)),
         ),
         (
             INTERIOR,
             len(w.column),
             float(dp @ w.interior_weight @ dp),
-            float((w.interior_weight * Q_interior).sum()) / unit,
+            float((w.interior_weight * Q_interior).sum()),
         ),
     ]
     taken = len(length) - float(a.bar_redundancy[layout.bars].sum())
@@ -271,13 +271,9 @@ def _as_weighted(adjustment: Adjustment) -> Adjustment:
 
     Sigma0 a posteriori of image points that are better than their weights would scale those of control, too.
     """
-    c, unit = adjustment.covariance, adjustment.sigma0**2
-    if not unit > 0:
+    if not adjustment.sigma0 > 0:
         return adjustment
-    covariance = Covariance(
-        c.points / unit, c.exterior / unit, tuple(Q / unit for Q in c.interior), c.points_limiting / unit
-    )
-    return replace(adjustment, sigma0=1.0, covariance=covariance)
+    return replace(adjustment, sigma0=1.0, covariance=adjustment.cofactors)
 
 
 def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:

@@ -128,7 +128,7 @@ def control_residuals(a: Adjustment, unit: str) -> GivenResiduals | None:
     variance = np.einsum("nii->ni", control.covariance)
     difference = a.estimate.points[control.point] - control.xyz
     weight, _ = inverse_of_observed(control.covariance)
-    w, r = standardised_of_given(difference, weight, a.covariance.points[control.point] / a.sigma0**2)
+    w, r = standardised_of_given(difference, weight, a.cofactors.points[control.point])
     return GivenResiduals(
         kind="control point",
         coordinates=("X", "Y", "Z"),
@@ -172,7 +172,7 @@ def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
     adjustment, found = result.adjustment, result.adjustment.network.interior
     names, units, parts = [], [], []
     for a in np.unique(found.camera):
-        camera, Q = adjustment.estimate.cameras[a], adjustment.covariance.interior[a]
+        camera, Q = adjustment.estimate.cameras[a], adjustment.cofactors.interior[a]
         column = {int(s): k for k, s in enumerate(np.flatnonzero(camera.free))}
         rows = [
             int(q)
@@ -185,7 +185,7 @@ def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
         names += [f"{camera.names[s]} of camera {camera.owner_of(s)}" for s in own]
         units += [camera.units[s] for s in own]
         at = [column[int(s)] for s in own]
-        cofactor = Q[np.ix_(at, at)] / adjustment.sigma0**2 if len(Q) else np.full((len(at),) * 2, np.nan)
+        cofactor = Q[np.ix_(at, at)] if len(Q) else np.full((len(at),) * 2, np.nan)
         given, difference = found.value[rows], camera.parameters[own] - found.value[rows]
         weight = found.weight_of(np.array(rows))
         w, r = standardised_of_given(difference[None], weight[None], cofactor[None])
@@ -207,7 +207,7 @@ def exterior_residuals(result: SurveyResult) -> tuple[GivenResiduals, GivenResid
     angles = (angles_from_rotation(rotation) - seen.angles + np.pi) % (2 * np.pi) - np.pi
     v = np.where(np.isfinite(variance), np.hstack([position - seen.position, angles]), 0.0)
     weight, _ = inverse_of_observed(seen.covariance)
-    w, r = standardised_of_given(v, weight, a.covariance.exterior[seen.image] / a.sigma0**2)
+    w, r = standardised_of_given(v, weight, a.cofactors.exterior[seen.image])
     given = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
     sigma = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
     v = np.where(np.isfinite(variance), v, np.nan)

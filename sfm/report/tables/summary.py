@@ -91,6 +91,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         },
         "sigma0": or_none(adjustment.sigma0),
         "sigma0_px": or_none(adjustment.sigma0_px),
+        "error_correlation": _error_correlation(adjustment),
         "rms_px": or_none(adjustment.rms_px),
         "max_residual_px": or_none(adjustment.max_residual_px),
         "cameras": [
@@ -132,6 +133,14 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "baseline": summary_of_baseline(result),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
+
+
+def _error_correlation(a: Adjustment) -> dict[str, float] | None:
+    """Return what neighbouring image points err alone and together, px; None where they are independent."""
+    if a.error_correlation is None:
+        return None
+    alone, common = a.error_correlation.sigmas_px(a.sigma0_px)
+    return {"alone_px": alone, "common_px": common, "length_px": a.error_correlation.length_px}
 
 
 def _datum_points(adjustment: Adjustment) -> list[str] | None:

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
+from sfm.adjustment.quality.error_correlation import estimate_error_correlation
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -123,7 +125,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     """
     start = _prepared(survey, matched)
     solved = _solved(start, _plates(survey, matched.naming, matched.network))
-    final, settled, whole = solved.final, solved.settled, start.whole
+    final = solved.final if survey.tie_points is None else _with_neighbours(solved.final)
+    settled, whole = solved.settled, start.whole
     left_out = left_out_points(
         whole,
         final.network.points,
@@ -158,6 +161,13 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         solved.given.tests,
         solved.others,
     )
+
+
+def _with_neighbours(final: Adjustment) -> Adjustment:
+    """Return the adjustment with the covariance that neighbouring windows have, which err together."""
+    report_step("estimating the errors that neighbours have in common")
+    correlation = estimate_error_correlation(final)
+    return final if correlation is None else with_error_correlation(final, correlation)
 
 
 def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:

@@ -1,0 +1,210 @@
+"""What the correlation of neighbouring image points adds to the covariance of the unknowns.
+
+Least squares with weights of independent errors stays unbiased where the errors of a photograph are
+correlated, but is less precise than its cofactors say. With the influence Z of the errors e on the unknowns,
+dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; with R = I it is the usual one.
+
+Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.6 and 3.2;
+covariance function: Moritz (1980), Advanced Physical Geodesy, sec. 22; Foerstner and Wrobel (2016), sec. 4.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial.distance import cdist
+
+from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.linearised import Linearised, linearise
+from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
+from sfm.adjustment.result import Covariance, ErrorCorrelation
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import rows_of
+
+POINTS_AT_ONCE = 2000
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How the errors of image points move the unknowns of an adjustment in its datum."""
+
+    linear: Linearised
+    through: csr_matrix  # what the object points take from the reduced unknowns, (reduced, 3n)
+    scores: csr_matrix  # right side of the reduced normal equations by errors, (2k, reduced)
+    scores_of_datum: FloatArray  # and what moves the datum by itself, (2k, d)
+    unknowns: FloatArray  # reduced unknowns and parameters of the datum of both, (reduced + d, reduced + d)
+    H: FloatArray  # motions of the reduced unknowns, (reduced, d)
+    H_points: FloatArray  # motions of the object points, (3n, d)
+
+    def of(self, unknowns: IntArray, points: IntArray) -> FloatArray:
+        """Return d (reduced unknowns, X Y Z of points) / d errors, (k, 2, u + 3 p)."""
+        point, reduced = self.linear.layout.observations.point, len(self.H)
+        coordinates = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        right = self.unknowns @ np.hstack([self.of_reduced()[:, unknowns], self.of_points(coordinates)])
+        Z = np.asarray(self.scores @ right[:reduced] + self.scores_of_datum @ right[reduced:])
+        Z = Z.reshape(len(point), 2, -1)
+        place = np.full(len(self.linear.layout.point_free), -1)
+        place[points] = len(unknowns) + 3 * np.arange(len(points))
+        for axis in range(3):
+            rays = np.flatnonzero(place[point] >= 0)
+            Z[rays, :, place[point[rays]] + axis] += self.linear.own[rays, :, axis]
+        return Z
+
+    def scores_of(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
+        """Return which of `unknowns` some image points reach, and their scores, (k, 2, columns)."""
+        both = (2 * rows[:, None] + np.arange(2)).ravel()
+        scores, reduced = self.scores[both], len(self.H)
+        some = np.flatnonzero(np.bincount(scores.indices, minlength=reduced))
+        S = np.hstack([scores[:, some].toarray(), self.scores_of_datum[both]])
+        columns = np.concatenate([some, np.arange(reduced, len(self.unknowns))])
+        return columns, S.reshape(len(rows), 2, len(columns))
+
+    def of_reduced(self) -> FloatArray:
+        """Return the reduced unknowns in the datum by those in any and its parameters."""
+        return np.vstack([np.eye(len(self.H)), -self.H.T])
+
+    def of_points(self, rows: IntArray) -> FloatArray:
+        """Return the same of some coordinates of object points, without their own errors."""
+        return np.vstack([-self.through[:, rows].toarray(), -self.H_points[rows].T])
+
+
+def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Influence:
+    """Return how the errors of image points move the unknowns, in the datum of the optimum.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        weight: factor on the weight of each image point, (k,).
+    """
+    linear, motions = linearise(optimum, layout, weight), optimum.motions
+    through = linear.through.tolil()
+    n, d = len(layout.point_free), len(motions.inverse)
+    kept = (3 * layout.kept[:, None] + np.arange(3)).ravel()
+    through[layout.kept_start + np.arange(len(kept)), kept] = -1.0
+    through = csr_matrix(through)
+    B = motions.constraints.reshape(3 * n, d)
+    of_datum = (motions.on_reduced - through @ B) @ motions.inverse.T
+    Q = linear.cofactor()
+    whole = np.eye(layout.reduced + d)
+    whole[: layout.reduced, : layout.reduced] = Q
+    whole[: layout.reduced, layout.reduced :] = Q @ of_datum
+    own = linear.own @ (motions.constraints @ motions.inverse.T)[layout.observations.point]
+    return Influence(
+        linear,
+        through,
+        linear.scores,
+        own.reshape(-1, d),
+        whole,
+        motions.reduced,
+        motions.points.reshape(3 * n, d),
+    )
+
+
+@dataclass(frozen=True)
+class CorrelatedPart:
+    """What the correlation of the errors adds to cofactors, in the datum of the influence."""
+
+    influence: Influence
+    correlation: ErrorCorrelation
+    middle: FloatArray  # of the scores of reduced unknowns and datum, Z'(R - I) Z, (reduced + d, reduced + d)
+    points: FloatArray  # of each object point, (n, 3, 3)
+
+    def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
+        """Return what is added to the joint cofactor of reduced unknowns and points, (u + 3 p, u + 3 p)."""
+        influence, p, u = self.influence, len(points), len(unknowns)
+        coordinates = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        C = influence.unknowns @ np.hstack(
+            [influence.of_reduced()[:, unknowns], influence.of_points(coordinates)]
+        )
+        added = C.T @ self.middle @ C
+        if not p:
+            return np.asarray(added)
+        o, own = influence.linear.layout.observations, influence.linear.own
+        place = np.full(len(self.points), -1)
+        place[points] = np.arange(p)
+        for rows, K in _matrices(o.image, o.xy, self.correlation):
+            chosen = np.flatnonzero(place[o.point[rows]] >= 0)
+            columns, S = influence.scores_of(rows)
+            O, at = own[rows[chosen]], place[o.point[rows[chosen]]]
+            KS = (K[chosen] @ S.reshape(len(rows), -1)).reshape(len(chosen), 2, -1)
+            half = (O.transpose(0, 2, 1) @ KS @ C[columns]).reshape(-1, C.shape[1])
+            lines = (u + 3 * at[:, None] + np.arange(3)).ravel()
+            added[lines] += half
+            added[:, lines] += half.T
+            pairs = np.einsum("ocx,op,pcy->oxpy", O, K[np.ix_(chosen, chosen)], O, optimize=True)
+            added[np.ix_(lines, lines)] += pairs.reshape(len(lines), len(lines))
+        return np.asarray(added)
+
+    def added_to(self, covariance: Covariance, variance: float, optimum: Optimum) -> Covariance:
+        """Return the marginal covariance with what correlation adds, of variance factor sigma0^2."""
+        layout = self.influence.linear.layout
+        m = len(layout.exterior_free)
+        reduced = self.influence.unknowns @ self.influence.of_reduced()
+        D = variance * reduced.T @ self.middle @ reduced
+        T = np.zeros((m, 6, 6))
+        T[:, :3, :3] = np.eye(3)
+        T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+        exterior = np.einsum("ipiq->ipq", D[: 6 * m, : 6 * m].reshape(m, 6, m, 6))
+        return replace(
+            covariance,
+            points=covariance.points + variance * self.points,
+            exterior=covariance.exterior + T @ exterior @ np.swapaxes(T, 1, 2),
+            interior=tuple(
+                Q + D[np.ix_(own, own)]
+                for Q, own in zip(covariance.interior, layout.interior_column, strict=True)
+            ),
+        )
+
+
+def correlated_part(influence: Influence, correlation: ErrorCorrelation) -> CorrelatedPart:
+    """Return what the correlation of the errors adds to the cofactors of all unknowns."""
+    linear, r = influence.linear, len(influence.unknowns)
+    o, n = linear.layout.observations, len(linear.layout.point_free)
+    middle, added = np.zeros((r, r)), np.zeros((n, 3, 3))
+    for rows, K in _matrices(o.image, o.xy, correlation):
+        columns, S = influence.scores_of(rows)
+        KS = (K @ S.reshape(len(rows), -1)).reshape(S.shape)
+        middle[np.ix_(columns, columns)] += np.tensordot(S, KS, axes=((0, 1), (0, 1)))
+        j, own = o.point[rows], linear.own[rows].transpose(0, 2, 1)
+        right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
+        half = own @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
+        alone = correlation.variance_change * own @ own.transpose(0, 2, 1)
+        np.add.at(added, j, half + half.transpose(0, 2, 1) + alone)
+    D = influence.unknowns.T @ middle @ influence.unknowns
+    for first in range(0, n, POINTS_AT_ONCE):
+        C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
+        through = np.einsum("rpa,rpb->pab", C.reshape(r, -1, 3), (D @ C).reshape(r, -1, 3))
+        added[first : first + POINTS_AT_ONCE] += through
+    return CorrelatedPart(influence, correlation, middle, added)
+
+
+def correlated_sum(
+    image: IntArray, xy: FloatArray, Z: FloatArray, correlation: ErrorCorrelation
+) -> FloatArray:
+    """Return Z'(R - I) Z: what correlation adds to the covariance of functions of errors, for sigma0 = 1.
+
+    Args:
+        image: photograph of each image point, (k,).
+        xy: image points, px, (k, 2).
+        Z: derivatives of the functions by the errors in units of their standard deviations, (k, 2, u).
+        correlation: of the errors.
+    """
+    total = np.zeros((Z.shape[2], Z.shape[2]))
+    for rows, K in _matrices(image, xy, correlation):
+        own = Z[rows]
+        KZ = (K @ own.reshape(len(rows), -1)).reshape(own.shape)
+        total += np.tensordot(own, KZ, axes=((0, 1), (0, 1)))
+    return total
+
+
+def _matrices(
+    image: IntArray, xy: FloatArray, correlation: ErrorCorrelation
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Yield the image points of each photograph and R - I of them."""
+    for rows in rows_of(image, int(image.max(initial=-1)) + 1):
+        K = correlation.common * np.exp(-cdist(xy[rows], xy[rows]) / correlation.length_px)
+        K[np.diag_indices(len(rows))] = correlation.variance_change
+        yield rows, K

@@ -1,0 +1,126 @@
+"""Errors that neighbouring image points have in common: found in residuals, and in the covariance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
+from sfm.adjustment.quality.error_correlation import estimate_error_correlation
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, Network, rows_of
+from tests.synthetic import make_network, seed_of
+
+SIGMA_PX = 0.1
+
+
+def in_common(network: Network, share: float, length_px: float, rng: np.random.Generator) -> FloatArray:
+    """Return errors, px, of which a share of the variance falls as exp(-d / length) with the distance."""
+    seen = network.image_points
+    errors = np.sqrt(1 - share) * rng.standard_normal((len(seen), 2))
+    for rows in rows_of(seen.image, len(network.images)):
+        covariance = np.exp(-cdist(seen.xy[rows], seen.xy[rows]) / length_px)
+        factor = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(rows)))
+        errors[rows] += np.sqrt(share) * factor @ rng.standard_normal((len(rows), 2))
+    return SIGMA_PX * errors
+
+
+def adjusted(network: Network, truth: Estimate, errors: FloatArray) -> Adjustment:
+    """Return the adjustment of the image points with other errors."""
+    seen = network.image_points
+    moved = replace(network, image_points=replace(seen, xy=seen.xy + errors))
+    return adjust(moved, truth, reject="none", redundancy_numbers=False)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Network, Estimate]:
+    """Return a network without errors, many points on a plane in each of its photographs, and its truth."""
+    return make_network(
+        seed_of("common errors"), images=8, points=400, planar=True, free=("c",), noise_px=0.0
+    )
+
+
+def test_covariance_with_common_errors_is_what_repetition_shows(scene: tuple[Network, Estimate]) -> None:
+    """Of centres, points and c; the covariance of independent errors states centres far too precise."""
+    network, truth = scene
+    correlation = ErrorCorrelation(alone=0.7, common=0.3, length_px=400.0)
+    rng = seed_of("repeated")
+    runs = [adjusted(network, truth, in_common(network, 0.3, 400.0, rng)) for _ in range(40)]
+    of_unit_weight = replace(runs[0], sigma0=1.0)  # of the errors as they were drawn
+    found = with_error_correlation(of_unit_weight, correlation)
+    centres = np.var([one.estimate.position for one in runs], axis=0).mean()
+    points = np.var([one.estimate.points for one in runs], axis=0).mean()
+    c = np.var([one.estimate.cameras[0].parameters[0] for one in runs])
+    ratios = np.sqrt(
+        [
+            centres / np.einsum("mii->mi", found.covariance.exterior)[:, :3].mean(),
+            points / np.einsum("nii->ni", found.covariance.points).mean(),
+            c / found.covariance.interior[0][0, 0],
+        ]
+    )
+    assert ratios == pytest.approx(1.0, abs=0.25)
+    independent = np.einsum("mii->mi", found.cofactors.exterior)[:, :3].mean()
+    assert np.sqrt(centres / independent) > 1.6
+
+
+@pytest.mark.parametrize("datum", ["free", "minimal"])
+def test_every_covariance_has_the_common_errors(scene: tuple[Network, Estimate], datum: str) -> None:
+    """Marginal and joint ones, also after a change of datum; without common errors nothing is added."""
+    network, truth = scene
+    plain = adjusted(network, truth, in_common(network, 0.0, 1.0, seed_of("joint")))
+    found = with_error_correlation(plain, ErrorCorrelation(alone=0.8, common=0.2, length_px=200.0))
+    found, plain = change_datum(found, datum), change_datum(plain, datum)
+    m, points = marginal_of(found), np.array([7, 3, 200])
+    joint = m.joint(np.arange(12), points)
+    assert joint[:3, :3] == pytest.approx(found.covariance.exterior[0, :3, :3], rel=1e-6)
+    for k, j in enumerate(points):
+        own = slice(12 + 3 * k, 15 + 3 * k)
+        assert joint[own, own] == pytest.approx(found.covariance.points[j], rel=1e-6, abs=1e-14)
+    Z = m.influence.of(np.arange(12), points)  # with independent errors it gives the usual covariance
+    usual = marginal_of(plain).joint(np.arange(12), points)
+    sigma = np.sqrt(np.diagonal(usual))
+    assert plain.sigma0**2 * np.einsum("kcu,kcv->uv", Z, Z) / np.outer(sigma, sigma) == pytest.approx(
+        usual / np.outer(sigma, sigma), abs=1e-6
+    )
+    assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9, abs=1e-15)
+    none = with_error_correlation(plain, ErrorCorrelation(alone=1.0, common=0.0, length_px=200.0))
+    assert none.covariance.points == pytest.approx(plain.covariance.points, rel=1e-9, abs=1e-15)
+
+
+def sigma_of_centres(adjustment: Adjustment) -> float:
+    """Return the RMS standard deviation of the projection centres."""
+    return float(np.sqrt(np.einsum("mii->mi", adjustment.covariance.exterior)[:, :3].mean()))
+
+
+@pytest.mark.parametrize(("share", "length_px"), [(0.3, 400.0), (0.3, 100.0), (0.1, 400.0)])
+def test_common_errors_are_found(scene: tuple[Network, Estimate], share: float, length_px: float) -> None:
+    """Centres are as precise as stated, though points, orientations and c take much of long waves."""
+    network, truth = scene
+    ratios, plain = [], []
+    for seed in range(6):
+        a = adjusted(network, truth, in_common(network, share, length_px, seed_of(f"common {seed}")))
+        found = estimate_error_correlation(a)
+        assert found is not None
+        true = ErrorCorrelation(1 - share, share, length_px)
+        expected = sigma_of_centres(with_error_correlation(replace(a, sigma0=1.0), true))
+        ratios.append(sigma_of_centres(with_error_correlation(a, found)) / expected)
+        plain.append(sigma_of_centres(a) / expected)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
+    assert min(ratios) > 0.6 and max(ratios) < 1.6
+    assert max(plain) < 0.65
+
+
+def test_independent_errors_have_little_in_common(scene: tuple[Network, Estimate]) -> None:
+    """Chance alone makes standard deviations hardly larger."""
+    network, truth = scene
+    for seed in range(6):
+        errors = in_common(network, 0.0, 1.0, seed_of(f"independent {seed}"))
+        a = adjusted(network, truth, errors)
+        found = estimate_error_correlation(a)
+        if found is not None:
+            assert sigma_of_centres(with_error_correlation(a, found)) < 1.25 * sigma_of_centres(a)
