@@ -108,3 +108,12 @@ def _tiled(tiles: list[FloatArray], across: int) -> FloatArray:
 def with_noise(photograph: FloatArray, sigma: float, seed: int) -> FloatArray:
     """Add white noise."""
     return np.asarray(photograph + np.random.default_rng(seed).normal(0, sigma, photograph.shape), np.float32)
+
+
+def natural_texture(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
+    """A photograph whose amplitudes fall with the frequency, as those of natural scenes do, (H, W)."""
+    width, height = size_px
+    f = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    f[0, 0] = np.inf
+    grey = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(height, width))) / f, (height, width))
+    return np.asarray(MEAN + CONTRAST * (grey - grey.mean()) / grey.std())

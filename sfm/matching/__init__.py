@@ -2,6 +2,7 @@
 
 - `conjugate.match_points`: begin here; points of one photograph in another, by correlation and least squares.
 - `local_affinity`, `turned_templates`: its starts on wide baselines, by key points or by turned templates.
+- `relative_blur`: which photograph is blurred more, and both brought to one blur.
 - `correlation`: normalised cross-correlation in windows, along epipolar lines and in pyramids.
 - `lsm`: least squares matching of two photographs, and of many tied together by their orientation.
 - `tracks`: points of many photographs: unnamed targets, and natural texture.

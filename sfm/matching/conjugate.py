@@ -21,14 +21,18 @@ from sfm.matching.conjugate_patches import (
     match_upright,
     match_warped,
 )
-from sfm.matching.local_affinity import local_affinities
+from sfm.matching.local_affinity import LocalAffinities, local_affinities
+from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
+from sfm.matching.relative_blur import equally_blurred
 from sfm.matching.turned_templates import match_turned
 
 MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
 BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
 MIN_TEMPLATE_PX = 7  # smaller ones look like anything once they are turned and scaled
 REACH_SIGMAS = 3.0  # of the place that key points tell
-REACH_PX = (4, 15)  # of that search, at least and at most
+MIN_REACH_PX = 4  # of that search
+# Reasons for a larger template, which shows more: a second place is as good, or there is hardly texture.
+TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, LsmFlag.FLAT_TEXTURE))
 
 
 def match_points(
@@ -50,7 +54,11 @@ def match_points(
 
     Points that are not found in their search windows as they are, are looked for again (`wide`): where the
     key points around them agree on an affine map to the right photograph, at the place and in the shape that
-    it says; else in their search windows turned by up to 30 degrees and scaled by up to 1.3.
+    it says; else in their search windows turned by up to 30 degrees and scaled by up to 1.3. Those that are
+    ambiguous or without texture are looked for once more with templates twice as large.
+
+    Where one photograph is blurred more, the other is smoothed to it, and both are reduced until that blur is
+    one of a sharp photograph: templates and windows then have as many of the larger pixels.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
@@ -81,27 +89,91 @@ def match_points(
         raise GeometryError(f"matching: method '{method}', expected one of {', '.join(METHODS)}")
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = a if xy_right is None else np.asarray(xy_right, dtype=float).reshape(-1, 2)
-    by = Settings(method, template_px, search_px, equalise, interpolation, min_correlation, back_px)
-    matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
-    lost = np.flatnonzero([bool(why) and "left photograph" not in why for why in matched.reason])
-    if wide and len(lost) and template_px >= MIN_TEMPLATE_PX:
-        maps = local_affinities(left, right, a[lost])
-        known = np.isfinite(maps.xy).all(axis=1)
-        if xy_right is not None:
-            known &= (np.abs(maps.xy - b[lost]) <= search_px // 2).all(axis=1)
-        reach = np.clip(np.ceil(REACH_SIGMAS * maps.spread_px[known]), *REACH_PX).astype(np.int64)
-        start = Starts(maps.xy[known], maps.linear[known], reach)
-        again = match_warped(left, right, a[lost[known]], start, by)
-        again = confirmed(left, right, again, by, 2 * reach)
-        matched = matched.with_rows(lost[known][again.good], again.rows(again.good))
-        rest = lost[~known]
-        if len(rest):
-            again = match_turned(left, right, a[rest], b[rest], by)
-            again = confirmed(left, right, again, by, np.full(len(rest), by.reach_px))
-            matched = matched.with_rows(rest[again.good], again.rows(again.good))
-    bad = ~matched.good
-    return replace(
-        matched,
-        right=np.where(bad[:, None], np.nan, matched.right),
-        covariance=np.where(bad[:, None, None], np.nan, matched.covariance),
+    seen = equally_blurred(left, right)
+    reach = -(-((search_px - template_px) // 2) // seen.shrink)
+    back = None if back_px is None else back_px / seen.shrink
+    by = Settings(
+        method, template_px, template_px + 2 * reach, equalise, interpolation, min_correlation, back
     )
+    found = _match_by_size(
+        seen.left,
+        seen.right,
+        seen.small(a),
+        seen.small(b),
+        by,
+        given=xy_right is not None,
+        wide=wide and template_px >= MIN_TEMPLATE_PX,
+    )
+    right_xy = np.where(found.good[:, None], seen.full(found.right), np.nan)
+    covariance = np.where(found.good[:, None, None], seen.shrink**2 * found.covariance, np.nan)
+    warp = found.warp.copy()
+    warp[:, :2, 2], warp[:, 2, :2] = seen.full(warp[:, :2, 2]), warp[:, 2, :2] / seen.shrink
+    return replace(found, left=a, right=right_xy, covariance=covariance, warp=warp)
+
+
+def _match_by_size(
+    left: AnyArray, right: AnyArray, a: FloatArray, b: FloatArray, by: Settings, *, given: bool, wide: bool
+) -> ConjugatePoints:
+    """Match points with templates as asked for, and larger ones where these show too little.
+
+    Args:
+        left: the left photograph.
+        right: the right photograph.
+        a: points in the left photograph, px, (k, 2).
+        b: centres of the search windows, px, (k, 2).
+        by: how points are matched.
+        given: whether the centres are known, and not those of the left photograph.
+        wide: whether what is not found is looked for turned, scaled, and with larger templates.
+    """
+    if not wide:
+        return confirmed(left, right, match_upright(left, right, a, b, by), by)
+    maps = local_affinities(left, right, a)
+    if given:
+        maps.xy[~(np.abs(maps.xy - b) <= by.search_px // 2).all(axis=1)] = np.nan
+    matched = _match(left, right, a, b, by, maps, given=given)
+    few = np.flatnonzero([why in TOO_LITTLE_TEXTURE for why in matched.reason])
+    if len(few):
+        more = by.template_px - 1
+        larger = replace(by, template_px=by.template_px + more, search_px=by.search_px + more)
+        again = _match(left, right, a[few], b[few], larger, maps.rows(few), given=given)
+        matched = matched.with_rows(few[again.good], again.rows(again.good))
+    return matched
+
+
+def _match(
+    left: AnyArray,
+    right: AnyArray,
+    a: FloatArray,
+    b: FloatArray,
+    by: Settings,
+    maps: LocalAffinities,
+    *,
+    given: bool,
+) -> ConjugatePoints:
+    """Match points with templates of one size: upright, led by key points, or turned.
+
+    Args:
+        left: the left photograph.
+        right: the right photograph.
+        a: points in the left photograph, px, (k, 2).
+        b: centres of the search windows, px, (k, 2).
+        by: how points are matched.
+        maps: where key points lead.
+        given: whether the centres are known, and not those of the left photograph.
+    """
+    matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
+    lost = np.array([bool(why) and "left photograph" not in why for why in matched.reason], dtype=bool)
+    led = np.isfinite(maps.xy).all(axis=1)
+    rows = np.flatnonzero(lost & led)
+    if len(rows):
+        least = np.ceil(REACH_SIGMAS * maps.spread_px[rows]).astype(np.int64)
+        reach = np.maximum(least, MIN_REACH_PX)
+        again = match_warped(left, right, a[rows], Starts(maps.xy[rows], maps.linear[rows], reach), by)
+        again = confirmed(left, right, again, by, 2 * reach)
+        matched = matched.with_rows(rows[again.good], again.rows(again.good))
+    rows = np.flatnonzero(lost & ~led)
+    if len(rows):
+        again = match_turned(left, right, a[rows], b[rows], by, given=given)
+        again = confirmed(left, right, again, by, np.full(len(rows), by.reach_px))
+        matched = matched.with_rows(rows[again.good], again.rows(again.good))
+    return matched

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
 from sfm.matching.tracks.features import match_features, sift_features
 
 AROUND = 12  # key points nearest to a point
@@ -21,6 +21,7 @@ MARGIN_PX = 300.0  # around the points, in which key points are looked for
 MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
 LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
 GROSS = 3.0  # times the robust spread, beyond which a key point is on another map
+MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set are on some map of their own spread
 MAX_FEATURES = 10_000
 TRIPLES = np.array(list(combinations(range(AROUND), 3)))
 SINGULAR = 1e-3  # part of the squared extent of the key points that the triangle of a triple must have
@@ -33,6 +34,10 @@ class LocalAffinities:
     xy: FloatArray  # place in the right photograph, px, (k, 2)
     linear: FloatArray  # right px per left px, (k, 2, 2)
     spread_px: FloatArray  # standard deviation of the place along an axis, right px, (k,)
+
+    def rows(self, some: IntArray) -> LocalAffinities:
+        """Return those of some points."""
+        return LocalAffinities(self.xy[some], self.linear[some], self.spread_px[some])
 
 
 def local_affinities(
@@ -97,8 +102,10 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
     maps = np.linalg.solve(full[triples], target[triples])  # (t, 3, 2)
     off = np.linalg.norm(full @ maps - target, axis=2)  # (t, n)
     best = int(np.median(off, axis=1).argmin())
-    limit = GROSS * max(MAD_TO_SIGMA * float(np.median(off[best])), LOCALISATION_PX)
-    agree = off[best] <= limit
+    spread = max(MAD_TO_SIGMA * float(np.median(off[best])), LOCALISATION_PX)
+    if spread > MAX_SPREAD_PX:
+        return None
+    agree = off[best] <= GROSS * spread
     if agree.sum() < MIN_AGREEING:
         return None
     # near ones tell more about the place than far ones, as the surface is curved

@@ -9,6 +9,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray
 from sfm.matching.conjugate_patches import ConjugatePoints, Settings, Starts, match_warped
 from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
+from sfm.matching.correlation.ncc import match_ncc
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.match_flags import NccFlag, in_words
 from sfm.matching.radiometry import grey_of, grey_of_8_bit
@@ -18,10 +19,17 @@ ANGLES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
 SAME_PX = 5.0  # peaks of two shapes this near are one place
 REACH_PX = 3  # of the match that follows
+OWN_PX = 500  # around a point, for others like it
 
 
 def match_turned(
-    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
+    left: AnyArray,
+    right: AnyArray,
+    xy_left: FloatArray,
+    xy_right: FloatArray,
+    by: Settings,
+    *,
+    given: bool,
 ) -> ConjugatePoints:
     """Match points whose templates are turned by up to 30 degrees and scaled by up to 1.3 in the right.
 
@@ -34,6 +42,9 @@ def match_turned(
         xy_left: points in the left photograph, px, (k, 2).
         xy_right: centres of the search windows, px, (k, 2).
         by: how points are matched.
+        given: whether the centres are known. Where they are not, the place may be outside of its window, and
+            what is in the window another one like it: then the template must be the only one of its kind in
+            the left photograph, as far as OWN_PX.
     """
     best, rival, second = _starts(left, right, xy_left, xy_right, by)
     one, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
@@ -44,6 +55,9 @@ def match_turned(
         np.where(swap, one.good, other.good),
     )
     second = np.where(is_other, np.fmax(lesser, second), second)
+    if not given:
+        own = match_ncc(left, left, xy_left, xy_left, template_px=by.template_px, search_px=2 * OWN_PX + 1)
+        second = np.fmax(second, own.second)
     pixels = independent_pixels(grey_of(left), xy_left, by.template_px)
     doubt = one.good | other.good
     doubt &= ambiguous(r, second, pixels)
