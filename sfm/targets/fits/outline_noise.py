@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import digamma, fdtri, polygamma
 
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.damage import LEVEL, MAD, MIN_POPULATION, harmonics
 from sfm.targets.fits.goodness import SHAPES
@@ -66,7 +66,7 @@ def outline_shape(equations: FloatArray) -> OutlineShape:
 
 
 def judge_outlines(
-    outlines: OutlineShape, variance: FloatArray, sound: BoolArray, rise: float
+    outlines: OutlineShape, variance: FloatArray, sound: BoolArray, softness: FloatArray, rise: float
 ) -> OutlineNoise:
     """Return the noise of outlines.
 
@@ -78,17 +78,23 @@ def judge_outlines(
     """
     shape, N, effect = outlines[:3]
     rest = shape - np.median(shape[sound], axis=0) if sound.sum() >= MIN_POPULATION else shape
-    ratio = np.maximum(np.einsum("ka,kab,kb->k", rest, N, rest), 0.0) / (SHAPES * np.maximum(variance, 1e-12))
-    factor = moderate(ratio, sound, SHAPES)
-    excess = np.maximum(factor - 1, 0.0)
+    damping = np.repeat(damping_of(np.arange(3, 3 + SHAPES // 2), softness[:, None]), 2, axis=1)
+    seen, squares = damping.sum(axis=1), (damping**2).sum(axis=1)
+    weighted = np.sqrt(damping) * rest
+    ratio = np.maximum(np.einsum("ka,kab,kb->k", weighted, N, weighted), 0.0) / (
+        seen * np.maximum(variance, 1e-12)
+    )
+    freedom = float(np.median((seen**2 / squares)[sound])) if sound.any() else float(SHAPES)
+    factor, strange = moderate(ratio, sound, freedom)
+    excess = np.maximum(factor - 1, 0.0) * np.where(strange, seen / squares, rise)
     in_radii = excess * variance / np.maximum(np.diagonal(N, axis1=1, axis2=2).max(axis=1), 1e-12)
     return OutlineNoise(
-        factor + (rise - 1) * excess,
+        np.minimum(factor, 1.0) + excess,
         in_radii[:, None, None] * effect @ np.swapaxes(effect, 1, 2),
     )
 
 
-def moderate(ratio: FloatArray, sound: BoolArray, freedom: int) -> FloatArray:
+def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[FloatArray, BoolArray]:
     """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,).
 
     What is too large for the population is not drawn to it. Few targets are drawn half way to 1.
@@ -105,7 +111,12 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: int) -> FloatArray:
         prior_freedom, prior = 2 * half, np.exp(middle + digamma(half) - np.log(half))
     moderated = (prior_freedom * prior + freedom * ratio) / (prior_freedom + freedom)
     strange = ratio > prior * fdtri(freedom, prior_freedom, 1 - LEVEL / max(len(ratio), 1))
-    return np.where(strange, ratio, moderated)
+    return np.where(strange, ratio, moderated), strange
+
+
+def damping_of(k: IntArray, softness: FloatArray | float) -> FloatArray:
+    """Return the share of the power of these harmonics of outlines that so soft edges leave."""
+    return np.asarray(np.exp(-((k * softness) ** 2)))
 
 
 def _inverse_trigamma(value: float) -> float:
@@ -129,7 +140,7 @@ def rise_to_first(h: FloatArray, weight: FloatArray, softness: float) -> float:
         softness: blur of the edges over the radius, damps harmonics as the width of the sectors does.
     """
     k = np.arange(3, MAX_HARMONIC + 1)
-    damped = np.exp(-((k * softness) ** 2)) * np.sinc(k / RAYS) ** 2
+    damped = damping_of(k, softness) * np.sinc(k / RAYS) ** 2
     k = k[damped > MIN_DAMPED]
     if len(h) < MIN_POPULATION or len(k) < 3:
         return 1.0

@@ -206,9 +206,9 @@ def _repaired(
             p * r - q * q
         )
     fits.theta[cut, :2] -= px.T[cut]
-    softness = float(np.median((fits.theta[:, BLUR] / _radii(fits.theta))[sound])) if sound.any() else 0.0
-    rise = rise_to_first(h[sound], weight[sound], softness)
-    return fits, variance, judge_outlines(outlines, variance, sound, rise)
+    softness = fits.theta[:, BLUR] / _radii(fits.theta)
+    rise = rise_to_first(h[sound], weight[sound], float(np.median(softness[sound])) if sound.any() else 0.0)
+    return fits, variance, judge_outlines(outlines, variance, sound, softness, rise)
 
 
 def _variances(fits: EllipseFits, least: float) -> FloatArray:
