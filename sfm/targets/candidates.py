@@ -105,14 +105,18 @@ def find_legible(fit: EllipseFit, reason: IntArray) -> BoolArray:
     return np.asarray((reason == 0) | (np.isin(reason, SHAPE_REASONS) & ~damaged & shown))
 
 
-def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray, coded: BoolArray) -> BoolArray:
+def find_duplicates(
+    fit: EllipseFit, sign: IntArray, reason: IntArray, coded: BoolArray
+) -> tuple[BoolArray, FloatArray]:
     """Return which of the good candidates are no targets because of what is about or inside of them.
+
+    And how much farther holes are from the centres of what they are in than perspective puts them, px, (k, 2).
 
     Of concentric ellipses the one with a code is kept, else the smallest: a retro-reflective dot with a dark
     rim in glare is seen as bright dot and, larger, as the dark rim. What is in another candidate and not
     shown to be concentric, of the polarity that fewer targets of the photograph have, is a stain.
     """
-    duplicate = np.zeros(len(fit.xy), dtype=bool)
+    duplicate, off_centre = np.zeros(len(fit.xy), dtype=bool), np.zeros((len(fit.xy), 2))
     p, q, r = fit.shape.T
     with np.errstate(divide="ignore", invalid="ignore"):
         radius = np.abs(p * r - q * q) ** -0.5
@@ -139,10 +143,14 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray, coded: Bo
         stained = larger & (distance < radius[near]) & apart & (sign[near] == usual)
         if sign[i] != usual:
             duplicate[i] = stained.any()
+            about = near[larger & (sign[near] == usual) & (distance < radius[near]) & ~coded[i]]
+            if len(about):
+                shift = fit.xy[i] - fit.xy[about[radius[about].argmin()]]
+                off_centre[i] = shift * max(0.0, 1 - ECCENTRIC * radius[i] / max(np.hypot(*shift), 1e-9))
         duplicate[i] |= (smaller & ~(apart & (sign[near] != usual) & (sign[i] == usual))).any()
         within = larger & coded[near] & ~coded[i] & (reason[near] == 0)
         duplicate[i] |= (within & (distance < CONCENTRIC * radius[i])).any()
-    return duplicate
+    return duplicate, off_centre
 
 
 def find_parts_of_codes(

@@ -183,7 +183,8 @@ def find_targets(
             noise=fit.noise[legible],
         )
         reason[code >= 0] = 0
-    reason[find_duplicates(fit, outlines.sign, reason, code >= 0)] = Flag.DUPLICATE
+    duplicate, off_centre = find_duplicates(fit, outlines.sign, reason, code >= 0)
+    reason[duplicate] = Flag.DUPLICATE
     tags = None
     if isinstance(family, TagFamily):
         tags = find_tags(photograph, family, polarity=polarity, scale=scale)
@@ -207,6 +208,7 @@ def find_targets(
     if centres != "model":
         xy, covariance = _measure_centres(grey, fit, outlines.sign, noise, centres)
         reason[(reason == 0) & np.isnan(xy[:, 0])] = Flag.NO_CONVERGENCE.value
+    covariance = covariance + off_centre[:, :, None] * off_centre[:, None, :]
     keep = np.flatnonzero(reason == 0)
     keep = keep[np.lexsort((xy[keep, 0], xy[keep, 1]))]
     remark = np.where(code == UNREADABLE, fit.flag | Flag.CODE_UNREADABLE.value, fit.flag)

@@ -170,6 +170,7 @@ def _fit_one(
             )
     done = steps > 0
     goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, not keep.all())
+    goodness.judge_coherence(pixels, n, theta, length, saturation, noise, J, statistics)
     goodness.judge_background(image, theta, length, statistics)
     goodness.judge_glow(pixels, n, theta, saturation, statistics)
     statistics[goodness.STEPS] = abs(steps)
@@ -185,9 +186,7 @@ def _fit_one(
     cofactor[:] = N
     goodness.shape_equations(pixels, n, theta, length, saturation, cofactor, J, shape)
     n = _collect(image, theta, limit, margin, half_x, half_y, depth, np.ones(RAYS, np.bool_), pixels)
-    statistics[goodness.INSIDE] = goodness.sum_sectors(
-        pixels, n, theta, length, saturation, noise, J, sectors
-    )
+    goodness.sum_sectors(pixels, n, theta, length, saturation, J, sectors)
     return flag
 
 

@@ -14,10 +14,10 @@ from sfm.targets.fits import blurred_ellipse as model
 
 # Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, share
 # of strokes, halo and its sigma, saturated share of the background, share of the circumference behind which
-# glare is, and the second largest residual inside, in robust sigmas of those there.
-STATISTICS = 11
+# glare is, and the largest sum of residuals that lie together, in robust sigmas: inside and anywhere.
+STATISTICS = 12
 PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS = range(5)
-STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE = range(5, STATISTICS)
+STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE, TOGETHER = range(5, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
@@ -29,8 +29,6 @@ EDGE_ENDS_BLURS, HALO_PX = 2.5, 2.0
 SHAPES = 8
 # Standard deviation of rounding intensities.
 ROUNDING = 12**-0.5
-# Fewer pixels inside the edge than this do not show what is usual there.
-MIN_INSIDE = 20
 # Residuals of the edge are taken from this far in units of its blur, and at least so many px.
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
@@ -104,18 +102,12 @@ def sum_sectors(
     theta: FloatArray,
     length: float,
     saturation: float,
-    noise: float,
     J: FloatArray,
     sectors: FloatArray,
-) -> float:
-    """Sum up v H and H^2 of each sector of the edge, H being the derivative by the radius, into (2, RAYS).
-
-    Returns:
-        The second largest residual deeper inside than the edge, in robust standard deviations of those there.
-    """
+) -> None:
+    """Sum up v H and H^2 of each sector of the edge, H being the derivative by the radius, into (2, RAYS)."""
     A, s = theta[model.CONTRAST], theta[model.BLUR]
-    band, deep = _BAND_PX + _BAND_BLURS * s, np.empty(n)
-    inside = 0
+    band = _BAND_PX + _BAND_BLURS * s
     sectors[:] = 0.0
     for first in range(0, n, model.BLOCK):
         m = min(model.BLOCK, n - first)
@@ -128,14 +120,66 @@ def sum_sectors(
                 k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS) % RAYS
                 sectors[0, k] += J[model.RESIDUAL + i] * slope
                 sectors[1, k] += slope * slope
-            elif d < 0:
-                deep[inside] = abs(J[model.RESIDUAL + i])
-                inside += 1
-    if inside < MIN_INSIDE:
-        return 0.0
-    sigma = 1.4826 * np.median(deep[:inside])
-    deep[:inside].sort()
-    return float(deep[inside - 2] / max(sigma, noise, ROUNDING))
+
+
+@compiled
+def judge_coherence(
+    pixels: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    noise: float,
+    J: FloatArray,
+    statistics: FloatArray,
+) -> None:
+    """Set the largest sums of residuals that lie together, inside and anywhere, in robust standard deviations.
+
+    They lie in a square of two blurs at least, rounded up to whole px: a photograph shows nothing smaller. Half
+    of it or more is in the fit.
+    """
+    statistics[INSIDE], statistics[TOGETHER] = 0.0, 0.0
+    if n == 0:
+        return
+    band, side = _BAND_PX + _BAND_BLURS * theta[model.BLUR], max(2, round(2 * theta[model.BLUR]))
+    left, top = int(pixels[0, :n].min()), int(pixels[1, :n].min())
+    right, bottom = int(pixels[0, :n].max()), int(pixels[1, :n].max())
+    # sums of residuals, of weights and of pixels that are not deep inside over all rows and columns before
+    sums, size = np.zeros((3, bottom - top + 2, right - left + 2)), np.empty(n)
+    for first in range(0, n, model.BLOCK):
+        m = min(model.BLOCK, n - first)
+        model.linearise(pixels, first, m, theta, length, saturation, J)
+        for i in range(m):
+            x, y, residual = pixels[0, first + i], pixels[1, first + i], J[model.RESIDUAL + i]
+            _, _, rho, nw = _beside_outline(theta, x, y)
+            row, column = int(y) - top + 1, int(x) - left + 1
+            sums[0, row, column] = residual
+            sums[1, row, column] = J[model.WEIGHT + i]
+            sums[2, row, column] = rho * (rho - 1) / nw > -band
+            size[first + i] = abs(residual)
+    for k in range(3):
+        for i in range(1, sums.shape[1]):
+            along = 0.0
+            for j in range(1, sums.shape[2]):
+                along += sums[k, i, j]
+                sums[k, i, j] = sums[k, i - 1, j] + along
+    inside, anywhere = 0.0, 0.0
+    for i in range(side, sums.shape[1]):
+        for j in range(side, sums.shape[2]):
+            weight = _within(sums[1], i, j, side)
+            if weight >= 0.5 * side * side:
+                together = abs(_within(sums[0], i, j, side)) / math.sqrt(weight)
+                anywhere = max(anywhere, together)
+                if together > inside and _within(sums[2], i, j, side) < 0.5:
+                    inside = together
+    sigma = max(1.4826 * np.median(size), noise, ROUNDING)
+    statistics[INSIDE], statistics[TOGETHER] = inside / sigma, anywhere / sigma
+
+
+@compiled
+def _within(sums: FloatArray, i: int, j: int, side: int) -> float:
+    """Return the sum over a square that ends before row i and column j from the sums over all before."""
+    return float(sums[i, j] - sums[i - side, j] - sums[i, j - side] + sums[i - side, j - side])
 
 
 @compiled

@@ -9,12 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.special import ndtri
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
-from sfm.targets.fits.damage import MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
+from sfm.targets.fits.damage import LEVEL, MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
 from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
 from sfm.targets.fits.outline_noise import (
     OutlineNoise,
@@ -37,8 +38,6 @@ POOR_FIT = 0.12
 ROUNDS = 3
 # So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
 SKIRT_BLURS = 1.5
-# Largest residual inside of whole targets, in robust sigmas of those there.
-MAX_INSIDE = 8.0
 # What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike
 # the others. Their scatter is that of the variance of 200 pixels at least.
 POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
@@ -174,16 +173,14 @@ def _repaired(
         h, weight, _, sound, _ = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
         skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
         damaged = find_damage(h, weight, sound, skirt)
-        inside = np.maximum(fits.statistics[:, goodness.INSIDE], 1.0)
-        deep = np.isinf(depth) & (inside > MAX_INSIDE) & _stands_out(inside, sound)
+        shallow = goodness.HALO_PX + goodness.EDGE_ENDS_BLURS * fits.theta[:, BLUR]
+        deep = np.isinf(depth) & (shallow < _radii(fits.theta)) & _has_marks(fits, goodness.INSIDE, sound)
         damaged &= judged[:, None]
         again = weight.any(axis=1) & ((damaged == keep).any(axis=1) | deep)
         if not again.any():
             break
         keep[again] = ~damaged[again]
-        depth[again & deep] = (goodness.HALO_PX + goodness.EDGE_ENDS_BLURS * fits.theta[:, BLUR])[
-            again & deep
-        ]
+        depth[again & deep] = shallow[again & deep]
         begin = fits.theta[again, : R + 1]
         repaired = fit(begin, sign[again], keep[again], depth[again])
         for whole, part in zip(fits, repaired, strict=True):
@@ -198,6 +195,7 @@ def _repaired(
     variance, contrast = _variances(fits, least_variance), np.abs(fits.theta[:, CONTRAST])
     if sound.sum() >= MIN_POPULATION:
         unlike = _stands_out(variance, sound) & _stands_out(variance / np.maximum(contrast, 1e-9) ** 2, sound)
+        unlike |= _has_marks(fits, goodness.TOGETHER, sound)
         fits.flag[unlike & judged & weight.any(axis=1)] |= Flag.POOR_FIT.value
     shift = gap_shifts(common, weight, keep)
     p, q, r = fits.theta[:, P : R + 1].T
@@ -250,6 +248,17 @@ def _deviations(
     h = np.divide(fits.sectors[:, 0], squares, out=np.zeros_like(squares), where=weight > 0)
     common = common_shape(h, weight, sound)
     return h - common, weight, common, sound, outlines
+
+
+def _has_marks(fits: EllipseFits, column: int, sound: BoolArray) -> BoolArray:
+    """Return where residuals that lie together are significant and larger than in sound targets, shape (k,).
+
+    The level is divided by the number of squares of one blur in all targets.
+    """
+    together = fits.statistics[:, column]
+    squares = (fits.statistics[:, goodness.PIXELS] / np.maximum(fits.theta[:, BLUR], 1.0) ** 2).sum()
+    limit = -ndtri(LEVEL / (2 * max(squares, 1.0)))
+    return np.asarray((together > limit) & _stands_out(np.maximum(together, 1.0), sound))
 
 
 def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
