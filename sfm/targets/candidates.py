@@ -110,7 +110,7 @@ def find_duplicates(
 ) -> tuple[BoolArray, FloatArray]:
     """Return which of the good candidates are no targets because of what is about or inside of them.
 
-    And how much farther holes are from the centres of what they are in than perspective puts them, px, (k, 2).
+    And how much farther holes are from the centres of what they are in than perspective puts them, (k, 2).
 
     Of concentric ellipses the one with a code is kept, else the smallest: a retro-reflective dot with a dark
     rim in glare is seen as bright dot and, larger, as the dark rim. What is in another candidate and not

@@ -14,10 +14,11 @@ from sfm.targets.fits import blurred_ellipse as model
 
 # Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, share
 # of strokes, halo and its sigma, saturated share of the background, share of the circumference behind which
-# glare is, and the largest sum of residuals that lie together, in robust sigmas: inside and anywhere.
-STATISTICS = 12
+# glare is, the largest sum of residuals that lie together, inside and anywhere, over the root of their number
+# (see `judge_coherence`), and the robust standard deviation of residuals.
+STATISTICS = 13
 PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS = range(5)
-STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE, TOGETHER = range(5, STATISTICS)
+STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE, TOGETHER, SPREAD = range(5, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
@@ -133,12 +134,11 @@ def judge_coherence(
     J: FloatArray,
     statistics: FloatArray,
 ) -> None:
-    """Set the largest sums of residuals that lie together, inside and anywhere, in robust standard deviations.
+    """Set the largest sums of residuals that lie together, inside and anywhere, and their robust deviation.
 
-    They lie in a square of two blurs at least, rounded up to whole px: a photograph shows nothing smaller. Half
-    of it or more is in the fit.
+    They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit.
     """
-    statistics[INSIDE], statistics[TOGETHER] = 0.0, 0.0
+    statistics[INSIDE], statistics[TOGETHER], statistics[SPREAD] = 0.0, 0.0, max(noise, ROUNDING)
     if n == 0:
         return
     band, side = _BAND_PX + _BAND_BLURS * theta[model.BLUR], max(2, round(2 * theta[model.BLUR]))
@@ -172,8 +172,8 @@ def judge_coherence(
                 anywhere = max(anywhere, together)
                 if together > inside and _within(sums[2], i, j, side) < 0.5:
                     inside = together
-    sigma = max(1.4826 * np.median(size), noise, ROUNDING)
-    statistics[INSIDE], statistics[TOGETHER] = inside / sigma, anywhere / sigma
+    statistics[INSIDE], statistics[TOGETHER] = inside, anywhere
+    statistics[SPREAD] = max(1.4826 * np.median(size), noise, ROUNDING)
 
 
 @compiled

@@ -70,10 +70,15 @@ def judge_outlines(
 ) -> OutlineNoise:
     """Return the noise of outlines.
 
+    A nick moves all harmonics of an outline alike, and its blur leaves little of the high ones. They show the
+    first one by the share that is left of them: where an outline is stranger than noise, the excess of its
+    variance is divided by that.
+
     Args:
         outlines: their harmonics.
         variance: of the intensities, shape (k,).
         sound: targets that show what is usual, shape (k,).
+        softness: blur of the edges over the radius, which leaves little of high harmonics, shape (k,).
         rise: power of the first harmonic over that of harmonics 3 to 6, see `rise_to_first`.
     """
     shape, N, effect = outlines[:3]
@@ -98,7 +103,8 @@ def judge_outlines(
 def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[FloatArray, BoolArray]:
     """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,).
 
-    What is too large for the population is not drawn to it. Few targets are drawn half way to 1.
+    What is too large for the population is not drawn to it; which that is comes second. Few targets are drawn
+    half way to 1.
 
     Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression" (2004);
     Phipson et al., "Robust hyperparameter estimation protects against hypervariable genes" (2016).
