@@ -137,11 +137,12 @@ def judge_coherence(
     """Set the largest sums of residuals that lie together, inside and anywhere, and their robust deviation.
 
     They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit.
+    Inside is what can be left out of it.
     """
     statistics[INSIDE], statistics[TOGETHER], statistics[SPREAD] = 0.0, 0.0, max(noise, ROUNDING)
     if n == 0:
         return
-    band, side = _BAND_PX + _BAND_BLURS * theta[model.BLUR], max(2, round(2 * theta[model.BLUR]))
+    deep, side = HALO_PX + EDGE_ENDS_BLURS * theta[model.BLUR], max(2, round(2 * theta[model.BLUR]))
     left, top = int(pixels[0, :n].min()), int(pixels[1, :n].min())
     right, bottom = int(pixels[0, :n].max()), int(pixels[1, :n].max())
     # sums of residuals, of weights and of pixels that are not deep inside over all rows and columns before
@@ -155,7 +156,7 @@ def judge_coherence(
             row, column = int(y) - top + 1, int(x) - left + 1
             sums[0, row, column] = residual
             sums[1, row, column] = J[model.WEIGHT + i]
-            sums[2, row, column] = rho * (rho - 1) / nw > -band
+            sums[2, row, column] = rho * (rho - 1) / nw > -deep
             size[first + i] = abs(residual)
     for k in range(3):
         for i in range(1, sums.shape[1]):
