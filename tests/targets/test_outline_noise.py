@@ -303,8 +303,6 @@ def test_a_hole_is_as_sure_as_it_is_concentric() -> None:
     )
     assert duplicate.tolist() == [True, False, False]
     np.testing.assert_allclose(off_centre, [(0, 0), (0, 0.14 - 0.02 * 2.0), (0, 0)])
-    measured, damaged, _ = measure_class("stain", ((6.0, 8),))
-    assert over_stated(measured, damaged) < 1.6
 
 
 @pytest.mark.parametrize(("radius", "rejected"), [(3.2, True), (7.0, False)])
@@ -318,7 +316,7 @@ def test_small_damaged_targets_are_rejected(radius: float, rejected: bool) -> No
     assert all(found.flag[at] & Flag.DAMAGED)
 
 
-@pytest.mark.parametrize(("depth", "flagged"), [(8.0, False), (40.0, True)])
+@pytest.mark.parametrize(("depth", "flagged"), [(2.0, False), (12.0, True)])
 def test_marks_inside_are_left_out(depth: float, flagged: bool) -> None:
     """Residuals inside that lie together, of a noise of 2 here, are 5 sigmas at most."""
     x, y = GRID[12][:2]
