@@ -17,10 +17,11 @@ from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring import surface_points, tie_points
-from sfm.survey.measuring.covering_points import _Places, _visible
+from sfm.survey.measuring.covering_points import CoveringPoints, _Places, _visible
 from sfm.survey.measuring.surface_points import Surface, cover_photographs
 from sfm.survey.measuring.tie_points import natural_points_of
 from tests.matching.test_tie_points import _scene as small_scene
+from tests.synthetic import make_network, seed_of
 
 SURVEY = """
 [survey]
@@ -144,6 +145,32 @@ def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one
     monkeypatch.setattr(surface_points, "TRIAL_RAYS", 10)
     for more, side in (("", 9), (HELD, 15)):
         assert all((one.semi_axes == side / 2).all() for one in covered(tmp_path, more).overlays)
+
+
+@pytest.mark.parametrize(
+    ("found", "side"),
+    [
+        ({21: (1000, 0.06), 15: (1750, 0.057), 11: (3000, 0.07)}, 15),  # stone
+        ({21: (220, 0.34), 15: (265, 0.36), 11: (274, 0.32)}, 21),  # a video: small windows find no more
+        ({21: (200, 0.05), 15: (1500, 0.03), 11: (7000, 0.03)}, 11),  # rough
+    ],
+)
+def test_windows_are_those_whose_rays_together_tell_the_most(
+    monkeypatch: pytest.MonkeyPatch, found: dict[int, tuple[int, float]], side: int
+) -> None:
+    """Rays and their spread on two photographs, windows four sides apart in each case."""
+
+    def trial(*_: object, window_px: int, **__: object) -> CoveringPoints:
+        rays, spread = found[window_px]
+        seen = ImagePoints(*(np.zeros((rays, *shape)) for shape in ((), (), (2,), (2, 2))))
+        return CoveringPoints(seen, np.zeros((0, 3)), np.full((rays, 2), spread), rays)
+
+    monkeypatch.setattr(surface_points, "find_covering_points", trial)
+    network, truth = make_network(seed_of("trial"), images=2, points=20)
+    photographs = [np.zeros((1024, 1536), dtype=np.uint8)] * 2
+    settings, seen = TiePointSettings(), network.image_points
+    chosen = surface_points._best_window(photographs, network, truth, seen, settings, 1)
+    assert chosen == side
 
 
 def test_rays_that_do_not_fit_tell_nothing_of_the_surface() -> None:
