@@ -144,6 +144,23 @@ class Camera:
         """Name of the cameras that share parameters with this one; its own where none does."""
         return next(filter(None, self.shared), self.name)
 
+    def reduced(self, shrink: int) -> Camera:
+        """Return the camera of the same photographs with the mean of `shrink` pixels a side in one.
+
+        What is left of whole squares at the right and the lower border is cut off.
+        """
+        width, height = (side // shrink for side in self.size_px)
+        cut = (np.array(self.size_px) - shrink * np.array([width, height])) / 2 * self.pixel_mm
+        parameters = self.parameters.copy()
+        if self.in_mm:  # from the middle of the photograph, which the cut moves
+            parameters[self.plays(Role.X0)] += cut[0]
+            parameters[self.plays(Role.Y0)] -= cut[1]
+        else:  # models in px count the principal point from the middle of the first pixel
+            parameters[self.plays(Role.FOCAL)] /= shrink
+            centre = self.plays(Role.X0, Role.Y0)
+            parameters[centre] = (parameters[centre] + 0.5) / shrink - 0.5
+        return replace(self, size_px=(width, height), pixel_mm=shrink * self.pixel_mm, parameters=parameters)
+
     def with_parameters(self, parameters: FloatArray) -> Camera:
         """Return the same camera with other parameter values, shape (n,)."""
         return replace(self, parameters=np.array(parameters, dtype=float))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numba import njit
@@ -34,6 +36,17 @@ def residual(camera: Camera, p: np.ndarray, xy: np.ndarray, uv: np.ndarray) -> t
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     MODELS[camera.model].function(camera.frame, p, xy[0], xy[1], uv[0], uv[1], r, Ju, Jp)
     return r, Ju, Jp[:, : len(p)]
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("shrink", [2, 3])
+def test_a_reduced_camera_sees_the_same_in_larger_pixels(model: str, shrink: int) -> None:
+    camera = replace(lens(model), size_px=(SIZE_PX[0] - 1, SIZE_PX[1] - 1))  # a rest is cut off
+    small = camera.reduced(shrink)
+    assert small.size_px == tuple(side // shrink for side in camera.size_px)
+    uv = seed_of(model).uniform(-0.2, 0.2, (20, 2))
+    expected = (pixel_from_tangents(camera, uv) + 0.5) / shrink - 0.5
+    assert pixel_from_tangents(small, uv) == pytest.approx(expected, abs=1e-7)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -85,6 +85,15 @@ def full_scale(photograph: AnyArray) -> float:
     return FULL_SCALE_16 if np.asarray(photograph).dtype == np.uint16 else FULL_SCALE_8
 
 
+def averaged(photograph: AnyArray, shrink: int) -> AnyArray:
+    """Return a photograph whose pixels are means of so many along each side; a rest at the border is cut."""
+    if shrink == 1:
+        return photograph
+    height, width = (side // shrink for side in photograph.shape[:2])
+    whole = photograph[: height * shrink, : width * shrink]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+
+
 def odd_window(what: str, side_px: int) -> int:
     """Return the side of a window that has a pixel in its middle.
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.matching.radiometry import grey_of_8_bit
+from sfm.matching.radiometry import averaged, grey_of_8_bit
 
 TILE_PX = 128  # side of the squares whose spectra are averaged
 LOBE = 2  # frequencies on either side into which the window of a tile spreads each one
@@ -61,15 +61,6 @@ def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
         left, right = (smooth, right) if more > 0.0 else (left, smooth)
     shrink = max(round(sigma / SHARP_PX), 1)
     return EquallyBlurred(averaged(left, shrink), averaged(right, shrink), shrink)
-
-
-def averaged(photograph: AnyArray, shrink: int) -> AnyArray:
-    """Return a photograph whose pixels are means of so many along each side; a rest at the border is cut."""
-    if shrink == 1:
-        return photograph
-    height, width = (side // shrink for side in photograph.shape[:2])
-    whole = photograph[: height * shrink, : width * shrink]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def difference_of_blur(left: AnyArray, right: AnyArray) -> float:

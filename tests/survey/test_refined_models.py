@@ -26,6 +26,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
 from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
+from sfm.survey.refining.windows import Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -412,6 +413,45 @@ def test_points_of_windows_that_overlap_are_intersected_and_not_adjusted(tmp_pat
     anew = np.flatnonzero(found.points_anew & ~found.points)
     near = np.linalg.norm(found.estimate.points[anew] - _scene()[1].points[anew % n], axis=1)
     assert len(anew) > 100 and np.median(near) < 1e-3
+
+
+def _blur(folder: Path) -> None:
+    """Blur the photographs of a model by 2 px, and add noise of 2."""
+    rng = np.random.default_rng(1)
+    for path in sorted(folder.glob("[ab]/*.png")):
+        sharp = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float)
+        seen = cv2.GaussianBlur(sharp, (0, 0), 2.0) + rng.normal(0, 2, sharp.shape)
+        cv2.imwrite(str(path), seen.clip(0, 255).astype(np.uint8))
+
+
+def test_blurred_photographs_are_measured_reduced(tmp_path: Path) -> None:
+    _model(tmp_path)
+    _blur(tmp_path)
+    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    assert found.window_px == 30 and found.refined > 0.9 * found.key_points
+    off = np.linalg.norm(found.estimate.points - _scene()[1].points, axis=1)
+    assert np.median(off[found.points_anew]) < 3e-3
+
+
+def test_points_not_found_in_fine_pixels_are_looked_for_in_coarser_ones(tmp_path: Path) -> None:
+    _model(tmp_path)
+    _blur(tmp_path)
+    network, estimate = read_model(tmp_path / "model")
+    seen = network.image_points
+    rays = np.bincount(seen.point, minlength=len(network.points))
+    rows = np.flatnonzero((rays >= 3)[seen.point])
+    reference = np.where(rays >= 3, np.unique(seen.point, return_index=True)[1], -1)
+    windows = Windows(np.full((len(seen), 2), np.nan), seen.covariance, np.zeros(len(seen), dtype=np.int64))
+    known = seen.point < 20
+    windows.xy[known] = seen.xy[known]
+    found = match_reduced(
+        tmp_path, network, estimate, windows, rows, reference,
+        size=Size(15), limits=Limits(3.0, 0.7), tolerance_px=3.0,
+    )  # fmt: skip
+    again = rows[~known[rows]]
+    assert np.isfinite(found.xy[again]).all(axis=1).mean() > 0.9
+    assert np.abs(found.xy[again] - seen.xy[again])[np.isfinite(found.xy[again])].max() < 3.0
+    assert (found.xy[known] == seen.xy[known]).all()
 
 
 def test_matches_of_a_point_with_too_few_of_them_contradict_nothing(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from sfm.conventions import AnyArray, BoolArray
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.radiometry import Grey
+from sfm.matching.radiometry import Grey, averaged, grey_of
 from sfm.network import Estimate, Network
 from sfm.photographs.reading import read_photograph
 
@@ -21,11 +21,19 @@ class Photographs:
     """The photographs of a model, read when they are needed; the oldest are forgotten."""
 
     def __init__(
-        self, network: Network, estimate: Estimate, folder: Path, *, memory_bytes: int = MEMORY_BYTES
+        self,
+        network: Network,
+        estimate: Estimate,
+        folder: Path,
+        *,
+        shrink: int = 1,
+        memory_bytes: int = MEMORY_BYTES,
     ) -> None:
+        """Begin with none; `shrink` pixels along each side of a photograph become one."""
         self._paths = photograph_paths(network, estimate, folder)
         self._names = network.images
         self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
+        self.shrink = shrink
         self._kept = GreyPhotographs(self._read, memory_bytes=memory_bytes)
 
     def grey(self, i: int) -> Grey:
@@ -33,7 +41,7 @@ class Photographs:
         return self._kept[i]
 
     def _read(self, i: int) -> AnyArray:
-        return read_of_size(self._paths[i], self._names[i], self._sizes[i])
+        return averaged(grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i])), self.shrink)
 
 
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:

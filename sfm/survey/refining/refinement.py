@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import WINDOWS_PX
+from sfm.matching.lsm.coverage import ALIKE, WINDOWS_PX
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network
@@ -34,7 +34,17 @@ from sfm.survey.refining.oriented_windows import (
     words_of_reasons,
 )
 from sfm.survey.refining.targets import ModelTargets
-from sfm.survey.refining.windows import MIN_RAYS, Limits, Windows, best_window, match_windows
+from sfm.survey.refining.windows import (
+    MIN_RAYS,
+    REDUCED_ALIKE,
+    SHRINKS,
+    Limits,
+    Size,
+    Windows,
+    best_size,
+    match_reduced,
+    match_windows,
+)
 
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
@@ -212,39 +222,60 @@ def refine_model(
             f"black, {len(seen) - black - beyond} of points that fewer than {MIN_RAYS} photographs see"
             + (f", {beyond} {BEYOND}" if beyond else "")
         )
-    photographs = Photographs(network, estimate, images_dir)
     limits = Limits(max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread), min_correlation)
 
-    def measured(orientation: Estimate, side_px: int) -> Oriented:
-        windows = match_windows(
-            photographs,
+    def reasons(windows: Windows) -> list[tuple[str, int]]:
+        few = len(seen) - len(rows) - int(masked.sum()) - beyond
+        return [*reasons_of(windows, rows, few=few, masked=int(masked.sum())), (BEYOND, beyond)]
+
+    def best(orientation: Estimate, sizes: list[Size], spread_px: float, alike: float) -> Size:
+        return best_size(
+            images_dir,
             network,
             orientation,
             rows,
             reference,
-            window_px=side_px,
+            sizes,
+            alike=alike,
+            limits=limits,
+            tolerance_px=TOLERANCE_FACTOR * spread_px,
+        )
+
+    def measured(orientation: Estimate, size: Size) -> Oriented:
+        windows = match_windows(
+            Photographs(network, estimate, images_dir, shrink=size.shrink),
+            network,
+            orientation,
+            rows,
+            reference,
+            window_px=size.window_px,
             limits=limits,
             progress=progress,
         )
         progress.stage("adjustment")
-        few = len(seen) - len(rows) - int(masked.sum()) - beyond
-        lost = [*reasons_of(windows, rows, few=few, masked=int(masked.sum())), (BEYOND, beyond)]
-        return orient(network, orientation, windows, side_px, targets, lost)
+        return orient(network, orientation, windows, size.side_px, targets, reasons(windows))
 
-    oriented = measured(estimate, WINDOWS_PX[0] if window_px is None else window_px)
+    side_px = WINDOWS_PX[0] if window_px is None else window_px
+    size = best(estimate, [Size(side_px, shrink) for shrink in SHRINKS], spread, REDUCED_ALIKE)
+    oriented = measured(estimate, size)
     if window_px is None:
-        best = best_window(
-            photographs,
-            network,
-            oriented.whole,
-            rows,
-            reference,
-            limits=limits,
-            tolerance_px=TOLERANCE_FACTOR * oriented.spread_px,
-        )
-        if best != oriented.window_px:
-            oriented = measured(oriented.whole, best)
-    windows, anew = oriented.windows, oriented.network
+        sizes = [Size(side, size.shrink) for side in WINDOWS_PX]
+        chosen = best(oriented.whole, sizes, oriented.spread_px, ALIKE)
+        if chosen != size:
+            size, oriented = chosen, measured(oriented.whole, chosen)
+    anew, tolerance_px = oriented.network, TOLERANCE_FACTOR * oriented.spread_px
+    progress.stage("matching in reduced photographs")
+    windows = match_reduced(
+        images_dir,
+        network,
+        oriented.whole,
+        oriented.windows,
+        rows,
+        reference,
+        size=size,
+        limits=limits,
+        tolerance_px=tolerance_px,
+    )
     part, start, images, points = part_of(anew, oriented.solved, oriented.accepted, oriented.rays)
     final, remarks = adjust_finally(
         part,
@@ -259,12 +290,10 @@ def refine_model(
         (oriented.accepted & images[anew.image_points.image] & points[anew.image_points.point])[:k]
     ]
     points = points[: len(network.points)]
-    whole, further = whole_model(
-        network, estimate, final.estimate, windows, images, points, TOLERANCE_FACTOR * oriented.spread_px
-    )
+    whole, further = whole_model(network, estimate, final.estimate, windows, images, points, tolerance_px)
     taken = np.zeros(len(seen), dtype=bool)
     taken[adjusted], taken[further] = ~final.rejected[: len(adjusted)], True
-    rejected = ~taken & (_off_px(network, whole, windows) > TOLERANCE_FACTOR * oriented.spread_px)
+    rejected = ~taken & (_off_px(network, whole, windows) > tolerance_px)
     rejected[adjusted] = final.rejected[: len(adjusted)]
     left = int((np.isfinite(windows.xy).all(axis=1) & ~taken & ~rejected).sum())
     return Refinement(
@@ -281,7 +310,7 @@ def refine_model(
         images,
         points,
         np.asarray(residuals),
-        by_count([*oriented.lost, ("contradict the others", int(rejected.sum())), (UNSUPPORTED, left)]),
+        by_count([*reasons(windows), ("contradict the others", int(rejected.sum())), (UNSUPPORTED, left)]),
         targets,
         remarks if targets is None else (*targets.remarks, *remarks),
     )

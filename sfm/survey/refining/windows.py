@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
-from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.matching.lsm.coverage import ALIKE, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -20,7 +22,23 @@ from sfm.survey.refining.model_photographs import Photographs
 
 TRIAL_PHOTOGRAPHS = 3  # whose points choose the window
 MIN_RAYS = 3  # of a point that is measured
+SHRINKS = (1, 2, 4)  # pixels of a photograph along a side of one, of photographs that are reduced
+# Ratio of precisions up to which finer pixels are taken: over large windows surfaces are not plane, which
+# shifts the matches of all photographs alike, and no residual shows it.
+REDUCED_ALIKE = 1.5
 TRIAL_RAYS = 100  # with fewer the window stays as it is
+
+
+class Size(NamedTuple):
+    """Of windows: pixels of the photographs, which may be reduced."""
+
+    window_px: int  # odd side, in pixels of the reduced photographs
+    shrink: int = 1  # pixels of a photograph along a side of one of these
+
+    @property
+    def side_px(self) -> int:
+        """Side in px of the model."""
+        return self.window_px * self.shrink
 
 
 class Limits(NamedTuple):
@@ -54,16 +72,17 @@ def match_windows(
 
     The window is seen in perspective on the plane through the points around it. In the reference it is moved
     to a whole pixel, which needs no resampling. Half of the noise of a match is that of the template and goes
-    to the reference.
+    to the reference. All is matched in the pixels of the photographs, which may be reduced, and returned in
+    px of the model.
 
     Args:
-        photographs: of the model.
+        photographs: of the model, reduced or not.
         network: the model.
         estimate: its solution.
         rows: image points to measure, (k,).
         reference: the row of each point that is its template, -1 for points that are not measured, (n,).
-        window_px: odd side of the windows.
-        limits: what is a match no more.
+        window_px: odd side of the windows, in pixels of the photographs.
+        limits: what is a match no more, in pixels of the photographs.
         progress: told of reference photographs.
 
     Raises:
@@ -71,6 +90,8 @@ def match_windows(
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
+    shrink = photographs.shrink
+    network, estimate = _reduced(network, estimate, shrink)
     seen, camera = network.image_points, network.camera
     xy, covariance = np.full((len(seen), 2), np.nan), np.full((len(seen), 2, 2), np.nan)
     flag = np.zeros(len(seen), dtype=np.int64)
@@ -111,55 +132,129 @@ def match_windows(
     some = np.flatnonzero(number)
     xy[reference[some]] = place[reference[some]]
     covariance[reference[some]] = at_template[some] / number[some, None, None]
-    return Windows(xy, covariance, flag)
+    return Windows(shrink * (xy + 0.5) - 0.5, shrink**2 * covariance, flag)
 
 
-def best_window(
-    photographs: Photographs,
+def _reduced(network: Network, estimate: Estimate, shrink: int) -> tuple[Network, Estimate]:
+    """Return a model in the pixels of photographs that are reduced."""
+    seen = network.image_points
+    small = replace(seen, xy=(seen.xy + 0.5) / shrink - 0.5, covariance=seen.covariance / shrink**2)
+    cameras = tuple(camera.reduced(shrink) for camera in estimate.cameras)
+    return replace(network, image_points=small), replace(estimate, cameras=cameras)
+
+
+def best_size(
+    folder: Path,
     network: Network,
     estimate: Estimate,
     rows: IntArray,
     reference: IntArray,
+    sizes: Sequence[Size],
     *,
+    alike: float = ALIKE,
     limits: Limits,
     tolerance_px: float,
-) -> int:
-    """Return the side of the windows with which the same pixels are the most precise, px.
+) -> Size:
+    """Return the windows that tell the most together.
 
-    A few photographs whose orientation is known to less than the matches tell.
+    By the spread of the rays that meet over the root of their number, of windows that do not overlap: where
+    small windows are too small to be found, there are few. A few photographs tell.
 
     Args:
-        photographs: of the model.
+        folder: of the photographs.
         network: the model.
-        estimate: adjusted with windows of one size.
+        estimate: its solution.
         rows: image points that can be measured, (k,).
         reference: as in `match_windows`.
+        sizes: that are tried.
+        alike: ratio of precisions up to which the first size is taken in place of the best.
         limits: likewise.
         tolerance_px: largest residual of a ray that counts.
     """
-    template = network.image_points.image[reference[network.image_points.point[rows]]]
+    seen = network.image_points
+    template = seen.image[reference[seen.point[rows]]]
     most = np.argsort(-np.bincount(template, minlength=len(network.images)), kind="stable")
     some = rows[np.isin(template, most[:TRIAL_PHOTOGRAPHS])]
-    costs: list[tuple[int, float]] = []
-    for window in WINDOWS_PX:
+    costs = []
+    for size in sizes:
+        photographs = Photographs(network, estimate, folder, shrink=size.shrink)
         found = match_windows(
-            photographs, network, estimate, some, reference, window_px=window, limits=limits
+            photographs, network, estimate, some, reference, window_px=size.window_px, limits=limits
         )
-        v = _residuals(network, estimate, found, tolerance_px)
-        if len(v) >= TRIAL_RAYS:
-            costs.append((window, window * MAD_TO_SIGMA * float(np.median(np.abs(v)))))
-    return largest_alike(costs) if costs else WINDOWS_PX[0]
+        used, v = _meeting(network, estimate, found, tolerance_px)
+        apart = points_apart(replace(seen, xy=found.xy), used, size.side_px, n_points=len(network.points))
+        number = int((used & apart[seen.point]).sum())
+        enough = len(v) >= TRIAL_RAYS
+        costs.append(MAD_TO_SIGMA * float(np.median(np.abs(v))) / np.sqrt(number) if enough else np.inf)
+    return sizes[int(np.argmax(np.array(costs) <= alike * min(costs)))]
 
 
-def _residuals(network: Network, estimate: Estimate, windows: Windows, tolerance_px: float) -> FloatArray:
-    """Return the residuals of the rays that meet in their points, tangents, (k, 2)."""
+def match_reduced(
+    folder: Path,
+    network: Network,
+    estimate: Estimate,
+    windows: Windows,
+    rows: IntArray,
+    reference: IntArray,
+    *,
+    size: Size,
+    limits: Limits,
+    tolerance_px: float,
+) -> Windows:
+    """Measure the points that are not found in all of their photographs again, in reduced photographs.
+
+    Where a photograph is blurred or its noise is smoothed, as telephones do, single pixels have no texture,
+    and matching diverges. Each point takes the finest pixels in which most of its rays meet.
+
+    Args:
+        folder: of the photographs.
+        network: the model.
+        estimate: adjusted with what was measured so far.
+        windows: this.
+        rows: image points to measure, (k,).
+        reference: as in `match_windows`.
+        size: of the windows so far; the coarser ones have as many pixels.
+        limits: likewise.
+        tolerance_px: largest residual of a ray that counts.
+    """
+    seen, n = network.image_points, len(network.points)
+    xy, covariance, flag = windows.xy.copy(), windows.covariance.copy(), windows.flag.copy()
+    asked = np.bincount(seen.point[rows], minlength=n)
+    rays = np.bincount(seen.point[_meeting(network, estimate, windows, tolerance_px)[0]], minlength=n)
+    for shrink in [coarser for coarser in SHRINKS if coarser > size.shrink]:
+        some = rows[(rays < asked)[seen.point[rows]]]
+        if not len(some):
+            break
+        photographs = Photographs(network, estimate, folder, shrink=shrink)
+        found = match_windows(
+            photographs, network, estimate, some, reference, window_px=size.window_px, limits=limits
+        )
+        used, _ = _meeting(network, estimate, found, tolerance_px)
+        now = np.bincount(seen.point[used], minlength=n)
+        taken = np.flatnonzero((now > rays)[seen.point])
+        xy[taken], covariance[taken], flag[taken] = (
+            found.xy[taken],
+            found.covariance[taken],
+            found.flag[taken],
+        )
+        rays = np.maximum(rays, now)
+    return Windows(xy, covariance, flag)
+
+
+def _meeting(
+    network: Network, estimate: Estimate, windows: Windows, tolerance_px: float
+) -> tuple[BoolArray, FloatArray]:
+    """Return which rays meet in their points, (k,), and the residuals of these, tangents, (r, 2)."""
     seen = network.image_points
     good = np.isfinite(windows.xy).all(axis=1)
     rays = ImagePoints(seen.image[good], seen.point[good], windows.xy[good], windows.covariance[good])
     met = intersect_image_points(
         rays, network.camera, estimate, n_points=len(network.points), tolerance_px=tolerance_px
     )
-    return met.residuals[met.used & (met.rays >= MIN_RAYS)[rays.point]]
+    meet = met.used & (met.rays >= MIN_RAYS)[rays.point]
+    used = np.zeros(len(seen), dtype=bool)
+    used[np.flatnonzero(good)[meet]] = True
+    return used, met.residuals[meet]
 
 
 def _planes(
