@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.planning.stations import looking
@@ -193,7 +193,8 @@ def two_objects(rng: np.random.Generator) -> Scene:
     """Photographs of two objects in one folder."""
     first, second = around(rng, 5), around(rng, 4, x=60.0)
     planes = [*corner_of_walls(rng), *corner_of_walls(rng, 60.0)]
-    scene = Scene(planes, *(np.concatenate(both) for both in zip(first, second, strict=True)))
+    position, rotation = (np.concatenate(both) for both in zip(first, second, strict=True))
+    scene = Scene(planes, position, rotation)
     scene.objects = np.repeat([0, 1], [5, 4])
     return scene
 
@@ -257,7 +258,7 @@ def _photograph(scene: Scene, i: int) -> FloatArray:
         @ scene.rotation[i].T
     )
     P = np.array([[c, 0, -w / 2], [0, -c, -h / 2], [0, 0, -1.0]]) @ scene.rotation[i].T
-    grey = np.full((h, w), 40.0, np.float32)
+    grey = np.full((h, w), 40.0)
     for one in scene.in_photograph.get(i, scene.planes):
         tall, wide = one.texture.shape
         place = np.column_stack([one.right / wide, -one.up / tall, one.corner + one.up - scene.position[i]])
@@ -267,10 +268,11 @@ def _photograph(scene: Scene, i: int) -> FloatArray:
             continue  # behind the camera
         value, there = _warped(one.texture, H, (w, h))
         grey = np.where(there, value, grey)
-    return np.asarray(scene.finish(i, cv2.resize(grey, SIZE_PX, interpolation=cv2.INTER_AREA)))
+    reduced = np.asarray(cv2.resize(grey, SIZE_PX, interpolation=cv2.INTER_AREA), dtype=float)
+    return scene.finish(i, reduced)
 
 
-def _warped(texture: FloatArray, H: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def _warped(texture: FloatArray, H: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, BoolArray]:
     """Return a texture seen through a homography, before the camera only, and where it is."""
     w, h = size
     y, x = np.mgrid[0:h, 0:w].astype(np.float32) + 0.5
@@ -281,8 +283,8 @@ def _warped(texture: FloatArray, H: FloatArray, size: tuple[int, int]) -> tuple[
     tall, wide = texture.shape
     there = (depth > 0.05) & (u > 0) & (u < wide - 1) & (v > 0) & (v < tall - 1)
     step = np.abs(np.gradient(u, axis=1)) + np.abs(np.gradient(v, axis=0))  # texture pixels for one
-    value = np.zeros((h, w), np.float32)
-    smooth = texture.astype(np.float32)
+    value = np.zeros((h, w))
+    smooth = np.asarray(texture, dtype=float)
     for level in range(4):
         scale = 2**level
         rows = (step / 2 < scale) | (level == 3)
@@ -292,7 +294,9 @@ def _warped(texture: FloatArray, H: FloatArray, size: tuple[int, int]) -> tuple[
             cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
         value = np.where(rows, seen, value)
-        smooth = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        smooth = np.asarray(
+            cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=float
+        )
     return value, there
 
 
