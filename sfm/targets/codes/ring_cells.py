@@ -22,16 +22,18 @@ INTERPOLATION = 1 / 6
 # The position of the cells is judged by the residuals of the samples and by how far the levels of the cells
 # are from being two: their sigmas in units of the step to the dot.
 _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
-# Every edge of what is printed lies outwards by the spread of the ink, every edge of a light mark by that of
-# the light, and as far inwards where light eats into it; in radii of the dot as it is measured. Ink of 0.4 mm
-# around a dot of 6 mm is 0.12.
-MAX_SPREAD = 0.14
-# What the spread and the blur of the cells' ends over that of the dot are before the ring is looked at: 0 and
-# 1 with these standard deviations, the second of its logarithm.
-_SPREAD_SIGMA, _BLUR_SIGMA = 0.05, 0.25
-# First steps of the search for the place of the first cell (in cells), spread and ln blur; halvings of them,
-# each where no step is an improvement; rounds at most.
-_STEP_PLACE, _STEP_SPREAD, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.15, 4, 16
+# Every edge of what is printed lies outwards by the spread of the ink, in radii of the dot as it is measured.
+# Ink of 0.4 mm around a dot of 6 mm is 0.12. Every edge of a light mark lies outwards by that of the light,
+# in px: in an oblique ring that is more of its short radii. Both are negative where light eats into marks.
+MAX_SPREAD, MAX_GLOW_PX, MAX_GLOW = 0.14, 1.5, 0.25  # the last in short semi-axes
+# What the spreads and the blur of the cells' ends over that of the dot are before the ring is looked at: 0
+# and 1 with these standard deviations, the last of its logarithm.
+_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.5, 0.25
+# First steps of the search for the place of the first cell (in cells), spread, glow and ln blur; halvings of
+# them, each where no step is an improvement; rounds at most.
+_STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.3, 0.15, 4, 24
+_FIRST_STEPS = (_STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR)
+_SIGMAS = np.array([_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA])
 # Least jump from clear to set, in steps to the dot, of a ring that is worth the search.
 _WORTH = 0.25
 # Rows of the result after the levels.
@@ -53,8 +55,8 @@ def fit_cells(
 
     Samples on ellipses similar to that of the dot are modelled as sum of the cells' levels, each blurred as
     the edge of the dot is. Of twelve places of the first cell the one is taken that explains them best by two
-    levels; then its place, a widening of the set cells along and across the ring, as ink spreads, and the
-    blur are improved.
+    levels; then its place, the widening of the set cells along and across the ring, as ink and light spread,
+    and the blur are improved.
 
     Args:
         image: intensities, shape (H, W).
@@ -79,10 +81,10 @@ def fit_cells(
     dot_part = np.empty((len(IN_RING) + 2, m))
     W, N = np.empty((m, cells)), np.empty((cells, cells))
     c, best_c = np.empty((len(IN_RING), cells)), np.empty((len(IN_RING), cells))
-    nothing = np.zeros(cells)
+    nothing = np.zeros((2, cells))
     for k in range(len(xy)):
         if not _sample(
-            image, xy[k], shape[k], levels[k], blur[k], inner, outer, samples, sigma, ring_part, dot_part
+            image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, samples, sigma, ring_part, dot_part
         ):
             continue
         least, place = math.inf, 0.0
@@ -95,27 +97,27 @@ def fit_cells(
         if least == math.inf:
             continue
         bits, step, jump = _two_levels(best_c)
-        spread, ratio = 0.0, 0.0
+        # place, spread, glow, ln of the blur over that of the dot
+        found, steps = np.array([place, 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
         if jump >= _WORTH * step and step >= _WORTH:
-            d_place, d_spread, d_ratio = _STEP_PLACE, _STEP_SPREAD, _STEP_BLUR
             halved = 0
             for _ in range(_ROUNDS):
                 before = least
-                for parameter in range(3):
+                for parameter in range(len(found)):
                     for sign in (-1.0, 1.0):
-                        tried_place = place + sign * d_place if parameter == 0 else place
-                        tried_spread = spread + sign * d_spread if parameter == 1 else spread
-                        tried_ratio = ratio + sign * d_ratio if parameter == 2 else ratio
-                        if abs(tried_spread) > MAX_SPREAD:
+                        tried = found.copy()
+                        tried[parameter] += sign * steps[parameter]
+                        if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                             continue
-                        near, far = _spread_ring(inner, outer, tried_spread)
-                        s = blur[k] * math.exp(tried_ratio)
+                        s = blur[k] * math.exp(tried[3])
+                        near, far = _spread_ring(inner, outer, tried[1])
                         if not _sample(
                             image,
                             xy[k],
-                            shape[k],
+                            _without_glow(shape[k], tried[2]),
                             levels[k],
                             s,
+                            tried[2],
                             near,
                             far,
                             samples,
@@ -124,29 +126,57 @@ def fit_cells(
                             dot_part,
                         ):
                             continue
-                        _mixture(sigma, tried_place, _shifts(bits, tried_spread, near, far), W)
+                        _mixture(sigma, tried[0], _shifts(bits, tried[1], tried[2] / s, near, far), W)
                         cost = _solve(samples, ring_part, dot_part, W, N, c)
-                        cost += _SAMPLE_SIGMA**2 * (
-                            (tried_spread / _SPREAD_SIGMA) ** 2 + (tried_ratio / _BLUR_SIGMA) ** 2
-                        )
+                        cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
                         if cost < least:
                             least = cost
-                            place, spread, ratio = tried_place, tried_spread, tried_ratio
+                            found[:] = tried
                             break
                 if least == before:
                     halved += 1
                     if halved == _HALVINGS:
                         break
-                    d_place, d_spread, d_ratio = d_place / 2, d_spread / 2, d_ratio / 2
-        near, far = _spread_ring(inner, outer, spread)
-        s = blur[k] * math.exp(ratio)
-        if not _sample(image, xy[k], shape[k], levels[k], s, near, far, samples, sigma, ring_part, dot_part):
+                    steps /= 2
+        near, far = _spread_ring(inner, outer, found[1])
+        s = blur[k] * math.exp(found[3])
+        if not _sample(
+            image,
+            xy[k],
+            _without_glow(shape[k], found[2]),
+            levels[k],
+            s,
+            found[2],
+            near,
+            far,
+            samples,
+            sigma,
+            ring_part,
+            dot_part,
+        ):
             continue
-        _mixture(sigma, place, _shifts(bits, spread, near, far), W)
+        _mixture(sigma, found[0], _shifts(bits, found[1], found[2] / s, near, far), W)
         if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
             _compare(samples, ring_part, dot_part, W, N, c, out[k])
-            out[k, SPREAD] = spread
+            out[k, SPREAD] = found[1]
     return out
+
+
+@compiled
+def _largest_glow(shape: FloatArray) -> float:
+    """Return the largest glow about a dot, px."""
+    p, q, r = shape[0], shape[1], shape[2]
+    short = 1 / ((p + r) / 2 + math.hypot((p - r) / 2, q))
+    return min(MAX_GLOW_PX, MAX_GLOW * short)
+
+
+@compiled
+def _without_glow(shape: FloatArray, glow: float) -> FloatArray:
+    """Return the (p, q, r) of a dot whose semi-axes are shorter by the glow, px: S (1 - glow S)^-1."""
+    p, q, r = shape[0], shape[1], shape[2]
+    det = (1 - glow * p) * (1 - glow * r) - (glow * q) ** 2
+    e, f, g = (1 - glow * r) / det, glow * q / det, (1 - glow * p) / det
+    return np.array([p * e + q * f, p * f + q * g, q * f + r * g])
 
 
 @compiled
@@ -156,13 +186,25 @@ def _spread_ring(inner: float, outer: float, spread: float) -> tuple[float, floa
 
 
 @compiled
-def _shifts(bits: FloatArray, spread: float, inner: float, outer: float) -> FloatArray:
-    """Return how far the beginning of each cell is turned where a set cell meets a clear one, in cells."""
+def _shifts(bits: FloatArray, spread: float, glow: float, inner: float, outer: float) -> FloatArray:
+    """Return how far the beginning of each cell is turned where a set cell meets a clear one.
+
+    Args:
+        bits: 1.0 for set cells, (cells,).
+        spread: of the ink, in radii.
+        glow: in blurs.
+        inner: radius of the ring.
+        outer: radius of the ring.
+
+    Returns:
+        By the ink, in cells, and by the glow, in blurs, (2, cells).
+    """
     cells = len(bits)
     turn = spread / ((inner + outer) / 2) / (2 * math.pi / cells)
-    out = np.empty(cells)
+    out = np.empty((2, cells))
     for a in range(cells):
-        out[a] = turn * (bits[a - 1] - bits[a])
+        out[0, a] = turn * (bits[a - 1] - bits[a])
+        out[1, a] = glow * (bits[a - 1] - bits[a])
     return out
 
 
@@ -252,6 +294,7 @@ def _sample(
     shape: FloatArray,
     levels: FloatArray,
     blur: float,
+    glow: float,
     inner: float,
     outer: float,
     samples: FloatArray,
@@ -287,9 +330,9 @@ def _sample(
                 samples[row, i] = math.nan
             else:
                 samples[row, i] = (bilinear(image, x, y) - levels[0]) / levels[1]
-            f = 1 / (steepness * s)
-            ring_part[row, i] = _phi((rho - inner) * f) - _phi((rho - outer) * f)
-            dot_part[row, i] = _phi((1 - rho) * f)
+            f, more = 1 / (steepness * s), glow / s
+            ring_part[row, i] = _phi((rho - inner) * f + more) - _phi((rho - outer) * f - more)
+            dot_part[row, i] = _phi((1 - rho) * f + more)
     return True
 
 
@@ -300,7 +343,7 @@ def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, W: FloatArray) 
     Args:
         sigma: blur of a cell's end at each sample, rad, (m,).
         phase: where the first cell begins, in cells.
-        shift: how far the beginning of each cell lies behind its nominal place, in cells, (cells,).
+        shift: how far the beginning of each cell lies behind its nominal place, see `_shifts`, (2, cells).
         W: shares, (m, cells).
     """
     m, cells = W.shape
@@ -311,8 +354,9 @@ def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, W: FloatArray) 
             away = (
                 position - a - 0.5 + cells / 2
             ) % cells - cells / 2  # from the middle of the cell, in cells
-            near = (away - 0.5 - shift[(a + 1) % cells]) * width / sigma[i]
-            far = (away + 0.5 - shift[a]) * width / sigma[i]
+            end = (a + 1) % cells
+            near = (away - 0.5 - shift[0, end]) * width / sigma[i] - shift[1, end]
+            far = (away + 0.5 - shift[0, a]) * width / sigma[i] - shift[1, a]
             W[i, a] = _phi(far) - _phi(near) if near < 4 and far > -4 else 0.0
 
 

@@ -174,6 +174,7 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
     uneven = np.minimum(np.abs(level), glare)
     uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
+    behind = behind - _frame(behind)
     clutter = np.abs(behind) > GAP_TOLERANCE * step + noise
     tests = (
         np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
@@ -190,3 +191,14 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     if not known or not all(np.all(t) for t in tests):
         return UNREADABLE, 0.0
     return int(family.number[entry]), float(min(1.0, jump[at] / step))
+
+
+def _frame(behind: FloatArray) -> FloatArray:
+    """Return what is behind each cell and the opposite one alike, (cells,): the border of a label.
+
+    It is printed about the dot, where other things cover one side. Rings of an odd number show none.
+    """
+    if len(behind) % 2:
+        return np.zeros_like(behind)
+    opposite = np.roll(behind, len(behind) // 2)
+    return np.where(behind * opposite > 0, np.sign(behind) * np.minimum(np.abs(behind), np.abs(opposite)), 0.0)
