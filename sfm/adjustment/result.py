@@ -132,8 +132,18 @@ class Adjustment:
 
     @property
     def tau(self) -> FloatArray:
-        """Pope's tau of each image coordinate: Baarda's w over sigma0 a posteriori, (k, 2)."""
-        return self.standardised / self.sigma0
+        """Pope's tau of each image coordinate: Baarda's w over their sigma0 a posteriori, (k, 2)."""
+        return self.standardised / self.image_sigma0
+
+    @property
+    def image_sigma0(self) -> float:
+        """As sigma0, of the image points by themselves: what others are stated to be says nothing of them."""
+        used, r = ~self.rejected, float(np.nansum(self.redundancy_numbers))
+        if not r > 0:
+            return self.sigma0
+        v, P = self.residuals[used], np.linalg.inv(self.image_covariance[used])
+        vPv = float(self.weights[used] @ np.einsum("ka,kab,kb->k", v, P, v))
+        return self.inflation * float(np.sqrt(vPv / r))
 
     @property
     def image_covariance(self) -> FloatArray:

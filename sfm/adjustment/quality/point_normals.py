@@ -17,7 +17,7 @@ from sfm.network import Estimate, rows_of
 
 @dataclass(frozen=True)
 class PointNormals:
-    """Contribution of each image point to the normal equations of its object point, over sigma0^2."""
+    """Contribution of each image point to the normal equations of its object point, over their sigma0^2."""
 
     N: FloatArray  # (k, 3, 3)
     b: FloatArray  # A'Pv, (k, 3)
@@ -74,7 +74,7 @@ def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, Flo
     )
     X, every = adjustment.estimate.points[j], np.arange(len(rows))
     for _ in range(MAX_STEPS):
-        parts = point_normals(own)
+        parts = point_normals(own, adjustment.image_sigma0)
         if not np.isfinite(parts.q).all():
             return X, np.full((3, 3), np.nan), np.inf
         Q = np.linalg.pinv(parts.N.sum(axis=0))
@@ -102,8 +102,13 @@ def _residuals(own: Adjustment, X: FloatArray) -> FloatArray:
     return np.asarray(np.concatenate(computed) - seen.xy)
 
 
-def point_normals(adjustment: Adjustment) -> PointNormals:
-    """Return the normal equations of every image point, rejected ones included, (k,)."""
+def point_normals(adjustment: Adjustment, sigma0: float | None = None) -> PointNormals:
+    """Return the normal equations of every image point, rejected ones included, (k,).
+
+    Args:
+        adjustment: finished, or with some of its image points.
+        sigma0: of the image points, that of the adjustment if not given.
+    """
     network, estimate = adjustment.network, adjustment.estimate
     seen = network.image_points
     R, X = estimate.rotation[seen.image], estimate.points[seen.point] - estimate.position[seen.image]
@@ -115,7 +120,10 @@ def point_normals(adjustment: Adjustment) -> PointNormals:
     for camera, own in zip(estimate.cameras, of_camera, strict=True):
         if len(own):
             A[own] = pixel_jacobian(camera, seen.xy[own]) @ A[own]
-    P = np.linalg.inv(adjustment.image_covariance) / adjustment.sigma0**2
+    P = (
+        np.linalg.inv(adjustment.image_covariance)
+        / (adjustment.image_sigma0 if sigma0 is None else sigma0) ** 2
+    )
     v = adjustment.residuals
     AP = np.einsum("kai,kab->kib", A, P)
     return PointNormals(AP @ A, np.einsum("kib,kb->ki", AP, v), np.einsum("ka,kab,kb->k", v, P, v))

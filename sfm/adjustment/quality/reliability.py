@@ -116,7 +116,7 @@ def level_of_single(family: float, tests: int) -> float:
     return float(1 - (1 - family) ** (1 / max(tests, 1)))
 
 
-def tau_critical(alpha: float, redundancy: int) -> float:
+def tau_critical(alpha: float, redundancy: float) -> float:
     """Return the critical value of Pope's tau for a two-sided test of one observation.
 
     Args:

@@ -23,6 +23,7 @@ from sfm.adjustment.quality.gross_errors.robust import (
     residual_lengths,
     robust_scale,
     snoop,
+    sum_of_squares,
     tukey_weights,
 )
 from sfm.conventions import BoolArray, FloatArray
@@ -239,19 +240,20 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         if vague > MAX_VAGUE:
             run.remarks = (remark("snooping_not_converging", rounds=MAX_VAGUE),)
             break
-        redundancy = run.redundancy(optimum, weight)
-        if redundancy < 2:
+        if run.redundancy(optimum, weight) < 2:
             break
         v = residuals(layout.observations, optimum.state)
         Q = cofactors(optimum, layout)
+        complement = hat_complement(optimum, layout, Q, weight)
+        vPv, redundancy = sum_of_squares(layout.observations, v, complement, weight > 0)
         out, back = snoop(
             layout.observations,
             optimum.state,
             v,
-            hat_complement(optimum, layout, Q, weight),
+            complement,
             Q.limiting,
             weight > 0,
-            vPv=optimum.vPv,
+            vPv=vPv,
             redundancy=redundancy,
             alpha=alpha,
         )

@@ -47,7 +47,7 @@ def snoop(
     used: BoolArray,
     *,
     vPv: float,
-    redundancy: int,
+    redundancy: float,
     alpha: float,
 ) -> tuple[BoolArray, BoolArray]:
     """Return which image points to take out and which to take back in one round.
@@ -59,8 +59,8 @@ def snoop(
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
         limiting: cofactors of each object point with the cameras fixed, shape (n, 3, 3).
         used: image points in the adjustment, shape (k,).
-        vPv: weighted sum of squares of the adjustment.
-        redundancy: of the adjustment.
+        vPv: weighted sum of squares of the image points in the adjustment, see `sum_of_squares`.
+        redundancy: of the same.
         alpha: probability with which the test of one image coordinate rejects a good one.
     """
     w = np.abs(standardised_residuals(residuals, complement, observations.whitening)).max(axis=1)
@@ -83,6 +83,23 @@ def snoop(
     )
 
 
+def sum_of_squares(
+    observations: Observations, residuals: FloatArray, complement: FloatArray, used: BoolArray
+) -> tuple[float, float]:
+    """Return v'Pv and redundancy of the image points in an adjustment, by themselves.
+
+    Other observations, whose standard deviations are stated by a person, say nothing of their noise.
+
+    Args:
+        observations: image points.
+        residuals: v, px, (k, 2).
+        complement: whitened cofactors of the residuals, (k, 2, 2).
+        used: image points in the adjustment, (k,).
+    """
+    v = np.einsum("kab,kb->ka", whitening_matrix(observations.whitening[used]), residuals[used])
+    return float((v**2).sum()), float(np.einsum("kaa->", complement[used]))
+
+
 def would_pass(
     observations: Observations,
     residuals: FloatArray,
@@ -90,7 +107,7 @@ def would_pass(
     used: BoolArray,
     *,
     vPv: float,
-    redundancy: int,
+    redundancy: float,
     alpha: float,
 ) -> BoolArray:
     """Return which rejected image points would clearly pass the test if each were in the adjustment, (k,).
@@ -103,8 +120,8 @@ def would_pass(
         residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
         complement: whitened cofactors of the residuals, I + H of rejected ones, shape (k, 2, 2).
         used: image points in the adjustment, shape (k,).
-        vPv: weighted sum of squares of the adjustment.
-        redundancy: of the adjustment.
+        vPv: weighted sum of squares of the image points in the adjustment, see `sum_of_squares`.
+        redundancy: of the same.
         alpha: probability with which the test of one image coordinate rejects a good one.
 
     Source: Cook and Weisberg (1982), Residuals and Influence in Regression, sec. 2.2.3.
@@ -179,7 +196,7 @@ def inflation(
     *,
     vPv: float,
     count: int,
-    redundancy: int,
+    redundancy: float,
 ) -> float:
     """Return by what to multiply sqrt(v'Pv / r) for the standard deviations of an M-estimator.
 
