@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfm.errors import OutputError
+from sfm.display import counted, listed
+from sfm.errors import OutputError, SurveyFileError
+from sfm.files.csv_tables import read_table
+from sfm.files.json_files import Content, Name, read_json
 from sfm.report.log import LOG, read_log
 
 
@@ -35,10 +39,36 @@ def read_origin(out: Path) -> Origin | None:
     return Origin(out / file, out / images)
 
 
-def refuse_other_origin(out: Path, own: Origin) -> None:
-    """Raise OutputError where a folder has the result of another survey file or of other photographs."""
+class _Summary(Content):
+    """What is read of summary.json."""
+
+    survey: Name
+
+
+def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs: bool = True) -> None:
+    """Raise OutputError where a folder has the result of another survey file or of other photographs.
+
+    A result that does not state its origin, as one that a script wrote, is another's if it has another name,
+    or none of the photographs.
+
+    Args:
+        out: the folder.
+        own: origin of what is to be written there.
+        survey: its name, where it is known.
+        photographs: whether it is of photographs.
+    """
     earlier = read_origin(out)
     if earlier is None:
+        with suppress(SurveyFileError):  # no result
+            name = read_json(out / "summary.json", _Summary, "the summary of a result").survey
+            images = read_table(out / "images.csv", ("image",), (), ignored=None).texts[0]
+            other_name = bool(survey) and name != survey
+            if other_name or (photographs and not any((own.images / one).is_file() for one in images)):
+                what = f"{counted(len(images), 'photograph')} ({listed(images)})"
+                raise OutputError(
+                    f"{out}: has the result of survey {name} with {what}, which --overwrite replaces; "
+                    "--out names another folder"
+                )
         return
     for what, there, here in (
         ("the survey", earlier.file, own.file),

@@ -247,7 +247,7 @@ def _run_survey(
     folder = _folder(survey, out)
     origin = Origin(survey_file, images or survey_file.parent)
     if not overwrite:
-        refuse_other_origin(folder, origin)
+        refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
     if from_photographs:
         find_photographs(survey, images_dir=images)  # a wrong folder is told before anything is compiled
     compile_first()

@@ -128,6 +128,25 @@ def test_a_result_of_another_survey_is_replaced_only_when_asked_for(
     refuse_other_origin(moved / "out/photos", Origin(moved / "out/photos.toml", moved / "photos"))
 
 
+def test_a_result_that_states_no_origin_is_known_by_its_name_and_photographs(tmp_path: Path) -> None:
+    """As those of a script; before, any other survey replaced them."""
+    out, images = tmp_path / "result", tmp_path / "photos"
+    out.mkdir()
+    images.mkdir()
+    own = Origin(tmp_path / "survey.toml", images)
+    (out / "summary.json").write_text('{"survey": "bridge"}', encoding="utf-8")
+    refuse_other_origin(out, own, survey="tower")  # no result
+    (out / "images.csv").write_text("image,X\na.jpg,1.0\nb.jpg,2.0\n", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"survey bridge with 2 photographs \(a.jpg, b.jpg\).*--overwrite"):
+        refuse_other_origin(out, own, survey="bridge")
+    refuse_other_origin(out, own, survey="bridge", photographs=False)  # of image points
+    (images / "b.jpg").touch()
+    for survey in ("bridge", ""):
+        refuse_other_origin(out, own, survey=survey)
+    with pytest.raises(OutputError, match="--overwrite"):
+        refuse_other_origin(out, own, survey="tower")
+
+
 def test_init_writes_only_the_file_and_replaces_none(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
