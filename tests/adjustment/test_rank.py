@@ -60,7 +60,7 @@ def test_c_and_height_of_a_flat_parallel_network_are_named() -> None:
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     assert (a.defect, a.expected_defect) == (1, 0)
     assert len(a.undetermined) == 1
-    assert a.undetermined[0].startswith("not separable: c of camera A")
+    assert a.undetermined[0].startswith("c of camera A with ")
     assert "Z0 of 4 photographs" in a.undetermined[0]
 
 

@@ -14,7 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.network import ObjectPoints
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.findings.survey_remarks import ray_remarks
 from sfm.survey.adjusting.datum_definition import datum_remarks
 from sfm.survey.diagnosis.missing_plates import missing_plates
@@ -94,10 +94,12 @@ def test_an_assumed_pitch_is_a_note_of_the_result(tmp_path: Path) -> None:
 
 
 def test_of_given_points_the_camera_shifts() -> None:
-    """Coordinates that are given do not."""
-    for sigma in (0.0, 1e-4):
-        causes = judge_alternatives(adjusted(8, sigma=sigma, other=1.01)).causes
-        assert causes and all(one.names("of") == ("cameras",) for one in causes)
+    """Coordinates that are given do not; of what is untested, those of the image points alone."""
+    for sigma, without in ((0.0, ("control",)), (1e-4, ())):
+        judged = judge_alternatives(adjusted(8, sigma=sigma, other=1.01))
+        assert judged.causes and all(one.names("of") == ("cameras",) for one in judged.causes)
+        weak = of_kind(judged.unchecked, "camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested")
+        assert weak and all(one.names("without") == without for one in weak)
 
 
 @pytest.mark.parametrize("codes", [*BOARDS, "grid"])

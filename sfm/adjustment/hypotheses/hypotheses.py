@@ -90,7 +90,8 @@ def judge_alternatives(
         return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
-    found = _judge_free(free_network(final), unit, bodies, fixed=not final.unknown_counts[2])
+    without = None if final.unknown_counts[2] else "control"
+    found = _judge_free(free_network(final), unit, bodies, without)
     if not _is_calibration(final):
         return found
     try:
@@ -107,21 +108,22 @@ def judge_alternatives(
 
 
 def _judge_free(
-    plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], *, fixed: bool
+    plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], without: str | None
 ) -> Judged:
-    """Return what the image points alone say; None if they determine no network."""
+    """Return what the image points alone say; without their network if they determine none."""
     if plain is None:
         return Judged(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
     try:
         moving = _moving_bodies(plain, bodies)
-        causes, unchecked = find_causes(plain, moving), unchecked_assumptions(plain, len(moving))
+        causes = find_causes(plain, moving)
+        unchecked = unchecked_assumptions(plain, len(moving), without)
     except np.linalg.LinAlgError:
         return Judged(unchecked=(remark("assumptions_untested"),))
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)
-    return Judged(tuple(remark_of(plain, one, unit, fixed=fixed) for one in causes), unchecked)
+    return Judged(tuple(remark_of(plain, one, unit, without) for one in causes), unchecked)
 
 
 def _is_calibration(final: Adjustment) -> bool:
@@ -154,21 +156,21 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
     return cause
 
 
-def remark_of(plain: Adjustment, cause: Cause, unit: str, *, fixed: bool = False) -> Remark:
+def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = None) -> Remark:
     """Return the remark on a cause.
 
     Args:
         plain: the adjustment without it.
         cause: the alternative that holds.
         unit: object unit.
-        fixed: whether control fixes all coordinates of the result, so that only those of `plain` shift.
+        without: what fixes all coordinates of the result, so that only those of `plain` shift.
     """
     one, found = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
     parts = one.family.parts(one, found.adjustment, found.beta, unit)
-    of = "cameras" if plain.datum == "control" else "coordinates"
-    if fixed and of == "coordinates":
-        of = "coordinates without control"
+    of = "coordinates" if without is None else f"coordinates without {without}"
+    if plain.datum == "control":
+        of = "cameras"
     return remark(one.kind, of=of, shift=found.shift, rms=found.rms, instead=instead or None, **parts)
 
 

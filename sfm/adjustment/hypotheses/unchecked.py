@@ -42,12 +42,13 @@ from sfm.similarity import without_motions
 POWER = 0.80  # with which a detectable error is found; Baarda (1968)
 
 
-def unchecked_assumptions(a: Adjustment, bodies: int = 0) -> tuple[Remark, ...]:
+def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = None) -> tuple[Remark, ...]:
     """Return which assumptions the tests hardly check, with the shift that an error may cause unnoticed.
 
     Args:
         a: adjustment of the image points alone, with its covariance.
         bodies: bodies that are tested for having moved.
+        without: what fixes all coordinates of the result, so that only those of `a` shift; None if nothing.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -73,10 +74,16 @@ def unchecked_assumptions(a: Adjustment, bodies: int = 0) -> tuple[Remark, ...]:
     return (
         *untested,
         *(
-            remark("held_weakly_tested", camera=camera, parameters=tuple(some), sigmas=max(some.values()))
+            remark(
+                "held_weakly_tested",
+                camera=camera,
+                parameters=tuple(some),
+                sigmas=max(some.values()),
+                without=without,
+            )
             for camera, some in held.items()
         ),
-        *(remark(kind, sigmas=reach) for kind, reach in found.items()),
+        *(remark(kind, sigmas=reach, without=without) for kind, reach in found.items()),
     )
 
 

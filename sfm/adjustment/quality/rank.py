@@ -158,4 +158,5 @@ def _name(vector: FloatArray, layout: Unknowns, network: Network, estimate: Esti
         f"{part} of {single[part]}" if count == 1 else f"{part} of {count} photographs"
         for part, count in others.items()
     ]
-    return "not separable: " + ", ".join(parts)
+    first, *rest = parts
+    return f"{first} with {', '.join(rest)}" if rest else first

@@ -107,6 +107,13 @@ ROWS = (
         ),
     ),
     Kind(
+        "camera_not_determined",
+        "error",
+        "The photographs do not determine camera {camera}, whose calibration is the result.",
+        "photographs from the front, whose distance takes up an error of c, or too few of them",
+        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+    ),
+    Kind(
         "margin_not_calibrated",
         NOT_CALIBRATED,
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "

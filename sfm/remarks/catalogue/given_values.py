@@ -183,21 +183,21 @@ ROWS = (
     Kind(
         "given_unchecked",
         "note",
-        "Of {of:@}, nothing checks {given:@}.",
+        "Nothing checks {given:@} among {of:@}.",
         "as many given values as the datum needs",
         "Add control or scale bars.",
     ),
     Kind(
         "given_partly_checked",
         "note",
-        "Of {of:@}, an error of {given:@} is found in some directions only.",
+        "An error of {given:@} among {of:@} is found in some directions only.",
         "hardly more given values than the datum needs",
         "Add control or scale bars.",
     ),
     Kind(
         "given_weakly_checked",
         "note",
-        "Of {of:@}, an error of {given:@} may stay unnoticed and shift the result by up to {sigmas} of its "
+        "An error of {given:@} among {of:@} may stay unnoticed and shift the result by up to {sigmas} of its "
         "standard deviations.",
         "few control points or bars, all on one side, or one far more precise than the others",
         "Add control or scale bars.",

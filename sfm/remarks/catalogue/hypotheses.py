@@ -155,8 +155,8 @@ ROWS = (
     Kind(
         "camera_weakly_tested",
         "note",
-        "The camera may change during the survey and shift coordinates by up to {sigmas} standard deviations "
-        "before a test shows it.",
+        "The camera may change and shift coordinates[[ of the network without "
+        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
         "few photographs, or all from about the same directions",
         "Take more photographs from more directions, some of them rolled by 90 degrees.",
     ),
@@ -180,16 +180,16 @@ ROWS = (
     Kind(
         "shape_weakly_tested",
         "note",
-        "The object may deform during the survey and shift coordinates by up to {sigmas} standard deviations "
-        "before a test shows it.",
+        "The object may deform and shift coordinates[[ of the network without "
+        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
         "few photographs, or few that show the same points before and after",
         "Photograph the whole object twice, one round after the other.",
     ),
     Kind(
         "held_weakly_tested",
         "note",
-        "Held values of {parameters} of camera {camera} may be wrong and shift coordinates by up to {sigmas} "
-        "standard deviations before a test shows it.",
+        "Held {parameters} of camera {camera} may be wrong and shift coordinates[[ of the network "
+        "without {without:@}]] by up to {sigmas} standard deviations before a test shows it.",
         "the exterior orientation of the photographs takes up what the parameters do",
         "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
     ),

@@ -10,7 +10,7 @@ ROWS = (
         Grade("share", error=0.5),  # half of them or more: the rest may be the wrong half
         "{missing} of {total} photographs {missing:is|are} not in the result.",
         "damaged files, too few common points, or start values that do not fit",
-        "See the reason of each below.",
+        "The report states the reason of each.",
     ),
     Kind(
         "not_connected",
@@ -81,7 +81,8 @@ ROWS = (
         "plate_not_recognised",
         "note",
         "In {photographs:photograph} {dots:dot} {dots:does|do} not fit the plate of {size}: {photographs}.",
-        "rows, columns or marks are not those of the plate; its marks are hidden; a part of it without marks",
+        "rows, columns or marks are not those of the plate; its marks are hidden or blurred; or a part "
+        "of it without marks",
         "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
         explains=("photograph_with_few_points",),
     ),

@@ -31,7 +31,10 @@ def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ..
     sigma, found = result.adjustment.sigma0_px, list[Remark]()
     for one in calibrated:
         rms = one.projection_rms_px
-        times = rms / sigma if sigma > 0 and np.isfinite(rms) else None
+        if np.isinf(rms):
+            found.append(remark("camera_not_determined", camera=one.name))
+            continue
+        times = rms / sigma if sigma > 0 else None
         weak = remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times)
         if remark("camera_not_calibrated", rms=one.observed_rms_px, times=times).severity == "note":
             numbers = {**weak.numbers, "observed": Quantity(one.observed)}
