@@ -188,8 +188,8 @@ ROWS = (
     Kind(
         "held_weakly_tested",
         "note",
-        "Held {parameters} of camera {camera} may be wrong and shift coordinates[[ of the network "
-        "without {without:@}]] by up to {sigmas} standard deviations before a test shows it.",
+        "Wrong held {parameters} of camera {camera} may shift coordinates[[ of the network without "
+        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
         "the exterior orientation of the photographs takes up what the parameters do",
         "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
     ),

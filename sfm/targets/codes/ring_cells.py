@@ -167,7 +167,7 @@ def _largest_glow(shape: FloatArray) -> float:
     """Return the largest glow about a dot, px."""
     p, q, r = shape[0], shape[1], shape[2]
     short = 1 / ((p + r) / 2 + math.hypot((p - r) / 2, q))
-    return min(MAX_GLOW_PX, MAX_GLOW * short)
+    return float(min(MAX_GLOW_PX, MAX_GLOW * short))
 
 
 @compiled

@@ -97,7 +97,8 @@ def sum_of_squares(
         used: image points in the adjustment, (k,).
     """
     v = np.einsum("kab,kb->ka", whitening_matrix(observations.whitening[used]), residuals[used])
-    return float((v**2).sum()), float(np.einsum("kaa->", complement[used]))
+    of_each = np.einsum("kaa->k", complement[used])  # between 0 and 2, but for what rounding leaves of it
+    return float((v**2).sum()), float(np.clip(of_each, 0.0, 2.0).sum())
 
 
 def would_pass(
