@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,11 +18,11 @@ from sfm.targets.candidates import (
     find_parts_of_codes,
     judge_fits,
 )
-from sfm.targets.codes.boards import find_crossings
+from sfm.targets.codes.boards import find_boards
 from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
-from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup
+from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup, plates_of
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
@@ -143,25 +144,26 @@ def find_targets(
         )
     if not isinstance(codes, str | CodeFamily | TagFamily | ConcentricFamily | PlateFamily | PlateGroup):
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
-    if isinstance(codes, PlateGroup):
-        return _joined(
-            [
-                find_targets(
-                    photograph,
-                    polarity=polarity,
-                    codes=plate,
-                    centres=centres,
-                    min_diameter_px=min_diameter_px,
-                    max_diameter_px=max_diameter_px,
-                )
-                for plate in codes.plates
-            ]
-        )
-    family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
-    if isinstance(family, PlateFamily) and family.name in BOARDS:
-        found, number = find_crossings(photograph, family, scale=scale, noise=noise)
-        return _of_crossings(found, family.first_point + number)
+    boards = [plate for plate in plates_of(codes) if plate.name in BOARDS]
+    found = find_boards(photograph, boards, scale=scale, noise=noise) if boards else []
+    parts = [
+        _of_crossings(saddles, plate.first_point + number)
+        for plate, (saddles, number) in zip(boards, found, strict=True)
+    ]
+    if isinstance(codes, PlateGroup):
+        find_dots = partial(
+            find_targets,
+            photograph,
+            polarity=polarity,
+            centres=centres,
+            min_diameter_px=min_diameter_px,
+            max_diameter_px=max_diameter_px,
+        )
+        return _joined([*parts, *(find_dots(codes=one) for one in codes.plates if one not in boards)])
+    if parts:
+        return parts[0]
+    family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     grey = as_grey(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)

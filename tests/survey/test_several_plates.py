@@ -25,6 +25,7 @@ from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import plate_bars
 from sfm.survey.told_settings import told_settings
+from sfm.targets.codes import boards
 from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.detect import find_targets
 from tests.plates import GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
@@ -175,13 +176,18 @@ def test_two_plates_in_one_folder_are_both_drafted(
     assert size == {(one.name, one.rows, one.columns, one.first_tag) for one in (first, second)}
 
 
-def test_points_are_numbered_on_and_found_in_one_photograph() -> None:
+def test_points_are_numbered_on_and_found_in_one_photograph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tags of all plates are read once."""
+    read = []
+    reading = boards.read_april_tags
+    monkeypatch.setattr(boards, "read_april_tags", lambda *what: read.append(1) or reading(*what))
     scene, truth = side_by_side(APRIL, OTHER), camera()
     rng = seed_of("numbered on")
     position, rotation = stations(rng, 1, APRIL)
     at = 1.9 * position[0] + [20.0, 40.0, 0.0]
     picture, _ = render_photograph(scene, truth, at, rotation[0], optics=Optics(noise=0.01), rng=rng)
     found = find_targets(picture, codes=group_plates([APRIL, OTHER]))
+    assert len(read) == 1
     assert found.code.min() == 0 and found.code.max() == APRIL.count + OTHER.count - 1
     xyz = np.vstack([APRIL.plane(PITCH), OTHER.plane(PITCH) @ TURN.T + PLACE])
     assert np.abs(found.xy - project(truth, at, rotation[0], xyz)[found.code]).max() < 0.3

@@ -30,33 +30,45 @@ OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.
 def find_crossings(
     photograph: AnyArray, plate: PlateFamily, *, scale: float, noise: float
 ) -> tuple[Saddles, IntArray]:
-    """Find, name and measure the crossings of a board in a photograph.
+    """Find, name and measure the crossings of a board in a photograph; see `find_boards`."""
+    return find_boards(photograph, (plate,), scale=scale, noise=noise)[0]
+
+
+def find_boards(
+    photograph: AnyArray, plates: Sequence[PlateFamily], *, scale: float, noise: float
+) -> list[tuple[Saddles, IntArray]]:
+    """Find, name and measure the crossings of boards in a photograph; tags of several are read once.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
-        plate: the board.
+        plates: the boards.
         scale: largest intensity that the photograph can hold.
         noise: standard deviation of an intensity.
 
     Returns:
-        The crossings, and which point of the plate each is.
+        The crossings of each, and which point of the plate each is.
 
     Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for place and name; measured by
     `measure_saddles`.
     """
     grey = as_bytes(photograph, scale)
-    if plate.name == "aprilgrid":
-        xy, code = name_corners(*read_april_tags(grey, plate.dictionary), plate)
-        half = windows_beside(xy, plate)
-    elif plate.name == "charuco":
-        xy, code = _charuco(grey, plate)
-        half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
-    else:
-        xy, code = _checkerboard(grey, plate)
-        half = MAX_HALF_SPACINGS * _spacing(xy)
-    saddles = measure_saddles(photograph, xy, half, noise=noise)
-    good = np.isfinite(saddles.xy[:, 0])
-    return saddles.select(good), code[good]
+    grids = {plate.dictionary for plate in plates if plate.name == "aprilgrid"}
+    tags = {dictionary: read_april_tags(grey, dictionary) for dictionary in grids}
+    found = []
+    for plate in plates:
+        if plate.name == "aprilgrid":
+            xy, code = name_corners(*tags[plate.dictionary], plate)
+            half = windows_beside(xy, plate)
+        elif plate.name == "charuco":
+            xy, code = _charuco(grey, plate)
+            half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
+        else:
+            xy, code = _checkerboard(grey, plate)
+            half = MAX_HALF_SPACINGS * _spacing(xy)
+        saddles = measure_saddles(photograph, xy, half, noise=noise)
+        good = np.isfinite(saddles.xy[:, 0])
+        found.append((saddles.select(good), code[good]))
+    return found
 
 
 def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
