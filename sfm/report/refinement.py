@@ -105,6 +105,12 @@ def _units(found: Refinement) -> dict[str, str]:
     return {name: "" if unit == "1" else f" [{unit}]" for name, unit in pairs}
 
 
+def _common_px(a: Adjustment) -> str:
+    """Return the standard deviation of what neighbouring image points err together, px."""
+    found = a.error_correlation
+    return "none" if found is None else significant(found.sigmas_px(a.sigma0_px)[1])
+
+
 def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[str, ...]]:
     """Return rows of what the page compares: name, before, adjusted here, after."""
     both = (found.readjusted, found.adjustment)
@@ -115,6 +121,7 @@ def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[str, ..
             *(general(one.rms_px, 4) for one in both),
         ),
         ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
+        ("Errors that neighbours have in common [px]", "", *map(_common_px, both)),
     ]
     for name, of, factor in (
         (f"Projection centre: median standard deviation [{unit}]", _centre_sigmas, 1.0),

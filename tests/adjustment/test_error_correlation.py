@@ -14,6 +14,11 @@ from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
+from sfm.report.numbers import significant
+from sfm.report.phrases import words_of_neighbours
+from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.inputs.settings import TiePointSettings
+from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
 SIGMA_PX = 0.1
@@ -124,3 +129,21 @@ def test_independent_errors_have_little_in_common(scene: tuple[Network, Estimate
         found = estimate_error_correlation(a)
         if found is not None:
             assert sigma_of_centres(with_error_correlation(a, found)) < 1.25 * sigma_of_centres(a)
+
+
+def test_surveys_of_texture_have_common_errors_in_their_covariance(scene: tuple[Network, Estimate]) -> None:
+    """And in the words and figures of their results; targets are measured each by itself."""
+    network, truth = scene
+    seen = network.image_points
+    moved = seen.xy + in_common(network, 0.3, 400.0, seed_of("texture"))
+    network = replace(network, image_points=replace(seen, xy=moved))
+    survey = survey_of(network, truth)
+    matched = Correspondences(network, truth, np.full(len(network.points), 3))
+    of_targets = solve_survey(survey, matched).adjustment
+    textured = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).adjustment
+    assert of_targets.error_correlation is None and words_of_neighbours(of_targets) == ""
+    assert textured.error_correlation is not None
+    assert sigma_of_centres(textured) > 1.5 * sigma_of_centres(of_targets)
+    alone, common = textured.error_correlation.sigmas_px(textured.sigma0_px)
+    assert alone == pytest.approx(SIGMA_PX * np.sqrt(0.7), rel=0.2)
+    assert f"{significant(common)} px in common" in words_of_neighbours(textured)

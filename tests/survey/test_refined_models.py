@@ -18,6 +18,8 @@ from adapters.colmap.model_files import MODELS
 from adapters.colmap.reconstruction import colmap_parameters
 from adapters.colmap.refined_model import open_model
 from datasets.textured import render
+from sfm.adjustment.quality import error_correlation
+from sfm.adjustment.result import ErrorCorrelation
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
 from sfm.conventions import AnyArray, FloatArray
@@ -314,6 +316,18 @@ def test_an_rms_that_is_hardly_lower_is_told_unless_it_is_that_of_windows(tmp_pa
     assert not found.remarks and not again.remarks
     bent = replace(again, adjustment=replace(found.adjustment, sigma0=20.0))
     assert bent.remarks[0].kind == "refinement_hardly_better"
+
+
+def test_key_points_that_are_neighbours_err_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before and after, so that the standard deviations of both can be compared."""
+    _model(tmp_path)
+    correlation = ErrorCorrelation(alone=0.5, common=0.5, length_px=100.0)
+    monkeypatch.setattr(error_correlation, "estimate_error_correlation", lambda _: correlation)
+    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    for one in (found.readjusted, found.adjustment):
+        assert one.error_correlation == correlation
+        independent = one.cofactors.exterior * one.sigma0**2
+        assert np.trace(one.covariance.exterior.sum(axis=0)) > 1.05 * np.trace(independent.sum(axis=0))
 
 
 def test_a_photograph_that_cannot_be_read_is_named_with_its_folder(tmp_path: Path) -> None:

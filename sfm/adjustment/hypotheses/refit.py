@@ -23,6 +23,7 @@ from sfm.similarity import fit_similarity
 
 ROUNDS = 6
 HALVINGS = 4  # of a step: linear in what a large error makes of the image points, it may go too far
+MAX_ITERATIONS = 15  # of an adjustment that starts next to its optimum; half of those that converge need 3
 SETTLED = 0.01  # gain of v'Pv over the variance factor at which the rounds end
 
 
@@ -96,6 +97,7 @@ def _stepped(
                 reject="tau",
                 alpha=plain.test_alpha,
                 rejected=start.rejected,
+                max_iterations=MAX_ITERATIONS,
             )
         except GeometryError:
             found = None

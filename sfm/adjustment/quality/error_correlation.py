@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
-from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.covariance import marginal_of, with_error_correlation
 from sfm.adjustment.engine.linearised import linearise
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -73,6 +73,12 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
         return None
     (of_each, of_neighbours), length_px = best
     return ErrorCorrelation(float(of_each), float(of_neighbours), float(length_px))
+
+
+def with_neighbours(adjustment: Adjustment) -> Adjustment:
+    """Return the adjustment with the covariance of errors that neighbours have in common by the residuals."""
+    found = estimate_error_correlation(adjustment)
+    return adjustment if found is None else with_error_correlation(adjustment, found)
 
 
 def _cells(image: IntArray, xy: FloatArray, used: BoolArray, side_px: float) -> csr_matrix:

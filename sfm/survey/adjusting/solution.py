@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation
+from sfm.adjustment.quality.error_correlation import with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -125,8 +124,10 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     """
     start = _prepared(survey, matched)
     solved = _solved(start, _plates(survey, matched.naming, matched.network))
-    final = solved.final if survey.tie_points is None else _with_neighbours(solved.final)
-    settled, whole = solved.settled, start.whole
+    final, settled, whole = solved.final, solved.settled, start.whole
+    if survey.tie_points is not None:
+        report_step("estimating the errors that neighbours have in common")
+        final = with_neighbours(final)
     left_out = left_out_points(
         whole,
         final.network.points,
@@ -161,13 +162,6 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         solved.given.tests,
         solved.others,
     )
-
-
-def _with_neighbours(final: Adjustment) -> Adjustment:
-    """Return the adjustment with the covariance that neighbouring windows have, which err together."""
-    report_step("estimating the errors that neighbours have in common")
-    correlation = estimate_error_correlation(final)
-    return final if correlation is None else with_error_correlation(final, correlation)
 
 
 def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:

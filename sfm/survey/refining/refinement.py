@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.error_correlation import with_neighbours
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
@@ -208,7 +209,7 @@ def refine_model(
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     progress.stage("adjustment as it came")
     first, start, _, _ = part_of(network, estimate, usable, np.full(len(network.points), MIN_RAYS))
-    readjusted = adjust(first, start, datum=Datum("free"), reject="none")
+    readjusted = with_neighbours(adjust(first, start, datum=Datum("free"), reject="none"))
     masked = np.zeros(len(seen), dtype=bool)
     if masks_dir is not None:
         masked = outside_masks(network, estimate, masks_dir)
@@ -285,6 +286,7 @@ def refine_model(
         unit="" if targets is None else targets.unit,
     )
     refuse_undetermined(part, final, oriented.lost)
+    final = with_neighbours(final)
     k = len(oriented.rows)
     adjusted = oriented.rows[
         (oriented.accepted & images[anew.image_points.image] & points[anew.image_points.point])[:k]
