@@ -240,12 +240,15 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         if vague > MAX_VAGUE:
             run.remarks = (remark("snooping_not_converging", rounds=MAX_VAGUE),)
             break
-        if run.redundancy(optimum, weight) < 2:
+        vPv, redundancy = optimum.vPv, float(run.redundancy(optimum, weight))
+        if redundancy < 2:
             break
         v = residuals(layout.observations, optimum.state)
         Q = cofactors(optimum, layout)
         complement = hat_complement(optimum, layout, Q, weight)
-        vPv, redundancy = sum_of_squares(layout.observations, v, complement, weight > 0)
+        if run.problem.weighted.count:
+            vPv, own = sum_of_squares(layout.observations, v, complement, weight > 0)
+            redundancy = min(max(own, 1.0), redundancy)
         out, back = snoop(
             layout.observations,
             optimum.state,
