@@ -28,7 +28,7 @@ _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
 MAX_SPREAD, MAX_GLOW_PX, MAX_GLOW = 0.14, 1.5, 0.25  # the last in short semi-axes
 # What the spreads and the blur of the cells' ends over that of the dot are before the ring is looked at: 0
 # and 1 with these standard deviations, the last of its logarithm.
-_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.5, 0.25
+_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25
 # First steps of the search for the place of the first cell (in cells), spread, glow and ln blur; halvings of
 # them, each where no step is an improvement; rounds at most.
 _STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.3, 0.15, 4, 24

@@ -201,5 +201,5 @@ def _frame(behind: FloatArray) -> FloatArray:
     if len(behind) % 2:
         return np.zeros_like(behind)
     opposite = np.roll(behind, len(behind) // 2)
-    least = np.minimum(np.abs(behind), np.abs(opposite))
-    return np.where(behind * opposite > 0, np.sign(behind) * least, 0.0)
+    alike = np.minimum(np.abs(behind), np.abs(opposite))
+    return np.where(behind * opposite > 0, np.sign(behind) * alike, 0.0)

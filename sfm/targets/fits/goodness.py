@@ -136,13 +136,14 @@ def judge_coherence(
 ) -> None:
     """Set the largest sums of residuals that lie together, inside and anywhere, and their robust deviation.
 
-    They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit.
-    Inside is what can be left out of it.
+    They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit,
+    and not so far outside that neighbours begin. Inside is what can be left out of the fit.
     """
     statistics[INSIDE], statistics[TOGETHER], statistics[SPREAD] = 0.0, 0.0, max(noise, ROUNDING)
     if n == 0:
         return
-    deep, side = HALO_PX + EDGE_ENDS_BLURS * theta[model.BLUR], max(2, round(2 * theta[model.BLUR]))
+    band, deep = _BAND_PX + _BAND_BLURS * theta[model.BLUR], HALO_PX + EDGE_ENDS_BLURS * theta[model.BLUR]
+    side = max(2, round(2 * theta[model.BLUR]))
     left, top = int(pixels[0, :n].min()), int(pixels[1, :n].min())
     right, bottom = int(pixels[0, :n].max()), int(pixels[1, :n].max())
     # sums of residuals, of weights and of pixels that are not deep inside over all rows and columns before
@@ -153,11 +154,12 @@ def judge_coherence(
         for i in range(m):
             x, y, residual = pixels[0, first + i], pixels[1, first + i], J[model.RESIDUAL + i]
             _, _, rho, nw = _beside_outline(theta, x, y)
-            row, column = int(y) - top + 1, int(x) - left + 1
-            sums[0, row, column] = residual
-            sums[1, row, column] = J[model.WEIGHT + i]
-            sums[2, row, column] = rho * (rho - 1) / nw > -deep
+            d, row, column = rho * (rho - 1) / nw, int(y) - top + 1, int(x) - left + 1
             size[first + i] = abs(residual)
+            if d < band:
+                sums[0, row, column] = residual
+                sums[1, row, column] = J[model.WEIGHT + i]
+                sums[2, row, column] = d > -deep
     for k in range(3):
         for i in range(1, sums.shape[1]):
             along = 0.0

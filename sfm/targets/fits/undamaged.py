@@ -43,9 +43,9 @@ SKIRT_BLURS = 1.5
 POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
 MIN_CURVATURE_BLURS = 2.0
-# Largest mean residual that it leaves in a square of two blurs of such edges, over the contrast, of ellipses
-# as oblique and as soft as targets may be.
-MISFIT = 0.035
+# Mean residual that it leaves in a square of two blurs, over the contrast, at most: for each blur over that
+# curvature and each part of 1 that the short axis is shorter than the long one. It is exact for circles.
+MISFIT = 0.045
 # Smaller targets have too few pixels to tell damage from another shape.
 MIN_RADIUS_PX = 4.0
 # Sizes are apart where no targets lie within this of the logarithm: 15 % of the radius.
@@ -178,7 +178,7 @@ def _repaired(
         damaged = find_damage(h, weight, sound, skirt)
         shallow = goodness.HALO_PX + goodness.EDGE_ENDS_BLURS * fits.theta[:, BLUR]
         deep = np.isinf(depth) & (shallow < _radii(fits.theta))
-        deep &= _has_marks(fits, goodness.INSIDE, sound, judged)
+        deep &= _has_marks(fits, goodness.INSIDE, sound)
         damaged &= judged[:, None]
         again = weight.any(axis=1) & ((damaged == keep).any(axis=1) | deep)
         if not again.any():
@@ -199,7 +199,7 @@ def _repaired(
     variance, contrast = _variances(fits, least_variance), np.abs(fits.theta[:, CONTRAST])
     if sound.sum() >= MIN_POPULATION:
         unlike = _stands_out(variance, sound) & _stands_out(variance / np.maximum(contrast, 1e-9) ** 2, sound)
-        unlike = (unlike & judged) | _has_marks(fits, goodness.TOGETHER, sound, judged)
+        unlike = (unlike & judged) | _has_marks(fits, goodness.TOGETHER, sound)
         fits.flag[unlike & weight.any(axis=1)] |= Flag.POOR_FIT.value
     shift = gap_shifts(common, weight, keep)
     p, q, r = fits.theta[:, P : R + 1].T
@@ -254,22 +254,29 @@ def _deviations(
     return h - common, weight, common, sound, outlines
 
 
-def _has_marks(fits: EllipseFits, column: int, sound: BoolArray, judged: BoolArray) -> BoolArray:
+def _has_marks(fits: EllipseFits, column: int, sound: BoolArray) -> BoolArray:
     """Return where residuals that lie together are significant and larger than in sound targets, shape (k,).
 
-    The level is divided by the number of squares of one blur in all targets. What the model lacks at edges
-    that are too curved is no mark. The usual spread is that of most targets: damage makes its own larger,
-    compression here and there smaller.
+    The level is divided by the number of squares of one blur in all targets. What the model lacks is no mark.
+    The usual spread is that of most targets: damage makes its own larger, compression here and there smaller.
     """
     blur, contrast = np.maximum(fits.theta[:, BLUR], 1.0), np.maximum(np.abs(fits.theta[:, CONTRAST]), 1e-9)
     spread = fits.statistics[:, goodness.SPREAD]
     if sound.sum() >= MIN_POPULATION:
         spread = np.maximum(np.median(spread[sound] / contrast[sound]) * contrast, goodness.ROUNDING)
-    lacking = np.where(judged, 0.0, MISFIT * contrast * 2 * blur)
+    lacking = _model_misfit(fits.theta) * contrast * 2 * blur
     marks = np.maximum((fits.statistics[:, column] - lacking) / spread, 1.0)
     squares = (fits.statistics[:, goodness.PIXELS] / blur**2).sum()
     limit = -ndtri(LEVEL / (2 * max(squares, 1.0)))
     return np.asarray((marks > limit) & _stands_out(marks, sound))
+
+
+def _model_misfit(theta: FloatArray) -> FloatArray:
+    """Return the largest mean residual of whole ellipses in a square of two blurs, in contrasts, (k,)."""
+    p, q, r = theta[:, P : R + 1].T
+    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
+    flattened = 2 * half / np.maximum(mean + half, 1e-12)
+    return np.asarray(MISFIT * flattened * theta[:, BLUR] / np.maximum(_least_curvature(theta), 1e-12))
 
 
 def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
