@@ -11,8 +11,9 @@ import pytest
 from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.codes import ring_reading
 from sfm.targets.codes.families import code_family
-from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.rings import CodeFamily, smallest_rotation
 from sfm.targets.detect import find_targets
 
 SUPER = 3
@@ -223,6 +224,44 @@ def test_ink_and_light_that_spread_are_read(spread_mm: float) -> None:
 def test_dots_with_a_hole_are_read_from_a_sharpened_photograph() -> None:
     right, wrong = count_read("necklace12", 64, 8, -0.2, hole=0.25, sharpening=1.5)
     assert right >= 60 and wrong == 0
+
+
+def oblique_ring(bits: str, glow_px: float) -> AnyArray:
+    """Return a bright ring seen at 70 degrees in a square border, all edges outwards by so many px."""
+    cells = 4  # per px
+    y, x = (np.mgrid[: cells * 170, : cells * 110] + 0.5) / cells - 0.5
+    a, b = (x - 55.2) / 6.0, (y - 84.7) / 18.0
+    rho, at = np.hypot(a, b), (np.arctan2(b, a) % (2 * np.pi)) / (2 * np.pi) * len(bits)
+    set_cell = np.array([bit == "1" for bit in bits])[at.astype(int) % len(bits)]
+    side = np.maximum(np.abs(a), np.abs(b))
+    white = (rho < 1) | ((rho > 2) & (rho < 3) & set_cell) | ((side > 3.25) & (side < 4))
+    reach = 2 * round(cells * glow_px) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    fine = cv2.dilate(white.astype(np.float32), disc)
+    soft = cv2.resize(cv2.GaussianBlur(fine, (0, 0), 0.6 * cells), (110, 170), interpolation=cv2.INTER_AREA)
+    noise = np.random.default_rng(9).normal(0, 2, soft.shape)
+    return np.rint(70 + 160 * soft + noise).clip(0, 255).astype(np.uint8)
+
+
+def number_of(bits: str) -> int:
+    """Return the number of a ring of the family of all necklaces of 12 cells."""
+    family = code_family("necklace12")
+    assert isinstance(family, CodeFamily)
+    value = smallest_rotation(np.array([int(bits, 2)]), len(bits))[0]
+    return int(family.number[np.searchsorted(family.pattern, value)])
+
+
+def test_light_that_spreads_about_oblique_rings_is_no_ink() -> None:
+    """In px it is alike in all directions; a border behind the ring is about the whole of it."""
+    for bits in ("110000110000", "101001101001", "110111110000"):
+        found = find_targets(oblique_ring(bits, 0.8), polarity="bright", codes="necklace12")
+        assert [int(code) for code in found.code if code >= 0] == [number_of(bits)]
+
+
+def test_what_is_behind_one_side_of_a_ring_is_no_border() -> None:
+    behind = np.array([0.8, 0.0, 0.9, 0.7, -0.2, 0.1])
+    np.testing.assert_allclose(ring_reading._frame(behind), [0.7, 0.0, 0.1, 0.7, 0.0, 0.1])
+    np.testing.assert_allclose(ring_reading._frame(behind[:5]), 0.0)
 
 
 @pytest.mark.slow
