@@ -144,10 +144,11 @@ def _fit_tag(
         corners_px = _corners(theta, modules) * scale + middle
         if np.abs(corners_px - quad).max() > FARTHEST_PX:
             return Flag.NO_CONVERGENCE.value
-        light = _describe_light(theta, P, residual, used, noise, black)
+        seen = _see_modules(theta, P, black)
+        light = _estimate_light(seen, residual, used)
     assert light is not None
     row = fits.theta[i]
-    if light.evidence < MIN_EVIDENCE:
+    if _evidence_of_code(seen, residual, noise) < MIN_EVIDENCE:
         return Flag.POOR_FIT.value
     row[:, :2] = corners_px
     row[:, BACKGROUND], row[:, CONTRAST], row[:, BLUR] = theta[_B], theta[_A], theta[_S] * scale
@@ -173,8 +174,6 @@ class _Light:
     """covariances of the light at pixels with that at modules, (n, q)"""
     weights: FloatArray
     """what takes residuals summed over `pixels` to the coefficients of the most probable field, (q, q)"""
-    evidence: float
-    """logarithm of the likelihood of the code in this light over that of clutter"""
 
     def without(self, values: FloatArray) -> FloatArray:
         """Return values at pixels, (n,) or (n, k), without the most probable light in them."""
@@ -290,13 +289,41 @@ def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
     return uv, w, along, sigma * np.sqrt(rest)[:, None]
 
 
-def _describe_light(
-    theta: FloatArray, P: FloatArray, residual: FloatArray, used: BoolArray, noise: float, black: BoolArray
-) -> _Light:
-    """Return the light on a tag, given by its values in the middle of modules and of the clear ones around.
+@dataclass(frozen=True)
+class _Modules:
+    """Modules of a tag and the clear ones around it that pixels see, q of them."""
 
-    The residuals are those of a fit of the tag, light in them.
-    """
+    uv: FloatArray
+    """where the pixels are, modules, (n, 2)"""
+    share: FloatArray
+    """share of each module in each pixel, (n, q)"""
+    weight: FloatArray
+    """sum of its squares, (q,)"""
+    place: FloatArray
+    """middle of each module, modules, (q, 2)"""
+    printed: BoolArray
+    """which are black, (q,)"""
+    judged: BoolArray
+    """which are modules of the tag, (q,)"""
+    background: float
+    step: float
+
+    @property
+    def level(self) -> FloatArray:
+        """Intensities of the modules in even light, (q,)."""
+        return np.asarray(self.background + self.step * self.printed, dtype=float)
+
+    def covariance(self, at: FloatArray, level_at: FloatArray) -> FloatArray:
+        """Return covariances of the light at places, (k, 2), of intensities, (k,), with that at modules."""
+        shade = LIGHT_SIGMA**2 * np.outer(level_at, self.level)
+        return np.asarray(
+            (shade + (GLARE_SIGMA * max(abs(self.step), np.finfo(float).eps)) ** 2)
+            * np.exp(-_distances(at, self.place) / LIGHT_MODULES)
+        )
+
+
+def _see_modules(theta: FloatArray, P: FloatArray, black: BoolArray) -> _Modules:
+    """Return the modules of a tag that scaled pixels see."""
     m = len(black)
     uv, _, along, rest = _in_modules(theta, P)
     shares = np.zeros((len(P), m + 2, m + 2))
@@ -308,42 +335,55 @@ def _describe_light(
     weight_of_module = (share**2).sum(axis=0)
     seen = weight_of_module > MIN_SEEN * np.median(weight_of_module)
     seen[[0, m + 1, -m - 2, -1]] = False
-    share = share[:, seen]
-    modules = share / weight_of_module[seen]
-    printed, judged = np.pad(black, 1), np.pad(np.ones_like(black), 1).ravel()[seen]
-    place = np.asarray(np.argwhere(np.ones_like(printed))[seen, ::-1] - 0.5, dtype=float)
-    level_px = np.asarray(theta[_B] + theta[_A] * share[:, printed.ravel()[seen]].sum(axis=1), dtype=float)
-    printed, step = printed.ravel()[seen], max(abs(theta[_A]), np.finfo(float).eps)
-    level = np.asarray(theta[_B] + theta[_A] * printed, dtype=float)
+    return _Modules(
+        uv,
+        share[:, seen],
+        weight_of_module[seen],
+        np.asarray(np.argwhere(np.ones((m + 2, m + 2)))[seen, ::-1] - 0.5, dtype=float),
+        np.pad(black, 1).ravel()[seen],
+        np.pad(np.ones_like(black), 1).ravel()[seen],
+        float(theta[_B]),
+        float(theta[_A]),
+    )
 
-    def covariance(at: FloatArray, level_at: FloatArray) -> FloatArray:
-        shade = LIGHT_SIGMA**2 * np.outer(level_at, level)
-        return np.asarray(
-            (shade + (GLARE_SIGMA * step) ** 2) * np.exp(-_distances(at, place) / LIGHT_MODULES)
-        )
 
-    K = covariance(place, level)
-    pixels = covariance(uv, level_px) * used[:, None]
+def _estimate_light(seen: _Modules, residual: FloatArray, used: BoolArray) -> _Light:
+    """Return the light on a tag, given by its values in the middle of modules and of the clear ones around.
+
+    The residuals are those of a fit of the tag, light in them.
+    """
+    level_px = seen.background + seen.step * seen.share[:, seen.printed].sum(axis=1)
+    K = seen.covariance(seen.place, seen.level)
+    pixels = seen.covariance(seen.uv, level_px) * used[:, None]
     seen_by, N = pixels.T @ residual, pixels.T @ pixels
     likeliest = math.inf
     for strength in STRENGTHS:
-        R = (PIXEL_SIGMA * step / strength) ** 2 * K
+        R = (PIXEL_SIGMA * max(abs(seen.step), np.finfo(float).eps) / strength) ** 2 * K
         inverse = np.linalg.inv(N + R)
         left = float(residual @ residual - seen_by @ inverse @ seen_by)
-        unlikely = len(P) * math.log(left) + np.linalg.slogdet(N + R)[1] - np.linalg.slogdet(R)[1]
+        unlikely = len(residual) * math.log(left) + np.linalg.slogdet(N + R)[1] - np.linalg.slogdet(R)[1]
         if unlikely < likeliest:
             likeliest, weights = unlikely, inverse
-    mixed, unseen = modules.T @ share, noise**2 * modules.T @ modules
-    unseen += (PRINT_SIGMA * step) ** 2 * np.eye(len(K))
-    clutter = (CLUTTER_SIGMA * step) ** 2 * np.exp(-_distances(place, place) / CLUTTER_MODULES)
-    off, middle = modules.T @ residual, theta[_B] + theta[_A] / 2
-    in_light = mixed @ K @ mixed.T + unseen
-    evidence = _ln_likelihood(off, in_light, judged) - _ln_likelihood(
-        off + mixed @ (level - middle), mixed @ clutter @ mixed.T + unseen, judged
+    return _Light(pixels, weights)
+
+
+def _evidence_of_code(seen: _Modules, residual: FloatArray, noise: float) -> float:
+    """Return the logarithm of the likelihood of the code in uneven light over that of clutter.
+
+    The residuals are those of a fit of the tag, light in them. A code with a module that is likelier in the
+    other colour has none, -inf.
+    """
+    modules, judged, step = seen.share / seen.weight, seen.judged, max(abs(seen.step), np.finfo(float).eps)
+    mixed, unseen = modules.T @ seen.share, noise**2 * modules.T @ modules
+    unseen += (PRINT_SIGMA * step) ** 2 * np.eye(len(seen.place))
+    clutter = (CLUTTER_SIGMA * step) ** 2 * np.exp(-_distances(seen.place, seen.place) / CLUTTER_MODULES)
+    off, middle = modules.T @ residual, seen.background + seen.step / 2
+    in_light = mixed @ seen.covariance(seen.place, seen.level) @ mixed.T + unseen
+    if _has_wrong_module(off, mixed * np.where(seen.printed, -seen.step, seen.step), in_light, judged):
+        return -math.inf
+    return _ln_likelihood(off, in_light, judged) - _ln_likelihood(
+        off + mixed @ (seen.level - middle), mixed @ clutter @ mixed.T + unseen, judged
     )
-    if _has_wrong_module(off, mixed * np.where(printed, -theta[_A], theta[_A]), in_light, judged):
-        evidence = -math.inf
-    return _Light(pixels, weights, evidence)
 
 
 def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
