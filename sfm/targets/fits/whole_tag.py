@@ -79,7 +79,8 @@ def fit_whole_tags(
     Also given is the standard deviation of an intensity, against which modules are judged.
     The four corners of a tag share background, step, blur and noise. Gains and sharpening are 0.
 
-    Source: Gauss-Markov model with Levenberg-Marquardt steps; covariance of the corners by propagation.
+    Source: Gauss-Markov model with Levenberg-Marquardt steps; covariance of the corners by propagation, wider
+    where modules scatter more than their pixels say.
     """
     k = len(quads)
     fits = CornerFits(
@@ -155,6 +156,7 @@ def _fit_tag(
     variance = float(residual @ light.without(residual)) / max(int(used.sum()) - len(theta), 1)
     cofactor = np.linalg.pinv(J.T @ light.without(J), hermitian=True)
     fits.noise[i] = math.sqrt(variance)
+    scatter, shown = _scatter_of_modules(seen, J, light.without(residual)), []
     for j, place in enumerate(_square(modules)):
         D = np.zeros((5, len(theta)))
         at = np.append(_corners(theta, modules)[j], 1.0)
@@ -162,7 +164,10 @@ def _fit_tag(
         D[2, _B], D[3, _A], D[4, _S] = 1.0, 1.0, scale
         columns = np.array([X0, Y0, BACKGROUND, CONTRAST, BLUR])
         fits.covariance[i, j] = 0.0
-        fits.covariance[i, j][np.ix_(columns, columns)] = variance * D @ cofactor @ D.T
+        stated, effect = variance * D @ cofactor @ D.T, D[:2] @ cofactor
+        shown.append(np.trace(np.linalg.solve(stated[:2, :2], effect @ scatter @ effect.T)) / 2)
+        fits.covariance[i, j][np.ix_(columns, columns)] = stated
+    fits.covariance[i] *= max(float(np.mean(shown)), 1.0)
     return 0 if used.all() else Flag.SATURATED.value
 
 
@@ -178,6 +183,18 @@ class _Light:
     def without(self, values: FloatArray) -> FloatArray:
         """Return values at pixels, (n,) or (n, k), without the most probable light in them."""
         return np.asarray(values - self.pixels @ (self.weights @ (self.pixels.T @ values)))
+
+
+def _scatter_of_modules(seen: _Modules, J: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the scatter over modules of what each contributes to the right-hand side, (11, 11).
+
+    Where a shadow ends in it, the pixels of a module err together. As many parts as unknowns are lost.
+
+    Source: Liang and Zeger (1986), Biometrika 73(1), covariance of estimates from clusters.
+    """
+    parts = np.zeros((len(seen.place), J.shape[1]))
+    np.add.at(parts, seen.share.argmax(axis=1), J * residual[:, None])
+    return np.asarray(parts.T @ parts * len(parts) / (len(parts) - J.shape[1]))
 
 
 def _iterate(
@@ -363,7 +380,7 @@ def _estimate_light(seen: _Modules, residual: FloatArray, used: BoolArray) -> _L
         left = float(residual @ residual - seen_by @ inverse @ seen_by)
         unlikely = len(residual) * math.log(left) + np.linalg.slogdet(N + R)[1] - np.linalg.slogdet(R)[1]
         if unlikely < likeliest:
-            likeliest, weights = unlikely, inverse
+            likeliest, weights = unlikely, np.asarray(inverse, dtype=float)
     return _Light(pixels, weights)
 
 
