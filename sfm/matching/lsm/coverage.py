@@ -25,15 +25,13 @@ SAMPLES = np.linspace(-0.42, 0.42, 6)  # of a window at which it is asked what i
 
 
 def largest_alike(costs: Sequence[tuple[int, float]]) -> int:
-    """Return the side of the largest windows that together are about as precise as the best, px.
+    """Return the side of the largest windows that are about as precise as the best for the same pixels, px.
 
     The standard deviation of a window's place falls with its side, the number of windows with the square of
-    that: for white noise alone all sides are as precise. Otherwise the surface is not plane over large ones,
-    or small ones do not find their texture in noise that is correlated.
+    that: for noise alone the product is the same for all. Where it grows, the surface is not plane over them.
 
     Args:
-        costs: side of the windows, px, and the spread of their places over the root of their number, or in
-            proportion to it; the largest first.
+        costs: side of the windows, px, and the spread of their places times the side; the largest first.
     """
     best = min(cost for _, cost in costs)
     return next(window for window, cost in costs if cost <= ALIKE * best)
