@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
+from typing import overload
 
 import cv2
 import numpy as np
@@ -66,6 +68,25 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
     if image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, {"blue": 0, "green": 1, "red": 2}[channel]])
     return image
+
+
+class PhotographFiles(Sequence[AnyArray]):
+    """Photographs that are read from their files whenever one is asked for, and not kept."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """Read nothing yet of these files."""
+        self._paths = tuple(paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, k: int) -> AnyArray: ...
+    @overload
+    def __getitem__(self, k: slice) -> PhotographFiles: ...
+    def __getitem__(self, k: int | slice) -> AnyArray | PhotographFiles:
+        """Return one photograph, (H, W), see `read_photograph`; of several, their files."""
+        return PhotographFiles(self._paths[k]) if isinstance(k, slice) else read_photograph(self._paths[k])
 
 
 def take_back_srgb(photograph: AnyArray) -> AnyArray:

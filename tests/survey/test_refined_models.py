@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
+from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
@@ -395,7 +396,8 @@ def test_photographs_keep_to_the_memory(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(
         model_photographs, "read_of_size", lambda path, *rest: read.append(path.name) or was(path, *rest)
     )
-    two = model_photographs.Photographs(network, estimate, tmp_path, memory_bytes=2 * 4 * SIZE[0] * SIZE[1])
+    monkeypatch.setattr(model_photographs, "GreyPhotographs", partial(GreyPhotographs, grey_bytes=0))
+    two = model_photographs.Photographs(network, estimate, tmp_path, memory_bytes=2 * SIZE[0] * SIZE[1])
     for i in (0, 1, 0, 2, 0, 1):  # the oldest is forgotten
         assert two.grey(i).pixels.shape == SIZE[::-1]
     assert read == ["0.png", "1.png", "2.png", "1.png"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -9,14 +11,19 @@ import numpy as np
 import pytest
 
 from sfm.camera import project
+from sfm.conventions import AnyArray
+from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import Covered
+from sfm.matching.tracks import feature_tracks
 from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.photographs import reading as reading_module
+from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.measuring import surface_points, tie_points
+from sfm.survey.measuring import covering_points, surface_points, tie_points
 from sfm.survey.measuring.covering_points import CoveringPoints, _Places, _visible
 from sfm.survey.measuring.surface_points import Surface, cover_photographs
 from sfm.survey.measuring.tie_points import natural_points_of
@@ -91,6 +98,31 @@ def test_photographs_with_few_tie_points_are_searched_for_more_features(
     tied = tie_points.tie_photographs(survey, measured.files)
     assert asked == searched
     assert len(tied.network.points) > 10
+
+
+def test_photographs_are_in_memory_only_while_they_are_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of the three at a time, as the store of grey photographs has no place for more here."""
+    survey, measured, start = prepared(tmp_path, HELD)
+    assert measured.files is not None
+    alive: list[weakref.ref[AnyArray]] = []
+    most = 0
+
+    def reading(path: Path, **channel: str) -> AnyArray:
+        nonlocal most
+        photograph = read_photograph(path, **channel)
+        alive.append(weakref.ref(photograph))
+        most = max(most, sum(one() is not None for one in alive))
+        return photograph
+
+    for module in (reading_module, tie_points):
+        monkeypatch.setattr(module, "read_photograph", reading)
+    for user in (feature_tracks, covering_points):
+        monkeypatch.setattr(user, "GreyPhotographs", partial(GreyPhotographs, memory_bytes=0, grey_bytes=0))
+    tie_points.tie_photographs(survey, measured.files)
+    assert cover_photographs(survey, measured, start) is not None
+    assert len(alive) > 6 and most <= 2
 
 
 def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) -> None:
@@ -204,6 +236,6 @@ def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_b
     covered_pixels = Covered([(360, 480)] * 3)
     assert _visible(truth, camera, 0, places, covered_pixels, 11, 15)[1].tolist() == [True, False, False]
     assert not _visible(truth, camera, 0, places, covered_pixels, 181, 15)[1].any()  # of 360 rows
-    covered_pixels.pixels[1][:] = True
+    covered_pixels.cover(np.array([1]), np.array([[240.0, 180.0]]), np.array([1000.0]))
     seen = _visible(truth, camera, 0, places, covered_pixels, 11, 15)
     assert seen[0].all() and not seen[1].any()

@@ -38,23 +38,30 @@ def largest_alike(costs: Sequence[tuple[int, float]]) -> int:
 
 
 class Covered:
-    """Which pixels of photographs have been measured."""
+    """Which pixels of photographs have been measured, a bit each."""
 
     def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:
         """Nothing is covered yet of photographs of these shapes (height, width)."""
-        self.pixels: list[BoolArray] = [np.zeros(shape[:2], dtype=bool) for shape in shapes]
+        self.shapes = [shape[:2] for shape in shapes]
+        self._bits = [np.zeros((height, -(-width // 8)), np.uint8) for height, width in self.shapes]
+
+    def pixels(self, image: int) -> AnyArray:
+        """Return a photograph with 1 where it is covered, uint8, (H, W)."""
+        return np.unpackbits(self._bits[image], axis=1, count=self.shapes[image][1])
 
     def cover(self, image: IntArray, xy: FloatArray, side_px: FloatArray) -> None:
         """Cover squares, given by photograph (k,), middle (px, (k, 2)) and side (px, (k,))."""
-        first = np.maximum(np.rint(xy - side_px[:, None] / 2 + 0.5).astype(np.int64), 0)
-        behind = np.maximum(np.rint(xy + side_px[:, None] / 2 + 0.5).astype(np.int64), 0)
+        sizes = np.array([shape[::-1] for shape in self.shapes])[image]
+        first = np.clip(np.rint(xy - side_px[:, None] / 2 + 0.5).astype(np.int64), 0, sizes)
+        behind = np.clip(np.rint(xy + side_px[:, None] / 2 + 0.5).astype(np.int64), 0, sizes)
         for i, (x0, y0), (x1, y1) in zip(image.tolist(), first.tolist(), behind.tolist(), strict=True):
-            self.pixels[i][y0:y1, x0:x1] = True
+            row = np.zeros(8 * self._bits[i].shape[1], np.uint8)
+            row[x0:x1] = 1
+            self._bits[i][y0:y1] |= np.packbits(row)
 
     def free_middles(self, image: int, side_px: int) -> BoolArray:
         """Return which pixels of a photograph are middles of squares with few covered pixels, (H, W)."""
-        covered = self.pixels[image].view(np.uint8)
-        shared = cv2.boxFilter(covered, cv2.CV_32F, (side_px, side_px))
+        shared = cv2.boxFilter(self.pixels(image), cv2.CV_32F, (side_px, side_px))
         return np.asarray(shared <= SHARED)
 
     def is_free(self, image: int, xy: FloatArray, side_px: float) -> BoolArray:
@@ -65,11 +72,11 @@ class Covered:
             xy: middles of the squares, px, (k, 2).
             side_px: their side.
         """
-        pixels = self.pixels[image]
-        height, width = pixels.shape
-        col = np.rint(xy[:, :1] + side_px * SAMPLES).astype(np.int64).clip(0, width - 1)
-        row = np.rint(xy[:, 1:] + side_px * SAMPLES).astype(np.int64).clip(0, height - 1)
-        return np.asarray(pixels[row[:, :, None], col[:, None, :]].mean(axis=(1, 2)) <= SHARED)
+        height, width = self.shapes[image]
+        col = np.rint(xy[:, :1] + side_px * SAMPLES).astype(np.int64).clip(0, width - 1)[:, None, :]
+        row = np.rint(xy[:, 1:] + side_px * SAMPLES).astype(np.int64).clip(0, height - 1)[:, :, None]
+        covered = (self._bits[image][row, col >> 3] >> (7 - (col & 7)).astype(np.uint8)) & 1
+        return np.asarray(covered.mean(axis=(1, 2)) <= SHARED)
 
 
 def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points: int) -> BoolArray:

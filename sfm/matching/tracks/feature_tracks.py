@@ -29,6 +29,10 @@ WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine 
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
 
 
+# Of pairs of photographs: pairs of features, and how distinctive they are; see `matched_features`.
+Matches = dict[tuple[int, int], tuple[IntArray, FloatArray]]
+
+
 @dataclass(frozen=True)
 class Tracks:
     """Which features belong to one point."""
@@ -61,6 +65,7 @@ def find_tie_points(
     min_correlation: float = 0.7,
     seed: int = 0,
     threads: int = 1,
+    known: Matches | None = None,
 ) -> TiePoints:
     """Find and measure points that several photographs have in common, knowing nothing of their orientation.
 
@@ -72,6 +77,7 @@ def find_tie_points(
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
         threads: pairs of photographs worked on at a time.
+        known: see `link_features`.
 
     Returns:
         The tie points; n may be 0.
@@ -82,7 +88,7 @@ def find_tie_points(
     return measure_tracks(
         photographs,
         natural,
-        link_features(natural, min_rays=min_rays, seed=seed, threads=threads),
+        link_features(natural, min_rays=min_rays, seed=seed, threads=threads, known=known),
         window_px=window_px,
         min_rays=min_rays,
         min_correlation=min_correlation,
@@ -91,7 +97,12 @@ def find_tie_points(
 
 
 def link_features(
-    features: Sequence[Features], *, min_rays: int = 3, seed: int = 0, threads: int = 1
+    features: Sequence[Features],
+    *,
+    min_rays: int = 3,
+    seed: int = 0,
+    threads: int = 1,
+    known: Matches | None = None,
 ) -> Tracks:
     """Match the features of photographs that overlap and put together what belongs to one point.
 
@@ -105,15 +116,20 @@ def link_features(
         min_rays: fewest photographs of a point.
         seed: of the random samples.
         threads: pairs worked on at a time.
+        known: matches of pairs of photographs that need not be matched again; the others are added.
     """
+    known = {} if known is None else known
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
     pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
 
     def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
+        every = [(i, j) for i, j in of.tolist()]
+        new = [pair for pair in every if pair not in known]
         matches = in_threads(
-            lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of.tolist(), threads
+            lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), new, threads
         )
-        return list(reported("pairs of photographs matched", matches, len(of)))
+        known.update(zip(new, reported("pairs of photographs matched", matches, len(new)), strict=True))
+        return [known[pair] for pair in every]
 
     matched = matched_pairs(pairs)
     linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]

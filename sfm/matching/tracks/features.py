@@ -51,14 +51,15 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
-    grey = grey_of_8_bit(photograph)
-    eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
+    eight_bit = photograph
+    if photograph.ndim > 2 or photograph.dtype != np.uint8:
+        eight_bit = np.rint(np.clip(grey_of_8_bit(photograph), 0, FULL_SCALE_8)).astype(np.uint8)
     shrink = 2
-    while max(grey.shape) > shrink * MAX_SIDE_PX:
+    while max(eight_bit.shape) > shrink * MAX_SIDE_PX:
         shrink *= 2
     sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
     while True:
-        height, width = (max(1, side // shrink) for side in grey.shape)
+        height, width = (max(1, side // shrink) for side in eight_bit.shape)
         # whole blocks of pixels: what is left at the border belongs to none
         whole = eight_bit[: height * shrink, : width * shrink]
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)

@@ -6,6 +6,7 @@ equations N = sum g g^T of a shift are large (weight w) and round (roundness q).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -74,10 +75,13 @@ def foerstner_points(
             f"interest operator: {counted(max_points, 'point')} asked for, at least 1 is needed"
         )
     grey = grey_of(photograph)
-    gx, gy = _gradients(grey)
-    weight, roundness = _texture(gx, gy, side)
+    weight, is_round = np.empty_like(grey), np.empty(grey.shape, dtype=np.bool_)
+    for first, end, begin, gx, gy in _strips(grey, side // 2):
+        own = slice(first - begin, end - begin)
+        part, roundness = _texture(gx, gy, side)
+        weight[first:end], is_round[first:end] = part[own], roundness[own] >= MIN_ROUNDNESS
     top = np.asarray(cv2.dilate(weight, np.ones((3, 3), np.uint8)) <= weight)
-    good = top & (roundness >= MIN_ROUNDNESS) & (weight > WEIGHT_OF_MEAN * weight.mean()) & (weight > 0)
+    good = top & is_round & (weight > WEIGHT_OF_MEAN * weight.mean()) & (weight > 0)
     margin = max(border_px, side // 2 + REACH_PX)
     good[:margin], good[-margin:], good[:, :margin], good[:, -margin:] = False, False, False, False
     row, col = np.nonzero(good)
@@ -88,8 +92,14 @@ def foerstner_points(
     _thin(row, col, float(min_distance_px), max_points, near, kept)
     row, col = row[kept], col[kept]
     place, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
-    _intersect_edges(gx, gy, row, col, side // 2, place, covariance)
-    return InterestPoints(place, covariance, weight[row, col], roundness[row, col])
+    roundness = np.empty(len(row))
+    for first, end, begin, gx, gy in _strips(grey, side // 2):
+        rows = np.flatnonzero((row >= first) & (row < end))
+        part, C = np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
+        _intersect_edges(gx, gy, begin, row[rows], col[rows], side // 2, part, C)
+        place[rows], covariance[rows] = part, C
+        roundness[rows] = _texture(gx, gy, side)[1][row[rows] - begin, col[rows]]
+    return InterestPoints(place, covariance, weight[row, col], roundness)
 
 
 def textured_squares(
@@ -105,8 +115,7 @@ def textured_squares(
 
     Source: the weight of Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
     """
-    gx, gy = _gradients(grey_of(photograph))
-    weight, _ = _texture(gx, gy, side_px)
+    weight = _weight(grey_of(photograph), side_px)
     free = allowed & (weight > TEXTURE_OF_MEAN * weight.mean())
     margin = max(border_px, 1)
     free[:margin], free[-margin:], free[:, :margin], free[:, -margin:] = False, False, False, False
@@ -122,24 +131,40 @@ def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
     return along_x, along_y
 
 
+def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray, AnyArray]]:
+    """Yield first and last line of strips of a photograph, and line, x and y of the gradients that they need.
+
+    Of a large photograph gradients, their products and sums would take twenty times its own memory.
+
+    Args:
+        grey: the photograph, float32, (H, W).
+        half: lines above and below a strip that its windows reach.
+    """
+    for first in range(0, len(grey), STRIP):
+        end = min(first + STRIP, len(grey))
+        begin, behind = max(0, first - half), min(len(grey), end + half)
+        above = min(begin, REACH_PX + 1)  # whose intensities are in derivatives
+        gx, gy = _gradients(grey[begin - above : behind + REACH_PX + 1])
+        yield first, end, begin, gx[above : above + behind - begin], gy[above : above + behind - begin]
+
+
 def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]:
-    """Return weight and roundness of the window around every pixel, each (H, W), strip by strip."""
-    weight, roundness = np.empty_like(gx), np.empty_like(gx)
-    height = len(gx)
-    for first in range(0, height, STRIP):
-        end = min(first + STRIP, height)
-        begin = max(0, first - side // 2)
-        rows = slice(begin, min(height, end + side // 2))
-        x, y = gx[rows], gy[rows]
-        xx, xy, yy = (
-            cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)[first - begin : end - begin]
-            for product in (x * x, x * y, y * y)
-        )
-        trace = np.maximum(xx + yy, 1e-12)
-        det = np.maximum(xx * yy - xy * xy, 0.0)
-        weight[first:end] = det / trace
-        roundness[first:end] = 4 * det / (trace * trace)
-    return weight, roundness
+    """Return weight and roundness of the window around every pixel, each (H, W), of gradients (H, W)."""
+    xx, xy, yy = (
+        cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
+        for product in (gx * gx, gx * gy, gy * gy)
+    )
+    trace = np.maximum(xx + yy, 1e-12)
+    det = np.maximum(xx * yy - xy * xy, 0.0)
+    return (det / trace).astype(np.float32), (4 * det / (trace * trace)).astype(np.float32)
+
+
+def _weight(grey: AnyArray, side: int) -> AnyArray:
+    """Return the weight of the window around every pixel, (H, W)."""
+    weight = np.empty_like(grey)
+    for first, end, begin, gx, gy in _strips(grey, side // 2):
+        weight[first:end] = _texture(gx, gy, side)[0][first - begin : end - begin]
+    return weight
 
 
 def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
@@ -182,19 +207,23 @@ def _take(near: BoolArray, row: int, col: int, distance: float) -> None:
 def _intersect_edges(
     gx: AnyArray,
     gy: AnyArray,
+    begin: int,
     row: IntArray,
     col: IntArray,
     half: int,
     place: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, g their gradients."""
+    """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, g their gradients.
+
+    Gradients are those from line `begin` on.
+    """
     n = (2 * half + 1) ** 2
     for k in range(len(row)):
         xx, xy, yy, bx, by, rest = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(-half, half + 1):
             for j in range(-half, half + 1):
-                a, b = gx[row[k] + i, col[k] + j], gy[row[k] + i, col[k] + j]
+                a, b = gx[row[k] - begin + i, col[k] + j], gy[row[k] - begin + i, col[k] + j]
                 along = a * j + b * i
                 xx += a * a
                 xy += a * b

@@ -97,7 +97,7 @@ def find_covering_points(
     """Measure points in all photographs that see them, until the texture of these is covered.
 
     Args:
-        photographs: (H, W), m of them.
+        photographs: (H, W), m of them; read when they are asked for, of files.
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
         seen: image points of the tie points that fit, which tell the surface.
@@ -115,14 +115,14 @@ def find_covering_points(
     margin = window_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
-    covered = Covered([one.shape for one in photographs])
+    covered = Covered([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
     in_order = np.asarray(order).tolist()
     for i in reported(f"photographs covered by windows of {window_px} px", in_order, len(in_order)):
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
             continue
-        xy = textured_squares(photographs[i], side_px, covered.free_middles(i, side_px), border_px=margin)
+        xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
         places = _Places(xy, normal, points).select(known)
@@ -160,10 +160,10 @@ def _visible(
 
     The reference is among them.
     """
-    visible = np.zeros((len(covered.pixels), len(places)), dtype=bool)
+    visible = np.zeros((len(covered.shapes), len(places)), dtype=bool)
     for j in np.flatnonzero(estimate.oriented).tolist():
         at = pictures_of(estimate, camera, np.full(len(places.xy), j), places.points)
-        size = np.array(covered.pixels[j].shape[::-1])
+        size = np.array(covered.shapes[j][::-1])
         ray = estimate.position[j] - places.points
         cosine = np.sum(ray * places.normal, axis=1) / np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore"):

@@ -24,7 +24,7 @@ from sfm.matching.lsm.coverage import ALIKE, WINDOWS_PX, largest_alike
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.photographs.reading import read_photograph
+from sfm.photographs.reading import PhotographFiles
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import PhotographTargets
@@ -64,8 +64,6 @@ def cover_photographs(
 ) -> Surface | None:
     """Return the network of a textured survey with points wherever its photographs have texture.
 
-    All photographs are in memory at the same time, as for the tie points.
-
     Args:
         survey: says the window, or does not, and the sigma of an image coordinate.
         measured: the tie points.
@@ -86,7 +84,7 @@ def cover_photographs(
         return None
     path_of = dict(zip(files.names, files.paths, strict=True))
     paths = [path_of[name] for name in network.images]
-    photographs = [read_photograph(path) for path in paths]
+    photographs = PhotographFiles(paths)
     surface = seen.select(fits)
     window = settings.window_px
     if "window_px" not in settings.model_fields_set:
@@ -97,7 +95,7 @@ def cover_photographs(
         network.camera,
         surface,
         window_px=window,
-        side_px=_side(photographs, window, settings.max_points),
+        side_px=_side(estimate, window, settings.max_points),
         min_rays=MIN_RAYS,
         threads=jobs,
     )
@@ -177,9 +175,9 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & (rays >= MIN_RAYS)[seen.point])
 
 
-def _side(photographs: Sequence[AnyArray], window_px: int, most: int) -> int:
+def _side(estimate: Estimate, window_px: int, most: int) -> int:
     """Return the odd side of the squares: a window, or more where a photograph would have too many, px."""
-    area = max(one.shape[0] * one.shape[1] for one in photographs)
+    area = max(lens.size_px[0] * lens.size_px[1] for lens in estimate.cameras)
     return max(window_px, int(np.sqrt(area / most)) | 1)
 
 
@@ -196,7 +194,7 @@ def _best_window(
     found: list[tuple[int, float]] = []
     together: dict[int, float] = {}  # standard deviation that all rays leave, in proportion
     for window in (*WINDOWS_PX, LARGE_PX):
-        side = _side(photographs, window, settings.max_points)
+        side = _side(estimate, window, settings.max_points)
         trial_side = max(TRIAL_SIDES * window + 1, side)
         trial = find_covering_points(
             photographs,

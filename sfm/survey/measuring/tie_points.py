@@ -11,11 +11,11 @@ import numpy as np
 
 from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
+from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
 from sfm.matching.tracks.natural_points import NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.photographs.reading import read_photograph
+from sfm.photographs.reading import PhotographFiles, read_photograph
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
@@ -44,8 +44,8 @@ def tie_photographs(
 ) -> Measurements:
     """Read the photographs and measure the points of natural texture that they have in common.
 
-    All photographs are in memory at the same time, since points are matched between any two of them. One
-    that cannot be read does not stop the others; it is named with the reason, as is a copy of another.
+    Photographs are read when they are needed. One that cannot be read does not stop the others; it is named
+    with the reason, as is a copy of another.
 
     Args:
         survey: says detector and windows, what is known of the cameras, and the sigma of an image coordinate.
@@ -63,7 +63,7 @@ def tie_photographs(
     found, failed = each_photograph(
         photographs,
         lambda path: _read(path, settings, store),
-        picture=lambda one: sha256(one[1].tobytes()).digest(),
+        picture=lambda one: one[1],
         jobs=jobs,
         progress=progress,
     )
@@ -73,11 +73,14 @@ def tie_photographs(
     cameras = start_cameras(
         survey.cameras, survey.source, tuple(found[k][0] for k in read), camera, names, survey.start_cameras
     )
-    pictures, natural = [found[k][1] for k in read], [found[k][2] for k in read]
+    pictures = PhotographFiles([photographs.paths[k] for k in read])
+    natural = [found[k][2] for k in read]
+
+    matches: Matches = {}
 
     def tie() -> TiePoints:
         return find_tie_points(
-            pictures, natural, window_px=settings.window_px, min_rays=MIN_RAYS, threads=jobs
+            pictures, natural, window_px=settings.window_px, min_rays=MIN_RAYS, threads=jobs, known=matches
         )
 
     tied = tie()
@@ -85,7 +88,9 @@ def tie_photographs(
     if scarce and "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
         for a in reported("photographs searched for more features", scarce, len(scarce)):
-            natural[a] = natural_points_of(photographs.paths[read[a]], more, store, photograph=pictures[a])[0]
+            natural[a] = natural_points_of(photographs.paths[read[a]], more, store)[0]
+        for pair in [pair for pair in matches if not set(pair).isdisjoint(scarce)]:
+            del matches[pair]
         tied = tie()
     if not len(tied):
         raise GeometryError(
@@ -124,9 +129,10 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
 
 def _read(
     path: Path, settings: TiePointSettings, store: MeasuredStore | None
-) -> tuple[Metadata, AnyArray, NaturalPoints, bool]:
+) -> tuple[Metadata, bytes, NaturalPoints, bool]:
     photograph = read_photograph(path)
-    return read_metadata(path), photograph, *natural_points_of(path, settings, store, photograph=photograph)
+    digest = sha256(photograph.tobytes()).digest()
+    return read_metadata(path), digest, *natural_points_of(path, settings, store, photograph=photograph)
 
 
 def natural_points_of(

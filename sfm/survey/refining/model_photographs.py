@@ -9,12 +9,10 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
-from sfm.matching.grey_photographs import GreyPhotographs
+from sfm.matching.grey_photographs import MEMORY_BYTES, GreyPhotographs
 from sfm.matching.radiometry import Grey, averaged, grey_of
 from sfm.network import Estimate, Network
 from sfm.photographs.reading import read_photograph
-
-MEMORY_BYTES = 1_000_000_000  # of photographs in memory at a time, as single precision
 
 
 class Photographs:
@@ -41,7 +39,8 @@ class Photographs:
         return self._kept[i]
 
     def _read(self, i: int) -> AnyArray:
-        return averaged(grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i])), self.shrink)
+        photograph = read_of_size(self._paths[i], self._names[i], self._sizes[i])
+        return photograph if self.shrink == 1 else averaged(grey_of(photograph), self.shrink)
 
 
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
