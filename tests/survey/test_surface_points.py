@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -201,9 +202,9 @@ def test_large_windows_are_taken_where_their_rays_together_tell_more(
 
     monkeypatch.setattr(surface_points, "find_covering_points", trial)
     network, truth = make_network(seed_of("trial"), images=2, points=20)
-    photographs = [np.zeros((1024, 1536), dtype=np.uint8)] * 2
+    truth = replace(truth, cameras=tuple(replace(one, size_px=(1536, 1024)) for one in truth.cameras))
     settings, seen = TiePointSettings(), network.image_points
-    chosen = surface_points._best_window(photographs, network, truth, seen, settings, 1)
+    chosen = surface_points._best_window([], network, truth, seen, settings, 1)
     assert chosen == side
 
 

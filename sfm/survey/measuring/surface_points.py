@@ -37,8 +37,9 @@ from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_p
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
 
 # Side that is taken where its rays, all together, are more precise by the factor ALIKE than those of the
-# usual ones: noise that is correlated over several pixels hides the texture of smaller windows. Those of 31 px,
-# which measure the mean depth of a curved surface, in all photographs alike, leave 0.93 to 1.8 times as much.
+# usual ones: noise that is correlated over several pixels hides the texture of smaller windows. Those of
+# 31 px, which measure the mean depth of a curved surface, in all photographs alike, leave 0.93 to 1.8 times
+# as much.
 LARGE_PX = 21
 TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
 TRIAL_RAYS = 100  # with fewer the window stays as it is
