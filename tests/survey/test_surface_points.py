@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from functools import partial
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
