@@ -259,9 +259,15 @@ def test_light_that_spreads_about_oblique_rings_is_no_ink() -> None:
 
 
 def test_what_is_behind_one_side_of_a_ring_is_no_border() -> None:
-    behind = np.array([0.8, 0.0, 0.9, 0.7, -0.2, 0.1])
-    np.testing.assert_allclose(ring_reading._frame(behind), [0.7, 0.0, 0.1, 0.7, 0.0, 0.1])
-    np.testing.assert_allclose(ring_reading._frame(behind[:5]), 0.0)
+    behind = np.array([0.8, 0.0, 0.0, 0.5, -0.1, 0.1])
+    np.testing.assert_allclose(ring_reading._frame(behind, 1.0), [0.5, 0.0, 0.0, 0.5, 0.0, 0.0])
+    np.testing.assert_allclose(ring_reading._frame(behind, 0.8), 0.0)  # 0.3 is more than 0.35 x 0.8
+    np.testing.assert_allclose(ring_reading._frame(behind[:5], 1.0), 0.0)
+
+
+def test_the_stroke_of_a_letter_is_no_border() -> None:
+    """It has no free corners."""
+    np.testing.assert_allclose(ring_reading._frame(np.full(8, 0.8), 1.0), 0.0)
 
 
 @pytest.mark.slow

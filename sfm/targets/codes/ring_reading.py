@@ -36,6 +36,9 @@ RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
 # Part of the circle just behind the ring that other things may cover, and what there may be behind a set
 # cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
+# Largest difference of what is behind opposite cells where it is the border of a label, in steps (0.32 where
+# cells are hardly resolved), and the least part of the circle behind which its corners are free (3 of 12).
+FRAME_TOLERANCE, CORNERS = 0.35, 0.25
 # Blur of the edge in a sharp photograph, px.
 SHARP_PX = 0.8
 # A ring may be interrupted by less than this angle, and an arc must be longer.
@@ -174,7 +177,7 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
     uneven = np.minimum(np.abs(level), glare)
     uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
-    behind = behind - _frame(behind)
+    behind = behind - _frame(behind, step)
     clutter = np.abs(behind) > GAP_TOLERANCE * step + noise
     tests = (
         np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
@@ -193,13 +196,15 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     return int(family.number[entry]), float(min(1.0, jump[at] / step))
 
 
-def _frame(behind: FloatArray) -> FloatArray:
+def _frame(behind: FloatArray, step: float) -> FloatArray:
     """Return what is behind each cell and the opposite one alike, (cells,): the border of a label.
 
-    It is printed about the dot, where other things cover one side. Rings of an odd number show none.
+    It is printed about the dot, and all of it is alike; other things cover one side. It is a square, whose
+    corners are free, where the stroke of a letter is not. Rings of an odd number of cells show none.
     """
-    if len(behind) % 2:
-        return np.zeros_like(behind)
     opposite = np.roll(behind, len(behind) // 2)
+    free = (np.abs(behind) <= GAP_TOLERANCE * step).mean() >= CORNERS
+    if len(behind) % 2 or not free or (np.abs(behind - opposite) > FRAME_TOLERANCE * step).any():
+        return np.zeros_like(behind)
     alike = np.minimum(np.abs(behind), np.abs(opposite))
     return np.where(behind * opposite > 0, np.sign(behind) * alike, 0.0)
