@@ -85,6 +85,7 @@ def judge_outlines(
     rest = shape - np.median(shape[sound], axis=0) if sound.sum() >= MIN_POPULATION else shape
     softness = np.minimum(softness, 1.0)[:, None]  # more where a fit failed
     damping = np.repeat(damping_of(np.arange(3, 3 + SHAPES // 2), softness), 2, axis=1)
+    damping = np.where(damping[:, :1] > MIN_DAMPED, damping, 1.0)  # softer edges show none
     seen, squares = damping.sum(axis=1), (damping**2).sum(axis=1)
     weighted = np.sqrt(damping) * rest
     ratio = np.maximum(np.einsum("ka,kab,kb->k", weighted, N, weighted), 0.0) / (
