@@ -205,6 +205,9 @@ def _matrices(
 ) -> Iterator[tuple[IntArray, FloatArray]]:
     """Yield the image points of each photograph and R - I of them."""
     for rows in rows_of(image, int(image.max(initial=-1)) + 1):
-        K = correlation.common * np.exp(-cdist(xy[rows], xy[rows]) / correlation.length_px)
+        K = cdist(xy[rows], xy[rows])  # 0.3 GB of 6000 image points: no copies
+        K /= -correlation.length_px
+        np.exp(K, out=K)
+        K *= correlation.common
         K[np.diag_indices(len(rows))] = correlation.variance_change
         yield rows, K
