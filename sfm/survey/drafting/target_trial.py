@@ -28,6 +28,8 @@ from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plate_search import (
     KALIBR_TAGS,
     MIN_DOTS_OF_PLATE,
+    Part,
+    checkerboard_of_parts,
     part_of_checkerboard,
     search_april_grids,
     search_charuco,
@@ -101,7 +103,8 @@ def try_targets(
     if min(one.size for one in photographs) > LARGE * LOOK_PX**2:
         greys = [_as_bytes(photograph) for photograph in photographs]
         looks = [_look(grey) for grey in greys]
-        if not any(look.shows_targets for look in looks) and search_checkerboard(greys) is None:
+        board = checkerboard_of_parts(greys, [look.board for look in looks])
+        if not any(look.shows_targets for look in looks) and board is None:
             circles = float(np.median([look.circles for look in looks]))
             return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
     plain = [_measure(path, "none", store) for path in tried]
@@ -256,6 +259,7 @@ class _Look:
 
     shows_targets: bool  # codes, plates, or many circles
     circles: int
+    board: Part | None = None  # part of a checkerboard, not looked for where there are targets
 
 
 def _look(grey: AnyArray) -> _Look:
@@ -281,7 +285,7 @@ def _look(grey: AnyArray) -> _Look:
             return _Look(True, circles)
     part = part_of_checkerboard(grey)
     board = part is not None and part[0][0] * part[0][1] >= MIN_DOTS_OF_PLATE
-    return _Look(board or len(read_april_tags(whole, KALIBR_TAGS)[0]) >= MIN_CODES, circles)
+    return _Look(board or len(read_april_tags(whole, KALIBR_TAGS)[0]) >= MIN_CODES, circles, part)
 
 
 def _readable(

@@ -33,6 +33,8 @@ SMALLEST = (3, 3)  # board that OpenCV is asked for, and for any larger one
 KALIBR_TAGS = "apriltag36h11"
 MIN_TAGS_OF_BOARD = 4  # that determine the homography from a photograph to a board
 MAX_SQUARES = 40  # along a side of a ChArUco board
+# Crossings in rows and columns, and along which of them the border cuts the board.
+Part = tuple[tuple[int, int], tuple[bool, bool]]
 _LARGER = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
@@ -41,10 +43,20 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
 
     Source: Duda and Frese (2018), in OpenCV, for boards of any size.
     """
-    whole, parts = Counter[tuple[int, int]](), list[tuple[tuple[int, int], tuple[bool, bool]]]()
-    for part in filter(None, map(part_of_checkerboard, photographs)):
-        parts.append(part)
-        size, is_cut = part
+    return checkerboard_of_parts(photographs, [part_of_checkerboard(one) for one in photographs])
+
+
+def checkerboard_of_parts(
+    photographs: Sequence[AnyArray], found: Sequence[Part | None]
+) -> PlateFamily | None:
+    """Return the checkerboard of which photographs (uint8) show parts, None without.
+
+    Args:
+        photographs: intensities, uint8, each (H, W).
+        found: in each of them, by `part_of_checkerboard`.
+    """
+    whole, parts = Counter[tuple[int, int]](), [part for part in found if part is not None]
+    for size, is_cut in parts:
         if not any(is_cut):
             whole[min(size), max(size)] += 1
     for (rows, columns), _ in whole.most_common():
@@ -55,7 +67,7 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
     return None
 
 
-def part_of_checkerboard(grey: AnyArray) -> tuple[tuple[int, int], tuple[bool, bool]] | None:
+def part_of_checkerboard(grey: AnyArray) -> Part | None:
     """Return the crossings of a checkerboard in rows and columns, and along which of them the border cuts it.
 
     Args:

@@ -39,6 +39,7 @@ def harmonics(first: int, last: int) -> FloatArray:
 
 
 _ELLIPSE = np.column_stack([np.ones(RAYS), harmonics(1, 2)])
+_PRODUCTS = (_ELLIPSE[:, :, None] * _ELLIPSE[:, None, :]).reshape(-1, 25)  # of these, (RAYS, 25)
 
 
 def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: FloatArray) -> BoolArray:
@@ -98,7 +99,7 @@ def gap_shifts(common: FloatArray, weight: FloatArray, keep: BoolArray) -> Float
 
 def _fit_harmonics(h: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the harmonics 0 to 2 of outlines, which ellipses follow to first order, radii, shape (k, 5)."""
-    N = np.einsum("ki,ia,ib->kab", weight, _ELLIPSE, _ELLIPSE)
+    N = (weight @ _PRODUCTS).reshape(-1, 5, 5)
     N += 1e-9 * (1 + np.trace(N, axis1=1, axis2=2))[:, None, None] * np.eye(5)
     return np.asarray(np.linalg.solve(N, ((weight * h) @ _ELLIPSE)[..., None])[..., 0])
 

@@ -11,6 +11,8 @@ import pytest
 from sfm.conventions import AnyArray
 from sfm.survey.drafting import target_trial
 from sfm.survey.drafting.target_trial import LARGE, LOOK_PX, try_targets
+from sfm.targets.codes import plate_search
+from sfm.targets.codes.plate_search import Part, part_of_checkerboard
 from tests.synthetic import seed_of
 
 SIDE = int(np.sqrt(LARGE) * LOOK_PX) + 200
@@ -35,7 +37,16 @@ def test_texture_is_not_measured_for_targets(tmp_path: Path, monkeypatch: pytest
     for i in range(2):
         cv2.imwrite(str(tmp_path / f"{i}.png"), texture(f"look {i}"))
     monkeypatch.setattr(target_trial, "_measure", lambda *args: pytest.fail("measured"))
+    searched: list[AnyArray] = []
+
+    def part(grey: AnyArray) -> Part | None:
+        searched.append(grey)
+        return part_of_checkerboard(grey)
+
+    for module in (target_trial, plate_search):
+        monkeypatch.setattr(module, "part_of_checkerboard", part)
     trial = try_targets(sorted(tmp_path.iterdir()))
+    assert len(searched) == 2  # each photograph once, which takes a tenth of the time
     assert trial.codes == "none" and trial.plate is None and len(trial.photographs) == 2
 
 
