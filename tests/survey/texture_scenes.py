@@ -34,9 +34,9 @@ from sfm.survey.inputs.survey import read_survey
 from tests.synthetic import seed_of
 from tests.textures import natural_texture
 
-SIZE_PX = (1000, 750)
-C_PX = 900.0
-TEXTURE_PX = 1500  # side of the texture of a plane
+SIZE_PX = (640, 480)
+C_PX = 576.0
+TEXTURE_PX = 1000  # side of the texture of a plane
 NOISE = 1.5  # grey values
 WRONG, SHARE = 5.0, 0.01
 NUMBERS = 4  # of each kind
