@@ -34,7 +34,7 @@ MIN_PROBABILITY = 1e-3  # smaller ones are written as less than it
 EXPECTED_SIGMAS = 3.0
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
-    "cameras": "Parameters of the camera",
+    "cameras": "Interior parameters",
     "centres": "the projection centres",
     "control": "the control points",
     "coordinates": "Coordinates",

@@ -42,6 +42,7 @@ class Remark:
         default_factory=dict
     )  # names by their role in the sentence
     numbers: Mapping[str, Quantity] = field(default_factory=dict)
+    at_least: Severity = "note"  # severity of what it explains
 
     @property
     def row(self) -> Kind:
@@ -52,8 +53,8 @@ class Remark:
 
     @property
     def severity(self) -> Severity:
-        """How much it matters, by the catalogue: note, warning or error."""
-        return self.row.severity_of(self)
+        """How much it matters, by the catalogue and by what it explains: note, warning or error."""
+        return min(self.row.severity_of(self), self.at_least, key=SEVERITIES.index)
 
     @property
     def text(self) -> str:

@@ -6,7 +6,7 @@ The most serious remark decides: an error makes a result bad, a warning fair, no
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sfm.display import MAX_LISTED
@@ -49,22 +49,35 @@ class Verdict:
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     """Return the verdict on a result; what others of its remarks explain is left out.
 
+    A warning that explains an error takes its severity: the result is as bad, and the reason is said.
+
     Args:
         remarks: all that was found, in the order in which it is to be read within a severity.
         headlines: what each level means for this kind of result.
     """
     every = tuple(remarks)
-    every = tuple(one for one in every if not any(_explains(cause, one) for cause in every))
+    every = tuple(
+        replace(one, at_least=_worst_explained(one, every))
+        for one in every
+        if not any(_explains(cause, one) for cause in every)
+    )
     order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order)
 
 
 def _explains(cause: Remark, one: Remark) -> bool:
-    """Return whether a remark follows from another one; of one with a grade, if it is no more serious."""
+    """Return whether a remark follows from another one; from a note with a grade only what is one as well."""
     graded = isinstance(cause.row.severity, Grade)
-    serious = SEVERITIES.index(cause.severity) <= SEVERITIES.index(one.severity)
+    serious = cause.severity != "note" or one.severity == "note"
     return one.kind in cause.row.explains and (serious or not graded)
+
+
+def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
+    """Return the worst severity of what a remark with a grade explains."""
+    graded = isinstance(cause.row.severity, Grade)
+    explained = [one.severity for one in every if graded and _explains(cause, one)]
+    return min((cause.at_least, *explained), key=SEVERITIES.index)
 
 
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:

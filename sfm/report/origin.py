@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,7 +48,7 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
     """Raise OutputError where a folder has the result of another survey file or of other photographs.
 
     A result that does not state its origin, as one that a script wrote, is another's if it has another name,
-    or none of the photographs.
+    or photographs that are not here.
 
     Args:
         out: the folder.
@@ -59,16 +58,23 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
     """
     earlier = read_origin(out)
     if earlier is None:
-        with suppress(SurveyFileError):  # no result
+        try:
             name = read_json(out / "summary.json", _Summary, "the summary of a result").survey
+        except SurveyFileError:
+            return  # no result
+        try:
             images = read_table(out / "images.csv", ("image",), (), ignored=None).texts[0]
-            other_name = bool(survey) and name != survey
-            if other_name or (photographs and not any((own.images / one).is_file() for one in images)):
-                what = f"{counted(len(images), 'photograph')} ({listed(images)})"
-                raise OutputError(
-                    f"{out}: has the result of survey {name} with {what}, which --overwrite replaces; "
-                    "--out names another folder"
-                )
+        except SurveyFileError:
+            images = ()
+        other_name = bool(survey) and name != survey
+        present = bool(images) and all((own.images / one).is_file() for one in images)
+        if other_name or (photographs and not present):
+            of = f"{counted(len(images), 'photograph')} ({listed(images)})"
+            what = of if images else "no table of photographs"
+            raise OutputError(
+                f"{out}: has the result of survey {name} with {what}, which --overwrite replaces; "
+                "--out names another folder"
+            )
         return
     for what, there, here in (
         ("the survey", earlier.file, own.file),

@@ -188,7 +188,7 @@ def test_alternatives_that_shift_coordinates_have_one_grade() -> None:
     assert len(SHIFTING) == 12 and "points_moved" in SHIFTING
     for kind in SHIFTING:
         severity = [
-            Remark(kind, numbers={"shift": Quantity(shift), "rms": Quantity(rms)}).severity
+            Remark(kind, numbers={"shift": Quantity(shift), "wrong": Quantity(rms)}).severity
             for shift, rms in ((2.9, 1.0), (3.1, 1.0), (100.0, 4.9), (100.0, 5.1), (5.1, 5.1))
         ]
         assert severity == ["note", "warning", "warning", "error", "error"], kind
@@ -317,3 +317,22 @@ def test_probabilities_are_written_as_numbers_that_say_something() -> None:
     for value, text in ((4.92e-31, "p < 0.001"), (0.0124, "p = 0.012"), (0.5, "p = 0.500")):
         one = Remark("sigma0_high", numbers={"p": Quantity(value)})
         assert row.write("{p:<}", one) == text
+
+
+def test_a_cause_is_as_serious_as_what_it_explains() -> None:
+    """Before, strained control led, which follows from a camera that changed by less than an error."""
+    numbers = {
+        "shift": Quantity(4.0),
+        "wrong": Quantity(4.0),
+        "rms": Quantity(1.0),
+        "change": Quantity(1.0, "%"),
+    }
+    parts = {"photographs": ("a",), "of": ("cameras",)}
+    cause = Remark("other_camera", parts, numbers)
+    control = {"chi2": Quantity(900.0), "fitting": Quantity(50.0), "elongation": Quantity(0.5, "%")}
+    strained = Remark("given_strained", {"of": ("control",)}, control)
+    assert (cause.severity, strained.severity) == ("warning", "error")
+    verdict = judge([strained, cause], HEADLINES)  # type: ignore[arg-type]
+    assert verdict.level == "bad" and kinds_of(verdict.remarks) == ("other_camera",)
+    slight = Remark("other_camera", parts, numbers | {"shift": Quantity(2.0), "wrong": Quantity(2.0)})
+    assert kinds_of(judge([strained, slight], HEADLINES).remarks) == ("given_strained", "other_camera")  # type: ignore[arg-type]

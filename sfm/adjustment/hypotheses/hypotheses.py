@@ -20,6 +20,7 @@ from sfm.adjustment.hypotheses.alternatives import (
     ALPHA,
     MIN_GROUP,
     alternatives_of,
+    cameras_of_photographs,
     interiors,
     is_significant,
 )
@@ -49,7 +50,10 @@ MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evid
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 MIN_OF_BODY = 3  # points that determine its six motions
-OF_FREE_POINTS = ("assumptions_untested", "photographs_untested")  # that given points make untrue
+OF_FREE_POINTS = (  # which given points make untrue
+    *("assumptions_untested", "photographs_untested"),
+    *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
+)
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
 
@@ -90,7 +94,7 @@ def judge_alternatives(
         return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
-    without = None if final.unknown_counts[2] else "control"
+    without = "control" if _is_calibration(final) or not final.unknown_counts[2] else None
     found = _judge_free(free_network(final), unit, bodies, without)
     if not _is_calibration(final):
         return found
@@ -101,8 +105,8 @@ def judge_alternatives(
     if cause is not None:
         found = replace(found, causes=(remark_of(final, cause, unit),))
         weak = ()
-    if len(final.network.images) == MIN_GROUP:
-        weak = (remark("calibrated_from_two"),)
+    else:
+        weak = _calibrated_from_few(final) or weak
     unchecked = (one for one in found.unchecked if one.kind not in OF_FREE_POINTS)
     return replace(found, unchecked=(*weak, *unchecked))
 
@@ -138,6 +142,20 @@ def _is_calibration(final: Adjustment) -> bool:
     return bool(adjusted and not beside and 2 * len(given) > len(np.unique(seen)))
 
 
+def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
+    """Return a remark for each camera of which there are MIN_GROUP photographs at most."""
+    number, names = cameras_of_photographs(final), np.array(final.network.images)
+    return tuple(
+        remark(
+            "calibrated_from_few",
+            camera=final.estimate.cameras[final.network.camera[some[0]]].shared_name,
+            photographs=names[some].tolist(),
+        )
+        for some in (np.flatnonzero(number == k) for k in range(int(number.max()) + 1))
+        if len(some) <= MIN_GROUP
+    )
+
+
 def cause_in_calibration(final: Adjustment) -> Cause | None:
     """Return what given points show: another camera in some photographs, or control that is strained.
 
@@ -171,7 +189,8 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     of = "coordinates" if without is None else f"coordinates without {without}"
     if plain.datum == "control":
         of = "cameras"
-    return remark(one.kind, of=of, shift=found.shift, rms=found.rms, instead=instead or None, **parts)
+    size = {"rms": found.rms, "wrong": found.rms} if of != "cameras" else {"wrong": found.shift}
+    return remark(one.kind, of=of, shift=found.shift, **size, instead=instead or None, **parts)
 
 
 def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:

@@ -93,7 +93,7 @@ ROWS = (
         "given, {fitting} if not stretched): scale and shape of the result are not dependable.",
         "coordinates of a print or a scan, or axes of different scale or unit",
         "Correct the scale of the axes, or give coordinates that were measured.",
-        explains=PULLED,
+        explains=(*PULLED, "shape_of_control"),
     ),
     Kind(
         "given_renamed",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
-# Standard deviations by which a coordinate shifts with the alternative.
-SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
-SHIFTED = "{of:@} shift by up to {shift} standard deviations, {rms} RMS."
+# Standard deviations by which a result shifts with the alternative, and by how much it is wrong: the root
+# mean square of coordinates, the largest shift of the few parameters of a camera.
+SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("wrong", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
+SHIFTED = "{of:@} shift by up to {shift} standard deviations[[, {rms} RMS]]."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
-OF_GIVEN = ("given_contradicted", "given_strained")  # a camera that changed bends the network against them
+# what given values contradict where a camera that changed, or a plate that slipped, bends the network
+OF_GIVEN = ("given_contradicted", "given_strained", "plate_sizes_contradict", "shape_of_control")
 
 ROWS = (
     Kind(
@@ -121,6 +123,7 @@ ROWS = (
         "Fix the plates to one another and photograph them anew, or adjust the photographs before and from "
         "{from} on as two surveys.",
         short="a plate that moved",
+        explains=OF_GIVEN,
     ),
     Kind(
         "too_many_to_test",
@@ -165,16 +168,16 @@ ROWS = (
         "note",
         "Zoom or focus may change between the photographs and shift the camera by up to {sigmas} standard "
         "deviations before a test shows it.",
-        "few photographs, or none that is tilted against the plate",
+        "few photographs, or none that is tilted against the given points",
         "Take more photographs, tilted by 30 to 45 degrees and rolled by 90 degrees.",
         explains=("camera_weakly_tested",),
     ),
     Kind(
-        "calibrated_from_two",
+        "calibrated_from_few",
         "warning",
-        "Two photographs calibrate the camera: hardly anything shows whether it changed between them, or "
-        "whether the given points are as stated.",
-        "nothing tells how much photographs of this camera differ anyhow",
+        "Camera {camera} is calibrated from {photographs} alone: hardly anything shows whether it changed, "
+        "or whether the given points are as stated.",
+        "one or two photographs of a camera do not show how much others would differ from them",
         "Take four photographs or more, tilted by 30 to 45 degrees and rolled by 90 degrees.",
     ),
     Kind(
