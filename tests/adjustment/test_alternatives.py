@@ -188,6 +188,18 @@ def dense() -> Dense:
     return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]], residual, found, spreads)
 
 
+def test_without_redundancy_only_rejected_image_points_have_a_likelihood() -> None:
+    """Five points in two photographs fit any relative orientation; it was a division by zero."""
+    network, truth = make_network(seed_of("no redundancy"), images=2, points=5, free=())
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    assert a.redundancy == 0
+    assert refit.log_likelihood(a) == refit.log_likelihood(a, freed=3) == 0
+    rejected = np.arange(len(network.image_points)) < 2
+    width, height = truth.cameras[0].size_px
+    found = refit.log_likelihood(replace(a, rejected=rejected))
+    assert found == pytest.approx(-2 * np.log(width * height))
+
+
 def test_whitening_makes_coordinates_independent_of_unit_variance(dense: Dense) -> None:
     r = dense.reduced
     assert r.used.tolist() == np.flatnonzero(~dense.a.rejected).tolist() and r.count == 2 * len(r.used)

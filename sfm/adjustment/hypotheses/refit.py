@@ -117,6 +117,8 @@ def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns)
 def log_likelihood(a: Adjustment, freed: int = 0) -> float:
     """Return ln of the likelihood, rejected image points spread evenly over their photograph.
 
+    Without redundancy, where every network fits, it is that of the rejected image points alone.
+
     Args:
         a: the adjustment.
         freed: unknowns in it that others it is compared with do not have; their price is reckoned apart.
@@ -125,6 +127,8 @@ def log_likelihood(a: Adjustment, freed: int = 0) -> float:
     """
     sizes = np.array([float(np.prod(camera.size_px)) for camera in a.estimate.cameras])
     area = sizes[a.network.camera[a.network.image_points.image[a.rejected]]]
+    if a.redundancy <= 0:
+        return float(-np.log(area).sum())
     redundancy = a.redundancy + freed
     variance = a.sigma0_px**2 * a.redundancy / redundancy
     return float(-redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
