@@ -11,9 +11,12 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import other_solutions
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
+from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
+from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.principal_distance import contradicted
-from tests.survey.weak_networks import outcome_of, study
+from sfm.survey.inputs.survey import CameraSetup
+from tests.survey.weak_networks import outcome_of, study, weak_network
 from tests.synthetic import make_network, seed_of
 
 
@@ -49,6 +52,17 @@ def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
     found = outcome_of(0)
     assert found.over_sigma < 2 and found.c == pytest.approx(1, abs=0.01)
     assert "better_solution_taken" in found.kinds and "held_to_converge" not in found.kinds
+
+
+def test_an_observed_c_beside_too_few_image_points_is_bad_and_no_failure() -> None:
+    """17 image points of 8 points leave no redundancy: nothing scales their weights against those of c."""
+    weak = weak_network(10)
+    (one,), c = weak.survey.cameras, weak.truth.cameras[0].value("c")
+    camera = CameraSetup(
+        name=one.name, size_px=one.size_px, pixel_mm=one.pixel_mm, weighted={"c": (c, 0.1 * c)}
+    )
+    result = run_survey(replace(weak.survey, cameras=(camera,)))
+    assert result.adjustment.redundancy == 0 and findings_of(result).verdict.level == "bad"
 
 
 @pytest.mark.parametrize(

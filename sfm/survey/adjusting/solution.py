@@ -323,8 +323,9 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
     task, given = _judged(start, free, plates)
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.settled.adjustment
-        factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
-        task = replace(task, factor=factor)
+        if alone.redundancy > 0:  # else nothing tells but what was stated
+            factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
+            task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
         free = None  # what they give alone is no start either, nor are the cameras that it gave photographs
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
