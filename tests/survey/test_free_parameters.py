@@ -14,6 +14,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.survey.adjusting.free_parameters import FreeParameters, choose_free_parameters
+from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -98,12 +99,59 @@ def test_what_a_network_does_not_determine_is_held() -> None:
     assert not {"c", "x0", "y0"} & set(chosen(network, truth).cameras[0].free)
 
 
-def test_three_photographs_hold_the_camera_and_say_so() -> None:
+@pytest.mark.parametrize("images", [1, 2])
+def test_two_photographs_hold_the_camera_and_say_so(images: int) -> None:
+    network, truth = make_network(seed_of("two photographs"), images=2, points=40)
+    if images == 1:
+        network = replace(network, image_points=network.image_points.select(network.image_points.image == 0))
+    found = chosen(network, truth)
+    assert found.cameras[0].free == found.cameras[0].weighted == ()
+    (note,) = found.remarks
+    assert note.kind == "interior_held" and note.severity == "note" and note.number("photographs") <= 2
+
+
+def test_three_photographs_observe_c_with_what_exif_data_are_worth() -> None:
     network, truth = make_network(seed_of("three photographs"), images=3, points=40)
     found = chosen(network, truth)
-    assert found.cameras[0].free == ()
-    (note,) = found.remarks
-    assert note.kind == "interior_held" and note.severity == "note" and note.number("photographs") == 3
+    (one,) = found.cameras
+    assert dict(one.weighted)["c"] == pytest.approx((10.2, 1.02)) and one.c_mm is None
+    assert one.adjusted == (*one.free, "c") and "c" not in one.free
+    assert {"K1"} <= set(one.free)
+    assert found.estimate.cameras[0].value("c") == 10.2 and not found.estimate.cameras[0].free[0]
+    observed, freed = found.remarks
+    assert (
+        observed.kind == "c_observed" and observed.severity == "note" and observed.number("photographs") == 3
+    )
+    assert observed.number("given") == 10.2 and observed.number("sigma") == pytest.approx(1.02)
+    assert freed.kind == "parameters_freed" and set(freed.names("parameters")) == set(one.free)
+
+
+def test_c_that_the_survey_states_is_observed_whatever_the_orientation_began_from() -> None:
+    network, truth = make_network(seed_of("three photographs"), images=3, points=40)
+    start = nominal(network, truth)
+    p = start.cameras[0].parameters.copy()
+    p[0] *= 0.9
+    tried = replace(start, cameras=(start.cameras[0].with_parameters(p),))
+    found = choose_free_parameters(survey_with(c_mm=10.1), network, tried)
+    assert dict(found.cameras[0].weighted)["c"] == pytest.approx((10.1, 1.01))
+
+
+def test_two_focal_lengths_are_observed_with_their_ratio() -> None:
+    """Apart, each by 10 %, they would stretch the photographs to one side."""
+    network, truth = make_network(seed_of("three photographs"), images=3, points=40)
+    known = truth.cameras[0]
+    pixel = (float(known.pixel_mm[0]), float(known.pixel_mm[1]))
+    camera = camera_from_values("a", "opencv", known.size_px, pixel, c_mm=10.2)
+    survey = survey_with(model="opencv")
+    found = choose_free_parameters(survey, network, replace(truth, cameras=(camera,)))
+    (one,) = found.cameras
+    assert [name for name, _ in one.weighted] == ["fx", "fy"]
+    ((_, _, rho),) = one.correlations
+    assert np.sqrt(2 * (1 - rho)) * 0.1 == pytest.approx(1e-3)
+    split, estimate = split_cameras(found.cameras, network, found.estimate)
+    a = adjust(split, estimate, datum=Datum("free"), reject="none")
+    fx, fy = a.estimate.cameras[0].value("fx"), a.estimate.cameras[0].value("fy")
+    assert abs(fx / fy * pixel[0] / pixel[1] - 1) < 4e-3
 
 
 def test_control_determines_what_three_photographs_do_not() -> None:

@@ -19,6 +19,14 @@ ROWS = (
         "Write free = [] to hold all parameters fixed.",
     ),
     Kind(
+        "c_observed",
+        "note",
+        "{parameter} of camera {camera} was observed, as {photographs:photograph} {photographs:does|do} not "
+        "determine it: {given} with a standard deviation of {sigma}.",
+        "the survey file does not state what is free; a focal length of EXIF data is no better",
+        "State a calibration, or add photographs, some turned by 90 degrees.",
+    ),
+    Kind(
         "interior_held",
         "note",
         "The interior orientation of camera {camera} was held fixed, as {photographs:photograph} "

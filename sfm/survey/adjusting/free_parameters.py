@@ -3,7 +3,8 @@
 A lens that is held at nominal values bends the network; parameters that a network does not determine take
 its precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The one that the network
 determines worst is held until all others are known better than they are of any camera; then what else the
-image points demand is freed, by the test of held parameters.
+image points demand is freed, by the test of held parameters. Three photographs fit many a c, with another
+shape of the object each: of them c is observed, with what a focal length of EXIF data is worth.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 7.3.2 (self-calibration).
 """
@@ -18,16 +19,20 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import KNOWN_WITHOUT, corner_shift
-from sfm.distortion.models import MODELS
+from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
+from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
-MIN_PHOTOGRAPHS = 4  # of a free network; fewer fit many a camera, with another shape of the object each
+MIN_PHOTOGRAPHS = 3  # of a free network; a pair determines hardly anything of a camera
+MIN_DETERMINING_C = 4  # photographs of a free network
+C_SIGMA = 0.1  # of c by EXIF data, of c: focusing from infinity to 1 : 5 makes twice as much, c = f (1 + 1/5)
+RATIO_SIGMA = 1e-3  # of the ratio of two focal lengths, which is that of the sides of a pixel
 MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take part in the decision
 ROUNDS = 3  # of tests of what is still held
 FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing tells which; then the others
@@ -39,8 +44,8 @@ Chosen = list[set[str] | None]  # free parameters of each camera; None where the
 class FreeParameters:
     """What is adjusted of the cameras of a survey."""
 
-    cameras: tuple[CameraSettings, ...]  # all of which say what is free
-    estimate: Estimate  # with the same freed in its cameras
+    cameras: tuple[CameraSettings, ...]  # all of which say what is free, and of which c is observed
+    estimate: Estimate  # with the same freed in its cameras; observed ones keep their values
     remarks: tuple[Remark, ...]  # on each camera that the survey says nothing about
 
 
@@ -70,24 +75,59 @@ def choose_free_parameters(
         network, estimate, everything, min_points=MIN_IMAGE_POINTS,
         min_rays=np.full(len(network.points), MIN_RAYS),
     )  # fmt: skip
+    settings = survey.cameras
     if images.sum() < (1 if datum == "control" else MIN_PHOTOGRAPHS):
         names = [one if one is None else set() for one in names]
     else:
         part, start = reduce_network(network, estimate, images, points, everything)
         alone = None
-        if images.sum() >= MIN_PHOTOGRAPHS:  # control may be wrong, and hide what the image points demand
+        if images.sum() >= MIN_DETERMINING_C:  # control may be wrong, and hide what the image points demand
             alone = _determined(without_given(part), start, names, "free", extend=extend)
+        elif datum != "control":
+            seen = set(silent) & set(part.camera.tolist())
+            settings = tuple(
+                _with_observed_c(one, camera) if a in seen else one
+                for a, (one, camera) in enumerate(zip(settings, start.cameras, strict=True))
+            )
+            own = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
+            part, start = split_cameras(own, without_given(part), start)  # others are as they were
+            alone = _determined(part, start, names, "free", extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
             with_control = _determined(part, start, names, datum, extend=extend)
             if alone is None or _has_each_c(start, names, with_control):
                 alone = with_control
-        names = alone
+        names = [
+            chosen if chosen is None else chosen - set(dict(one.weighted))
+            for one, chosen in zip(settings, alone, strict=True)
+        ]
     cameras = tuple(
         one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
-        for one, chosen in zip(survey.cameras, names, strict=True)
+        for one, chosen in zip(settings, names, strict=True)
     )
-    remarks = tuple(_remark(cameras[a], int(images[network.camera == a].sum())) for a in silent)
-    return FreeParameters(cameras, _with_free(estimate, names), remarks)
+    remarks = [
+        one
+        for a in silent
+        for one in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
+    ]
+    return FreeParameters(cameras, _with_free(estimate, names), tuple(remarks))
+
+
+def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:
+    """Return the settings with c, or the focal lengths, as an observation of the given value.
+
+    It is that of the survey file, else that of the start values, by EXIF data.
+    """
+    start_mm = camera.c_px * float(np.mean(camera.pixel_mm))
+    c = camera.parameters * ((settings.c_mm or start_mm) / start_mm)
+    focal = np.flatnonzero(camera.plays(Role.FOCAL))
+    rho = 1 - (RATIO_SIGMA / C_SIGMA) ** 2 / 2
+    return settings.model_copy(
+        update={
+            "c_mm": None,  # the observed value says it
+            "weighted": tuple((camera.names[s], (float(c[s]), C_SIGMA * abs(float(c[s])))) for s in focal),
+            "correlations": tuple((camera.names[focal[0]], camera.names[s], rho) for s in focal[1:]),
+        }
+    )
 
 
 def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
@@ -117,12 +157,17 @@ def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, ex
 
 
 def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tuple[Chosen, Adjustment | None]:
-    """Hold the worst determined parameter until all others are known well enough; the last adjustment."""
+    """Hold the worst determined parameter until all others are known well enough; the last adjustment.
+
+    Observed parameters are not held: with the precision of their values they take part.
+    """
+    observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
     while any(names):
         adjusted = _adjusted(part, _with_free(start, names), datum)
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
-            for name in sorted(chosen or (), key=_rank):
+            index = start.cameras[a].names.index
+            for name in sorted((one for one in chosen or () if (a, index(one)) not in observed), key=_rank):
                 now = np.inf if adjusted is None else _reach(adjusted, a, name)
                 if now > reach:
                     worst, reach = (a, name), now
@@ -180,10 +225,23 @@ def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
     return tuple(name for name in MODELS[settings.model].names if name in chosen)
 
 
-def _remark(settings: CameraSettings, photographs: int) -> Remark:
-    """Return the remark on what was chosen."""
-    if settings.free:
-        return remark(
-            "parameters_freed", camera=settings.name, parameters=settings.free, photographs=photographs
+def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int) -> list[Remark]:
+    """Return the remarks on what was chosen."""
+    found = []
+    for name, (value, sigma) in settings.weighted[:1]:
+        unit = units[MODELS[settings.model].names.index(name)]
+        observed = remark(
+            "c_observed",
+            camera=settings.name,
+            parameter=name,
+            photographs=photographs,
+            given=(value, unit),
+            sigma=(sigma, unit),
         )
-    return remark("interior_held", camera=settings.name, photographs=photographs)
+        found.append(observed)
+    if settings.free:
+        freed = settings.free
+        found.append(
+            remark("parameters_freed", camera=settings.name, parameters=freed, photographs=photographs)
+        )
+    return found or [remark("interior_held", camera=settings.name, photographs=photographs)]
