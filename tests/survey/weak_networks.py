@@ -3,7 +3,10 @@
 `weak_network` makes one that depends on its number only; `study` runs surveys of many of them from scratch,
 and tells how wrong each result is and what was said of it. Object unit m.
 
-    python -m tests.survey.weak_networks FIRST END FILE    a line of FILE for each; none of FILE is repeated
+    python -m tests.survey.weak_networks FIRST END FILE [C_SIGMA]
+
+writes a line of FILE for each; none of FILE is repeated. With C_SIGMA nothing is said of what is free, and
+the start value of c is wrong by a random factor of that standard deviation, as of drafts of photographs.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, seed_of
 
@@ -92,6 +95,15 @@ def weak_network(number: int) -> Weak:
     return Weak(survey, network, truth, words)
 
 
+def unstated(weak: Weak, off: float) -> Weak:
+    """Return a weak network whose survey says nothing of its camera but c, which is wrong by a factor."""
+    stated, c = weak.survey.cameras[0], weak.truth.cameras[0].value("c")
+    camera = CameraSetup(name=stated.name, size_px=stated.size_px, pixel_mm=stated.pixel_mm, c_mm=off * c)
+    survey = replace(weak.survey)
+    object.__setattr__(survey, "cameras", (camera,))  # with observations a survey takes cameras as calibrated
+    return replace(weak, survey=survey, words=f"{weak.words}; not stated, c from {off:.2f} c")
+
+
 def _stations(
     rng: np.random.Generator, images: int, spread_deg: float, rolled: bool, c_mm: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -142,9 +154,16 @@ def _measured(
     )
 
 
-def outcome_of(number: int) -> Outcome:
-    """Run the survey of a weak network from scratch and hold its result against the truth."""
+def outcome_of(number: int, c_sigma: float | None = None) -> Outcome:
+    """Run the survey of a weak network from scratch and hold its result against the truth.
+
+    Args:
+        number: of the network.
+        c_sigma: standard deviation of the logarithm of the factor of c, with nothing stated of what is free.
+    """
     weak = weak_network(number)
+    if c_sigma is not None:
+        weak = unstated(weak, float(np.exp(c_sigma * seed_of(f"off{number}").standard_normal())))
     try:
         result = run_survey(weak.survey)
     except GeometryError as error:
@@ -172,18 +191,19 @@ def outcome_of(number: int) -> Outcome:
     )
 
 
-def study(numbers: Iterable[int], kept: Path | None = None) -> list[Outcome]:
+def study(numbers: Iterable[int], kept: Path | None = None, c_sigma: float | None = None) -> list[Outcome]:
     """Return the outcomes of weak networks, and print those that are wrong and believed.
 
     Args:
         numbers: numbers of the networks
         kept: file that keeps the outcomes, a JSON line each; those that stand in it are not computed again.
+        c_sigma: as of `outcome_of`.
     """
     lines = kept.read_text().splitlines() if kept is not None and kept.exists() else []
     done = {one.number: one for one in (Outcome(**json.loads(line)) for line in lines)}
     found = []
     for number in numbers:
-        one = done[number] if number in done else outcome_of(number)
+        one = done[number] if number in done else outcome_of(number, c_sigma)
         found.append(one)
         if kept is not None and number not in done:
             with kept.open("a") as file:
@@ -200,4 +220,5 @@ def study(numbers: Iterable[int], kept: Path | None = None) -> list[Outcome]:
 
 
 if __name__ == "__main__":
-    study(range(int(sys.argv[1]), int(sys.argv[2])), Path(sys.argv[3]))
+    first, end, file, *c_sigma = sys.argv[1:]
+    study(range(int(first), int(end)), Path(file), *map(float, c_sigma))
