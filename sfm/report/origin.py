@@ -48,7 +48,7 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
     """Raise OutputError where a folder has the result of another survey file or of other photographs.
 
     A result that does not state its origin, as one that a script wrote, is another's if it has another name,
-    or photographs that are not here.
+    or none of the photographs.
 
     Args:
         out: the folder.
@@ -67,7 +67,7 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
         except SurveyFileError:
             images = ()
         other_name = bool(survey) and name != survey
-        present = bool(images) and all((own.images / one).is_file() for one in images)
+        present = any((own.images / one).is_file() for one in images)
         if other_name or (photographs and not present):
             of = f"{counted(len(images), 'photograph')} ({listed(images)})"
             what = of if images else "no table of photographs"

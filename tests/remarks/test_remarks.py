@@ -96,13 +96,13 @@ def test_what_wrong_coordinates_pull_away_is_not_told_beside_them() -> None:
     assert (high.severity, pulled[1].severity) == ("error", "warning")
     for shift, severity, left in (
         (16.0, "error", ()),
-        (4.0, "warning", (high,)),
+        (4.0, "warning", ()),
         (2.0, "note", (high, pulled[1])),
     ):
         cause = remark("given_not_exact", of="control", sigma=(0.1, "mm"), shift=shift)
         assert cause.severity == severity
-        found = judge((cause, pulled[1], high), HEADLINES).remarks
-        assert set(kinds_of(found)) == {cause.kind, *kinds_of(left)}
+        verdict = judge((cause, pulled[1], high), HEADLINES)
+        assert set(kinds_of(verdict.remarks)) == {cause.kind, *kinds_of(left)} and verdict.level == "bad"
 
 
 def test_every_kind_that_is_explained_is_known() -> None:

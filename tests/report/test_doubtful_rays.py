@@ -56,6 +56,15 @@ def _blame(networks: int) -> Counter[str]:
     return count
 
 
+def test_given_coordinates_are_not_doubtful() -> None:
+    """Before, points of a plate were, whose rays show a wrong camera."""
+    network, truth, _ = _with_wrong_rays("three rays 0")
+    alpha = 1 - 0.95 ** (0.5 / len(network.image_points))
+    assert consistency_of(adjust(network, truth, alpha=alpha)).doubtful
+    given = network.with_control(network.points, truth.points)
+    assert not consistency_of(adjust(given, truth, datum="control", alpha=alpha)).doubtful
+
+
 def test_a_point_whose_wrong_ray_was_not_the_one_rejected_is_doubtful() -> None:
     count = _blame(6)
     assert count["wrong, doubtful"] >= 5

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.network import Estimate
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.principal_distance import not_calibrated
+from tests.plates import camera
 from tests.survey.seen_plates import FREE, Plates, about, plates_survey, run_plates
 from tests.synthetic import seed_of
 
@@ -40,3 +42,16 @@ def test_projection_uncertainty_is_not_that_of_a_guess(tmp_path: Path) -> None:
         estimate, cameras=tuple(replace(one, free=np.ones_like(one.free)) for one in estimate.cameras)
     )
     assert not_calibrated(asked, free) == ()
+
+
+def test_a_camera_is_known_by_its_whole_name(tmp_path: Path) -> None:
+    """Before, of "cam" and "cam 2" both were reported where the second was held."""
+    survey = plates_survey(tmp_path, 1)
+    first = replace(camera(), name="cam", free=np.ones(10, dtype=bool))
+    second = replace(first, name="cam 2 a.png", free=np.zeros(10, dtype=bool))
+    both = tuple(survey.cameras[0].model_copy(update={"name": name}) for name in ("cam", "cam 2"))
+    survey = replace(survey, cameras=both)
+    nothing = np.zeros((0, 3))
+    estimate = Estimate((first, second), nothing, np.zeros((0, 3, 3)), nothing)
+    (found,) = not_calibrated(survey, estimate)
+    assert found.names("camera") == ("cam 2",)

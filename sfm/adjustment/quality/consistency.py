@@ -50,7 +50,9 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
         return Consistency((), None)
     parts = point_normals(adjustment)
     rays = parts.rows_of_points(adjustment)
-    doubtful = doubtful_points(adjustment, parts, rays)
+    of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
+    fixed = {name for name, covariance in of_point if not covariance.any()}
+    doubtful = tuple(one for one in doubtful_points(adjustment, parts, rays) if one.point not in fixed)
     return Consistency(_large(adjustment, parts, rays), _uneven(by_photograph(adjustment)), doubtful)
 
 

@@ -134,8 +134,10 @@ def test_a_result_that_states_no_origin_is_known_by_its_name_and_photographs(tmp
     out.mkdir()
     images.mkdir()
     own = Origin(tmp_path / "survey.toml", images)
-    (out / "summary.json").write_text('{"survey": "bridge"}', encoding="utf-8")
     refuse_other_origin(out, own, survey="tower")  # no result
+    (out / "summary.json").write_text('{"survey": "bridge"}', encoding="utf-8")
+    with pytest.raises(OutputError, match=r"survey bridge with no table of photographs.*--overwrite"):
+        refuse_other_origin(out, own, survey="bridge")
     (out / "images.csv").write_text("image,X\na.jpg,1.0\nb.jpg,2.0\n", encoding="utf-8")
     with pytest.raises(OutputError, match=r"survey bridge with 2 photographs \(a.jpg, b.jpg\).*--overwrite"):
         refuse_other_origin(out, own, survey="bridge")
