@@ -42,7 +42,7 @@ DETECTABLE = 17.07  # noncentrality that one test at the level 0.001 finds with 
 SURE_LEVEL, SURE_POWER = 1e-6, 0.999
 UNCHECKED = {
     *("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested"),
-    *("calibration_weakly_tested", "calibrated_from_few"),
+    "calibrated_from_few",
     *("assumptions_untested", "photographs_untested", "too_many_to_test"),
 }
 ACCIDENTS = {"image_points_misnamed"}  # what gross errors are, and no cause of anything

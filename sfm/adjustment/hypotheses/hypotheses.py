@@ -33,7 +33,7 @@ from sfm.adjustment.hypotheses.score import (
     reduce_adjustment,
     squares_gained,
 )
-from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions, unchecked_calibration
+from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
@@ -99,16 +99,14 @@ def judge_alternatives(
     if not _is_calibration(final):
         return found
     try:
-        cause, weak = cause_in_calibration(final), unchecked_calibration(final)
+        cause = cause_in_calibration(final)
     except np.linalg.LinAlgError:
         return found
     if cause is not None:
         found = replace(found, causes=(remark_of(final, cause, unit),))
-        weak = ()
-    else:
-        weak = _calibrated_from_few(final) or weak
+    few = () if cause is not None else _calibrated_from_few(final)
     unchecked = (one for one in found.unchecked if one.kind not in OF_FREE_POINTS)
-    return replace(found, unchecked=(*weak, *unchecked))
+    return replace(found, unchecked=(*few, *unchecked))
 
 
 def _judge_free(

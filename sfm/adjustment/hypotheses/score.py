@@ -91,8 +91,7 @@ class Reduced:
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
-        H, g, squares = self._eliminated(D)[:3]
-        return H, g, squares
+        return self._eliminated(D)[:3]
 
     def shifts(self, D: FloatArray) -> FloatArray:
         """Return by how much object points shift where whitened columns (k, 2, q) are in the image points.
@@ -100,12 +99,6 @@ class Reduced:
         The shifts (n, 3, q) are those of a network that knows nothing of the columns.
         """
         return self._eliminated(D)[4]
-
-    def shifts_of_cameras(self, D: FloatArray) -> FloatArray:
-        """Return by how much free interior parameters shift, as `shifts`, in standard deviations, (i, q)."""
-        own = slice(6 * self.photographs, None)
-        sigma = np.sqrt(np.diagonal(self.Sinv)[own])
-        return np.asarray(self._eliminated(D)[5][own] / sigma[:, None])
 
     def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
         """Return what each photograph adds to the slope along a direction, after a step, (m,).
@@ -118,11 +111,8 @@ class Reduced:
         slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
         return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
 
-    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, ...]:
-        """Return H, g and squares of whitened columns, what unknowns leave of them, and their shifts.
-
-        The shifts are of object points (n, 3, q) and of photographs and cameras (a, q).
-        """
+    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return H, g and squares of whitened columns, what unknowns leave of them, and shifts of points."""
         n, q = len(self.L), D.shape[2]
         C = np.zeros((n, 3, q))
         np.add.at(C, self.point, np.swapaxes(self.B, 1, 2) @ D)
@@ -138,7 +128,7 @@ class Reduced:
         left = D - self.B @ by_points[self.point]
         left -= self.A[:, :, :6] @ by_cameras[: 6 * m].reshape(m, 6, q)[self.image]
         left -= self.A[:, :, 6:] @ by_cameras[6 * m :]
-        return H, g, squares, left, by_points, by_cameras
+        return H, g, squares, left, by_points
 
     def _by_cameras(self, D: FloatArray) -> FloatArray:
         """Return A'D, (a, q)."""

@@ -87,23 +87,6 @@ def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = 
     )
 
 
-def unchecked_calibration(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the remark on a calibration in which a change of c could stay unnoticed, with what it shifts.
-
-    Args:
-        a: adjustment of photographs of given points, with its covariance.
-
-    Raises:
-        numpy.linalg.LinAlgError: the network is not determined.
-    """
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
-    rows = count_alternatives(a)
-    changes = [one for one in _typical(a, reduced) if one.family is CAMERA_FAMILIES[0]]
-    reach = max((reach_of(one, a, reduced, columns, rows=rows) for one in changes), default=0.0)
-    return (remark("calibration_weakly_tested", sigmas=reach),) if reach > WRONG_SIGMAS else ()
-
-
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Return each held parameter, and a change of the camera and a strain of the object half way through.
 
@@ -133,9 +116,7 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int) -> float:
-    """Return by how much a result shifts at most before an alternative is named, in standard deviations.
-
-    These are coordinates; with control, which is given them, interior parameters.
+    """Return by how much coordinates shift at most before an alternative is named, in standard deviations.
 
     Args:
         one: the alternative.
@@ -152,8 +133,6 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     needed = needed_gain(rank, touched, one.search, rows)
     least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
-    if a.datum == "control":
-        return float(np.abs(reduced.shifts_of_cameras(D) @ longest).max(initial=0.0))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)

@@ -164,15 +164,6 @@ ROWS = (
         "Take more photographs from more directions, some of them rolled by 90 degrees.",
     ),
     Kind(
-        "calibration_weakly_tested",
-        "note",
-        "Zoom or focus may change between the photographs and shift the camera by up to {sigmas} standard "
-        "deviations before a test shows it.",
-        "few photographs, or none that is tilted against the given points",
-        "Take more photographs, tilted by 30 to 45 degrees and rolled by 90 degrees.",
-        explains=("camera_weakly_tested",),
-    ),
-    Kind(
         "calibrated_from_few",
         "warning",
         "Camera {camera} is calibrated from {photographs} alone: hardly anything shows whether it changed, "
