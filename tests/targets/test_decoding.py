@@ -18,8 +18,8 @@ from sfm.targets.detect import find_targets
 
 SUPER = 3
 TILE, ACROSS = 180, 8
-# Occluders: none, a straight edge, a disc.
-NOTHING, HALF_PLANE, DISC = 0, 1, 2
+# Occluders: none, a straight edge, a disc, straight edges on two opposite sides.
+NOTHING, HALF_PLANE, DISC, TWO_EDGES = 0, 1, 2, 3
 # Least difference between an occluder and the background, in steps from background to dot.
 VISIBLE = 0.15
 
@@ -131,8 +131,10 @@ def _paint(
                     ends += pattern >> (cells - 1 - int(place + cells) % cells) & 1
                 if ends == 3 or (spread >= 0 and ends > 0):
                     value = levels[1]
-            if (occluder[0] == HALF_PLANE and a * nx + b * ny > occluder[2]) or (
-                occluder[0] == DISC and math.hypot(a - ox, b - oy) < occluder[3]
+            if (
+                (occluder[0] == HALF_PLANE and a * nx + b * ny > occluder[2])
+                or (occluder[0] == TWO_EDGES and abs(a * nx + b * ny) > occluder[2])
+                or (occluder[0] == DISC and math.hypot(a - ox, b - oy) < occluder[3])
             ):
                 value = levels[2]
             out[i, j] = value
@@ -258,16 +260,48 @@ def test_light_that_spreads_about_oblique_rings_is_no_ink() -> None:
         assert [int(code) for code in found.code if code >= 0] == [number_of(bits)]
 
 
-def test_what_is_behind_one_side_of_a_ring_is_no_border() -> None:
-    behind = np.array([0.8, 0.0, 0.0, 0.5, -0.1, 0.1])
-    np.testing.assert_allclose(ring_reading._frame(behind, 1.0), [0.5, 0.0, 0.0, 0.5, 0.0, 0.0])
-    np.testing.assert_allclose(ring_reading._frame(behind, 0.8), 0.0)  # 0.3 is more than 0.35 x 0.8
-    np.testing.assert_allclose(ring_reading._frame(behind[:5], 1.0), 0.0)
+def test_a_border_is_on_all_four_sides_of_a_ring() -> None:
+    def find(behind: list[float], step: float = 1.0) -> list[int]:
+        return np.flatnonzero(ring_reading._find_border(np.array(behind), step)).tolist()
+
+    behind = [0.8, 0.0, 0.7, -0.1, 0.4, 0.2, 0.9, 0.0]
+    assert find(behind) == [0, 2, 4, 6]
+    assert find(behind, 0.9) == []  # 0.5 is more than half of 0.9
+    assert find([*behind, 0.7, 0.0]) == []
+    for level in (0.4, 1.0):
+        assert find([0, 0, level, level, 0, 0, level, level]) == []
+        assert find([level, 0, level, 0, level, 0, 0, 0]) == []
 
 
 def test_the_stroke_of_a_letter_is_no_border() -> None:
     """It has no free corners."""
-    np.testing.assert_allclose(ring_reading._frame(np.full(8, 0.8), 1.0), 0.0)
+    assert not ring_reading._find_border(np.full(8, 0.8), 1.0).any()
+
+
+def cut_rings(count: int, family: CodeFamily, seed: int) -> Rings:
+    """Return rings in a strip that is narrower than they are, on what has the grey of their dots."""
+    rng = np.random.default_rng(seed)
+    rings = random_rings(count, family, rng)
+    kind, across = np.full(count, TWO_EDGES), rng.uniform(0, 2 * np.pi, count)
+    half_width = rng.uniform(0.9 * family.inner, family.outer, count)
+    levels = rings.levels[:, [0, 1, 1]]
+    return replace(
+        rings,
+        diameter=rng.uniform(10, 30, count),
+        tilt=rng.uniform(0, np.radians(40), count),
+        levels=levels,
+        occluder=np.column_stack([kind, across, half_width, np.zeros(count)]),
+    )
+
+
+@pytest.mark.parametrize("name", ["ring12", "ring14"])
+def test_rings_that_are_cut_on_two_sides_are_not_read_wrong(name: str) -> None:
+    family = code_family(name)
+    assert isinstance(family, CodeFamily)
+    rings = cut_rings(128, family, 7)
+    read, elsewhere = decode(rings, family, np.random.default_rng(7))
+    assert not ((read >= 0) & (read != rings.number)).any()
+    assert elsewhere == 0
 
 
 @pytest.mark.slow

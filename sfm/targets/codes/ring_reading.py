@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.sampling import as_grey, bilinear
 from sfm.targets.codes.ring_cells import fit_cells
@@ -36,9 +36,6 @@ RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
 # Part of the circle just behind the ring that other things may cover, and what there may be behind a set
 # cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
-# Largest difference of what is behind opposite cells where it is the border of a label, in steps (0.32 where
-# cells are hardly resolved), and the least part of the circle behind which its corners are free (3 of 12).
-FRAME_TOLERANCE, CORNERS = 0.35, 0.25
 # Blur of the edge in a sharp photograph, px.
 SHARP_PX = 0.8
 # A ring may be interrupted by less than this angle, and an arc must be longer.
@@ -152,9 +149,10 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
 
     Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
     the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
-    clear cells, clear ring and what is behind set cells are at the level of the background, set cells at one
-    level but for shading, and each cell is the same on all radii and over its length. What the model does not
-    explain of the dot (misfit, in steps), as halos of sharpening, it does not explain of the samples.
+    clear cells, clear ring and what is behind set cells, but for the border of a label, are at the level of
+    the background, set cells at one level but for shading, and each cell is the same on all radii and over
+    its length. What the model does not explain of the dot (misfit, in steps), as halos of sharpening, it does
+    not explain of the samples.
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0
@@ -177,7 +175,7 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
     uneven = np.minimum(np.abs(level), glare)
     uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
-    behind = behind - _frame(behind, step)
+    behind = np.where(_find_border(behind, step), 0.0, behind)
     clutter = np.abs(behind) > GAP_TOLERANCE * step + noise
     tests = (
         np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
@@ -196,15 +194,17 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     return int(family.number[entry]), float(min(1.0, jump[at] / step))
 
 
-def _frame(behind: FloatArray, step: float) -> FloatArray:
-    """Return what is behind each cell and the opposite one alike, (cells,): the border of a label.
+def _find_border(behind: FloatArray, step: float) -> BoolArray:
+    """Return which cells the border of a label is behind, (cells,): what is on all four sides of a square.
 
-    It is printed about the dot, and all of it is alike; other things cover one side. It is a square, whose
-    corners are free, where the stroke of a letter is not. Rings of an odd number of cells show none.
+    It is about the dot, alike to half a step at each quarter of a turn, with free corners. Other things cover
+    one side or two, and an edge on four sides that reaches into the ring leaves no corner free behind it.
+    Rings whose number of cells is no multiple of four show no border.
     """
-    opposite = np.roll(behind, len(behind) // 2)
-    free = (np.abs(behind) <= GAP_TOLERANCE * step).mean() >= CORNERS
-    if len(behind) % 2 or not free or (np.abs(behind - opposite) > FRAME_TOLERANCE * step).any():
-        return np.zeros_like(behind)
-    alike = np.minimum(np.abs(behind), np.abs(opposite))
-    return np.where(behind * opposite > 0, np.sign(behind) * alike, 0.0)
+    if len(behind) % 4:
+        return np.zeros(len(behind), bool)
+    sides, clear = behind.reshape(4, -1), GAP_TOLERANCE * step
+    free_corner = (np.abs(sides.mean(axis=0)) <= clear).any()
+    alike = (np.ptp(sides, axis=0) <= HALF * step).all()
+    on_all_sides = (np.abs(sides) > clear).all(axis=0)
+    return np.tile(on_all_sides & free_corner & alike, 4)
