@@ -241,6 +241,25 @@ def test_what_the_model_lacks_at_curved_edges(major: float, minor: float, blur: 
     assert 0.6 * allowed < lacking < allowed
 
 
+def test_a_hot_pixel_is_no_mark() -> None:
+    """Residuals are a mark where several pixels have them."""
+    rng, side = np.random.default_rng(4), 48
+    y, x = np.mgrid[:side, :side]
+    ink = np.clip(12.5 - np.hypot(x - 24.2, y - 23.7), 0, 1).astype(np.float32)
+    dot = 200 - 160 * cv2.GaussianBlur(ink, (0, 0), 0.8) + rng.normal(0, 1, ink.shape)
+
+    def coherence(where: tuple[slice, slice], more: float) -> FloatArray:
+        picture = dot.copy()
+        picture[where] += more
+        start = np.array([[24.0, 24.0, 1 / 12, 0.0, 1 / 12]])
+        whole = np.ones((1, RAYS), bool), np.array([math.inf])
+        found = fit_ellipses(picture, start, np.array([-1]), 1.0, math.inf, *whole).statistics[0]
+        return np.asarray(found[[goodness.INSIDE, goodness.TOGETHER]] / found[goodness.SPREAD])
+
+    assert (coherence((slice(24, 25), slice(26, 27)), 150) < 6).all()
+    assert (coherence((slice(24, 26), slice(26, 28)), 20) > 15).all()
+
+
 @pytest.mark.parametrize("radius", [pytest.param(14.0, marks=pytest.mark.slow), 25.0])
 def test_stains_are_not_measured(radius: float) -> None:
     """Before: a target more than half a pixel from the centre in 33 and 61 % of the stained dots."""

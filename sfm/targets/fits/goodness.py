@@ -137,7 +137,8 @@ def judge_coherence(
     """Set the largest sums of residuals that lie together, inside and anywhere, and their robust deviation.
 
     They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit,
-    and not so far outside that neighbours begin. Inside is what can be left out of the fit.
+    and not so far outside that neighbours begin. Inside is what can be left out of the fit. The
+    largest residual of a square counts as much as the others together at most: a hot pixel is alone.
     """
     statistics[INSIDE], statistics[TOGETHER], statistics[SPREAD] = 0.0, 0.0, max(noise, ROUNDING)
     if n == 0:
@@ -148,6 +149,7 @@ def judge_coherence(
     right, bottom = int(pixels[0, :n].max()), int(pixels[1, :n].max())
     # sums of residuals, of weights and of pixels that are not deep inside over all rows and columns before
     sums, size = np.zeros((3, bottom - top + 2, right - left + 2)), np.empty(n)
+    residuals = np.zeros((bottom - top + 1, right - left + 1))
     for first in range(0, n, model.BLOCK):
         m = min(model.BLOCK, n - first)
         model.linearise(pixels, first, m, theta, length, saturation, J)
@@ -157,7 +159,7 @@ def judge_coherence(
             d, row, column = rho * (rho - 1) / nw, int(y) - top + 1, int(x) - left + 1
             size[first + i] = abs(residual)
             if d < band:
-                sums[0, row, column] = residual
+                sums[0, row, column] = residuals[row - 1, column - 1] = residual
                 sums[1, row, column] = J[model.WEIGHT + i]
                 sums[2, row, column] = d > -deep
     for k in range(3):
@@ -170,11 +172,19 @@ def judge_coherence(
     for i in range(side, sums.shape[1]):
         for j in range(side, sums.shape[2]):
             weight = _within(sums[1], i, j, side)
-            if weight >= 0.5 * side * side:
-                together = abs(_within(sums[0], i, j, side)) / math.sqrt(weight)
+            if weight < 0.5 * side * side:
+                continue
+            deep_inside = _within(sums[2], i, j, side) < 0.5
+            total, root = _within(sums[0], i, j, side), math.sqrt(weight)
+            if abs(total) > root * (min(inside, anywhere) if deep_inside else anywhere):
+                sign, largest = math.copysign(1.0, total), 0.0
+                for y in range(i - side, i):
+                    for x in range(j - side, j):
+                        largest = max(largest, sign * residuals[y, x])
+                together = min(abs(total), 2 * (abs(total) - largest)) / root
                 anywhere = max(anywhere, together)
-                if together > inside and _within(sums[2], i, j, side) < 0.5:
-                    inside = together
+                if deep_inside:
+                    inside = max(inside, together)
     statistics[INSIDE], statistics[TOGETHER] = inside, anywhere
     statistics[SPREAD] = max(1.4826 * np.median(size), noise, ROUNDING)
 
