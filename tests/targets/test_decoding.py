@@ -11,7 +11,7 @@ import pytest
 from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.codes import ring_reading
+from sfm.targets.codes import ring_cells, ring_reading
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily, smallest_rotation
 from sfm.targets.detect import find_targets
@@ -258,6 +258,12 @@ def test_light_that_spreads_about_oblique_rings_is_no_ink() -> None:
     for bits in ("110000110000", "101001101001", "110111110000"):
         found = find_targets(oblique_ring(bits, 0.8), polarity="bright", codes="necklace12")
         assert [int(code) for code in found.code if code >= 0] == [number_of(bits)]
+
+
+def test_glow_is_bounded_by_the_size_of_the_dot_and_in_px() -> None:
+    for long, short, bound in ((12.0, 4.0, 1.0), (30.0, 30.0, 1.5)):
+        shape = np.array([1 / short, 0.0, 1 / long])
+        assert ring_cells._largest_glow(shape) == pytest.approx(bound)
 
 
 def test_a_border_is_on_all_four_sides_of_a_ring() -> None:

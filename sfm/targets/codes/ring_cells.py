@@ -25,9 +25,12 @@ _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
 # Every edge of what is printed lies outwards by the spread of the ink, in radii of the dot as it is measured.
 # Ink of 0.4 mm around a dot of 6 mm is 0.12. Every edge of a light mark lies outwards by that of the light,
 # in px: in an oblique ring that is more of its short radii. Both are negative where light eats into marks.
+# Half the part of the short semi-axis loses one of seven oblique rings on a screen; half or twice that
+# in px, for large dots, changes none of them.
 MAX_SPREAD, MAX_GLOW_PX, MAX_GLOW = 0.14, 1.5, 0.25  # the last in short semi-axes
 # What the spreads and the blur of the cells' ends over that of the dot are before the ring is looked at: 0
 # and 1 with these standard deviations, the last of its logarithm.
+# That of the glow is in px; half or twice as much changes none of seven oblique rings on a screen.
 _SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25
 # First steps of the search for the place of the first cell (in cells), spread, glow and ln blur; halvings of
 # them, each where no step is an improvement; rounds at most.

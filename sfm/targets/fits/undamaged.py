@@ -45,6 +45,7 @@ POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
 MIN_CURVATURE_BLURS = 2.0
 # Mean residual that it leaves in a square of two blurs, over the contrast, at most: for each blur over that
 # curvature and each part of 1 that the short axis is shorter than the long one. It is exact for circles.
+# Rendered ellipses with a ratio of the axes of 0.26 to 0.4 and blurs of 0.77 to 3.6 px need 0.032 to 0.042.
 MISFIT = 0.045
 # Smaller targets have too few pixels to tell damage from another shape.
 MIN_RADIUS_PX = 4.0
