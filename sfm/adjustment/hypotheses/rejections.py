@@ -164,7 +164,7 @@ def _of_places(
             points=tuple(a.network.points[one.point] for one in some),
             distance=(max(one.distance for one in some), unit),
             shift=max(one.over_sigma for one in some),
-            rms=0.0,  # rejected image points do not shift the others
+            wrong=0.0,  # rejected image points do not shift the others
             **{"from": names[start]},
         )
         for start, some in sorted(together.items())
