@@ -11,7 +11,7 @@ from sfm.adjustment.quality.consistency import consistency_of
 from tests.survey.seen_plates import SIGMA_PX, Plates, about, plates_survey, run_plates
 from tests.synthetic import seed_of
 
-RUNS = 8
+RUNS = 4
 
 
 def test_a_plate_better_than_stated_costs_no_image_points(tmp_path: Path) -> None:

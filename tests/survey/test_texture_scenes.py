@@ -11,6 +11,7 @@ from tests.survey.texture_scenes import KINDS, NUMBERS, SHARE, WRONG, outcome_of
 from tests.synthetic import seed_of
 
 
+@pytest.mark.slow
 def test_moving_water_is_left_out_of_a_shore(tmp_path: Path) -> None:
     rng = seed_of("water 0")
     scene = water(rng)
