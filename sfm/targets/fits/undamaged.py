@@ -78,7 +78,9 @@ def fit_undamaged(
 
     k = len(start)
     every = fit(start, sign, np.ones((k, RAYS), bool), np.full(k, np.inf))
-    classes = sizes_apart(_radii(start)) or [np.zeros(0, dtype=np.int64)]
+    alike = (np.flatnonzero(sign == one) for one in (1, -1))  # light and compression shift edges by polarity
+    classes = [rows[one] for rows in alike for one in sizes_apart(_radii(start[rows]))]
+    classes = classes or [np.zeros(0, dtype=np.int64)]
     found = [_repaired(_some_of(every, one), sign[one], fit, noise**2, least_variance) for one in classes]
     back = np.argsort(np.concatenate(classes))
 
