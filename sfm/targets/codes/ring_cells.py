@@ -112,24 +112,11 @@ def fit_cells(
                         tried[parameter] += sign * steps[parameter]
                         if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                             continue
-                        s = blur[k] * math.exp(tried[3])
-                        near, far = _spread_ring(inner, outer, tried[1])
-                        if not _sample(
-                            image,
-                            xy[k],
-                            _without_glow(shape[k], tried[2]),
-                            levels[k],
-                            s,
-                            tried[2],
-                            near,
-                            far,
-                            samples,
-                            sigma,
-                            ring_part,
-                            dot_part,
+                        if not _model(
+                            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, bits, tried),
+                            *(samples, sigma, ring_part, dot_part, W),
                         ):
                             continue
-                        _mixture(sigma, tried[0], _shifts(bits, tried[1], tried[2] / s, near, far), W)
                         cost = _solve(samples, ring_part, dot_part, W, N, c)
                         cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
                         if cost < least:
@@ -141,28 +128,46 @@ def fit_cells(
                     if halved == _HALVINGS:
                         break
                     steps /= 2
-        near, far = _spread_ring(inner, outer, found[1])
-        s = blur[k] * math.exp(found[3])
-        if not _sample(
-            image,
-            xy[k],
-            _without_glow(shape[k], found[2]),
-            levels[k],
-            s,
-            found[2],
-            near,
-            far,
-            samples,
-            sigma,
-            ring_part,
-            dot_part,
+        if not _model(
+            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, bits, found),
+            *(samples, sigma, ring_part, dot_part, W),
         ):
             continue
-        _mixture(sigma, found[0], _shifts(bits, found[1], found[2] / s, near, far), W)
         if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
             _compare(samples, ring_part, dot_part, W, N, c, out[k])
             out[k, SPREAD] = found[1]
     return out
+
+
+@compiled
+def _model(
+    image: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    levels: FloatArray,
+    blur: float,
+    inner: float,
+    outer: float,
+    bits: FloatArray,
+    ring: FloatArray,
+    samples: FloatArray,
+    sigma: FloatArray,
+    ring_part: FloatArray,
+    dot_part: FloatArray,
+    W: FloatArray,
+) -> bool:
+    """Fill the samples of a ring and what its cells have of them; False where the photograph cuts it.
+
+    `ring` is its place of the first cell, spread, glow, and ln of the blur over that of the dot; `bits` is
+    1.0 for set cells. The others are those of `fit_cells`, of one dot, of `_sample` and `_mixture`.
+    """
+    s = blur * math.exp(ring[3])
+    near, far = _spread_ring(inner, outer, ring[1])
+    without = _without_glow(shape, ring[2])
+    if not _sample(image, xy, without, levels, s, ring[2], near, far, samples, sigma, ring_part, dot_part):
+        return False
+    _mixture(sigma, ring[0], _shifts(bits, ring[1], ring[2] / s, near, far), W)
+    return True
 
 
 @compiled
