@@ -6,6 +6,7 @@ The distortion models are in `sfm.distortion`; a camera holds the values of one 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -255,6 +256,14 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
     return tuple(name for name, _ in families), np.array(
         [families.index(key) for key in keys], dtype=np.int64
     )
+
+
+def base_name(name: str, names: Iterable[str]) -> str:
+    """Return which of some cameras one is, by its name, which may have a photograph behind; "" if none.
+
+    Of names that begin alike it is the longest.
+    """
+    return max((one for one in names if f"{name} ".startswith(f"{one} ")), key=len, default="")
 
 
 def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
+from sfm.camera import base_name
 from sfm.conventions import FloatArray
 from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
@@ -101,14 +102,13 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
     survey file, else two thirds of the largest image radius, as is usual. A camera that has no such form, as
     with K4 or distortion that cannot be balanced there, has no rows.
     """
-    given = findings.result.balance_radius_mm
+    given = dict(findings.result.balance_radius_mm)
     a = findings.result.adjustment
     for camera, own in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         if camera.model != BALANCED_MODEL:
             continue
         half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
-        of_survey = [R0 for name, R0 in given if camera.name == name or camera.name.startswith(f"{name} ")]
-        R0 = of_survey[0] if of_survey else USUAL_R0 * half
+        R0 = given.get(base_name(camera.name, given), USUAL_R0 * half)
         try:
             rows = to_balanced(tuple(zip(camera.names, camera.parameters.tolist(), strict=True)), R0)
         except GeometryError:

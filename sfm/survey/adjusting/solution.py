@@ -15,6 +15,7 @@ from sfm.adjustment.quality.other_solutions import OtherSolution, other_solution
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import base_name
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
@@ -472,8 +473,8 @@ def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray)
 
 def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     """Return the remarks on pixels by nominal sensor sizes, of the first camera of each of the survey's."""
-    first = {one.name: camera for one in survey.cameras for camera in reversed(estimate.cameras)
-             if camera.name == one.name or camera.name.startswith(f"{one.name} ")}  # fmt: skip
+    names = [one.name for one in survey.cameras]
+    first = {base_name(camera.name, names): camera for camera in reversed(estimate.cameras)}
     settings = [one for one in survey.cameras if one.name in first]
     pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
     return unlike_squares(settings, pixels, [one.adjusted for one in settings])

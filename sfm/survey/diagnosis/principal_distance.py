@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sfm.camera import base_name
 from sfm.distortion.models import MODELS
 from sfm.network import Estimate
 from sfm.remarks.remark import Remark, remark
@@ -77,17 +78,12 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     remarks, names = [], [one.name for one in survey.cameras]
     for one in survey.cameras:
         name = MODELS[one.model].names[0]
-        own = [camera for camera in estimate.cameras if _survey_name(camera.name, names) == one.name]
+        own = [camera for camera in estimate.cameras if base_name(camera.name, names) == one.name]
         held = next((camera for camera in own if not camera.free[0]), None)
         if name in one.may_be_free and held is not None:
             value = held.c_px * float(np.mean(held.pixel_mm))
             remarks.append(remark("calibration_failed", camera=one.name, held=(value, "mm")))
     return tuple(remarks)
-
-
-def _survey_name(name: str, names: list[str]) -> str:
-    """Return the camera of the survey that an adjusted camera, of one photograph perhaps, belongs to."""
-    return max((one for one in names if f"{name} ".startswith(f"{one} ")), key=len, default="")
 
 
 def _calibrates(survey: Survey) -> bool:

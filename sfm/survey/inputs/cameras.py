@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values
+from sfm.camera import Camera, base_name, camera_from_values
 from sfm.conventions import IntArray
 from sfm.display import counted
 from sfm.distortion.balanced import from_balanced
@@ -162,9 +162,7 @@ def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCamer
     Values of a photograph or group begin with the name of its camera.
     """
     for row, name in enumerate(given.camera if given is not None else ()):
-        if given is not None and not any(
-            name == one.name or name.startswith(f"{one.name} ") for one in settings
-        ):
+        if given is not None and not base_name(name, (one.name for one in settings)):
             raise SurveyFileError(
                 f"{given.table.place(row)}: camera '{name}' is not in the survey, expected one of "
                 f"{', '.join(one.name for one in settings)}"
