@@ -212,13 +212,18 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
 
 def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Return the alternative of residuals that depend on the place in the photograph."""
-    D = reduced.whiten(format_columns(a))
+    return _in_all(reduced, FORMAT, format_columns(a))
+
+
+def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[Alternative]:
+    """Return the alternative of a family whose columns, px, (k, 2, q), are the same in all photographs."""
+    D = reduced.whiten(columns)
     H, g, squares = reduced.project(D)
     gain = gain_of(H, g, squares)
     if gain.rank:
-        scores = reduced.scores(D @ gain.beta, D @ gain.beta)
-        spread = _of_scores(scores, float(gain.beta @ H @ gain.beta))
-        yield _made(reduced, FORMAT, "all", np.ones(reduced.photographs), gain, 0.0, spread)
+        step = D @ gain.beta
+        spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
+        yield _made(reduced, family, "all", np.ones(reduced.photographs), gain, 0.0, spread)
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
@@ -273,13 +278,7 @@ def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternati
     """Return the alternatives of control that is strained or bent, as all photographs show it."""
     for family in OF_PHOTOGRAPHS:
         if not family.of_camera:
-            D = reduced.whiten(columns.freedoms[:, :, list(family.places)])
-            H, g, squares = reduced.project(D)
-            gain = gain_of(H, g, squares)
-            if gain.rank:
-                step = D @ gain.beta
-                spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
-                yield _made(reduced, family, "all", np.ones(reduced.photographs), gain, 0.0, spread)
+            yield from _in_all(reduced, family, columns.freedoms[:, :, list(family.places)])
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:

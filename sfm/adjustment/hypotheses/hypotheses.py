@@ -94,9 +94,10 @@ def judge_alternatives(
         return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
-    without = "control" if _is_calibration(final) or not final.unknown_counts[2] else None
+    calibration = _is_calibration(final)
+    without = "control" if calibration or not final.unknown_counts[2] else None
     found = _judge_free(free_network(final), unit, bodies, without)
-    if not _is_calibration(final):
+    if not calibration:
         return found
     try:
         cause = cause_in_calibration(final)
