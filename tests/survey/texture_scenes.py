@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
+from benchmarks.textured import covariance_on_centres
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
@@ -353,22 +353,10 @@ def _errors(result: SurveyResult, scene: Scene) -> tuple[float, float, int]:
     extent = float(np.sqrt(((truth - truth.mean(axis=0)) ** 2).sum(axis=1).mean()))
     rms = float(np.sqrt((error**2).sum(axis=1).mean()))
     m = len(on)
-    joint = marginal_of(a).joint((6 * np.arange(m)[:, None] + np.arange(3)).ravel(), np.zeros(0, np.int64))
-    S = _onto_centres(a.estimate.position)
-    variance = np.trace(S @ joint @ S.T) / m
+    of_centres = np.diagonal(covariance_on_centres(a)).reshape(m, 6)[:, :3]
+    variance = of_centres.sum(axis=1).mean()
     stated = placed.scale * float(np.sqrt(max(variance, 0.0)))
     return rms / stated if stated > 0 else np.inf, rms / extent, m
-
-
-def _onto_centres(position: FloatArray) -> FloatArray:
-    """Return the S-transformation of centres onto a datum on all of them, (3m, 3m). Baarda (1973)."""
-    away = position - position.mean(axis=0)
-    G = np.zeros((len(position), 3, 7))
-    G[:, :, :3] = np.eye(3)
-    G[:, :, 3:6] = -np.cross(away[:, None], np.eye(3)[None]).transpose(0, 2, 1)
-    G[:, :, 6] = away
-    Q = np.linalg.qr(G.reshape(-1, 7))[0]
-    return np.asarray(np.eye(len(Q)) - Q @ Q.T)
 
 
 def study(first: int, end: int, kinds: list[str]) -> list[tuple[str, int, Outcome]]:
