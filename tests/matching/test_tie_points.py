@@ -26,7 +26,7 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import SHARED, Covered, largest_alike, points_apart
+from sfm.matching.lsm.coverage import SHARED, Covered, Windows, first_alike, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -246,9 +246,9 @@ def test_covered_pixels_are_not_free() -> None:
     assert covered.free_middles(0, 11)[y, x].tolist() == [False, True, False, True]
 
 
-def test_windows_are_as_large_as_the_surface_bears() -> None:
-    assert largest_alike([(15, 3.1), (11, 3.0)]) == 15  # noise alone: as many pixels, as precise
-    assert largest_alike([(15, 3.4), (11, 3.0)]) == 11
+def test_preferred_windows_give_way_to_clearly_better_ones() -> None:
+    assert first_alike([(Windows(15), 3.1), (Windows(11), 3.0)]) == Windows(15)
+    assert first_alike([(Windows(15), 3.4), (Windows(11), 3.0)]) == Windows(11)
 
 
 def test_windows_of_a_plane_are_seen_in_perspective() -> None:
@@ -279,7 +279,7 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     )
     ties = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (3 * n, 1, 1)))
     arguments = (photographs, truth, camera, ties)
-    found = find_covering_points(*arguments, window_px=15, side_px=15)
+    found = find_covering_points(*arguments, windows=Windows(15), side_px=15)
     seen, count = found.image_points, np.bincount(found.image_points.point)
     assert len(found.points) > 3 * n and (count == 3).all()
     # every reference is on whole pixels; no pixel of it is in two windows, and most pixels are in one
@@ -299,13 +299,13 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     height = found.points[:, 2] - render.height(found.points[:, 0], found.points[:, 1])
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
-    assert len(find_covering_points(*arguments, window_px=15, side_px=15, references=[]).points) == 0
+    assert len(find_covering_points(*arguments, windows=Windows(15), side_px=15, references=[]).points) == 0
     assert len(seen) >= 0.95 * found.matched and remarks_on_disagreement(found) == ()
     # a photograph that is turned by 3 px: its windows are found, their rays do not meet the others
     turned = truth.rotation.copy()
     turned[2] = turned[2] @ rotation_from_vector(np.array([3 / lens.c_px, 0.0, 0.0]))
     apart = replace(truth, rotation=turned)
-    wrong = find_covering_points(photographs, apart, camera, ties, window_px=15, side_px=15)
+    wrong = find_covering_points(photographs, apart, camera, ties, windows=Windows(15), side_px=15)
     assert wrong.matched > 100
     (found_wrong,) = remarks_on_disagreement(wrong)
     assert found_wrong.number("share") == pytest.approx(1 - len(wrong.residuals) / wrong.matched)

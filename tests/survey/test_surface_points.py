@@ -14,7 +14,7 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import AnyArray
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import Covered
+from sfm.matching.lsm.coverage import Covered, Windows
 from sfm.matching.tracks import feature_tracks
 from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
@@ -174,38 +174,41 @@ def test_a_photograph_has_as_many_points_as_the_survey_says(tmp_path: Path) -> N
 def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surface_points, "WINDOWS_PX", (9,))
-    monkeypatch.setattr(surface_points, "LARGE_PX", 9)
+    monkeypatch.setattr(surface_points, "TRIED", (Windows(9),))
     monkeypatch.setattr(surface_points, "TRIAL_RAYS", 10)
     for more, side in (("", 9), (HELD, 15)):
         assert all((one.semi_axes == side / 2).all() for one in covered(tmp_path, more).overlays)
 
 
 @pytest.mark.parametrize(
-    ("found", "side"),
+    ("found", "windows"),
     [
-        ({21: (973, 0.058), 15: (1750, 0.057), 11: (2983, 0.069)}, 11),  # stone
-        ({21: (1937, 0.021), 15: (3889, 0.025), 11: (7112, 0.032)}, 15),  # smooth, white noise
-        ({21: (220, 0.343), 15: (265, 0.359), 11: (274, 0.316)}, 21),  # a video, noise that is correlated
-        ({21: (10, 0.01), 15: (265, 0.359), 11: (274, 0.316)}, 11),  # too few to tell
+        ({15: (1750, 0.057), 11: (2983, 0.066), 21: (973, 0.058)}, Windows(11)),  # stone
+        ({15: (3889, 0.025), 11: (7112, 0.032), 21: (1937, 0.021)}, Windows(15)),  # smooth, white noise
+        ({15: (265, 0.359), 11: (274, 0.316), 21: (300, 0.28)}, Windows(21)),  # correlated noise
+        ({15: (265, 0.359), 11: (274, 0.316), 21: (10, 0.01)}, Windows(11)),  # too few of 21 px
+        ({15: (265, 0.359), 11: (274, 0.316), -15: (820, 0.28), -21: (610, 0.25)}, Windows(15, "shift")),
+        ({15: (265, 0.359), -15: (320, 0.35), -21: (610, 0.15)}, Windows(21, "shift")),
+        ({}, Windows(15)),
     ],
 )
-def test_large_windows_are_taken_where_their_rays_together_tell_more(
-    monkeypatch: pytest.MonkeyPatch, found: dict[int, tuple[int, float]], side: int
+def test_windows_are_taken_whose_rays_together_are_precise(
+    monkeypatch: pytest.MonkeyPatch, found: dict[int, tuple[int, float]], windows: Windows
 ) -> None:
-    """Rays and their spread on two photographs, windows four sides apart in each case."""
+    """Rays and their spread on two photographs by side (negative: shifts), four sides apart in each case."""
 
-    def trial(*_: object, window_px: int, **__: object) -> CoveringPoints:
-        rays, spread = found[window_px]
+    def trial(*_: object, windows: Windows, **__: object) -> CoveringPoints:
+        rays, spread = found.get(windows.side_px * (1 if windows.model == "affine" else -1), (0, 1.0))
         seen = ImagePoints(*(np.zeros((rays, *shape)) for shape in ((), (), (2,), (2, 2))))
         return CoveringPoints(seen, np.zeros((0, 3)), np.full((rays, 2), spread), rays)
 
     monkeypatch.setattr(surface_points, "find_covering_points", trial)
     network, truth = make_network(seed_of("trial"), images=2, points=20)
-    truth = replace(truth, cameras=tuple(replace(one, size_px=(1536, 1024)) for one in truth.cameras))
-    settings, seen = TiePointSettings(), network.image_points
-    chosen = surface_points._best_window([], network, truth, seen, settings, 1)
-    assert chosen == side
+    truth = replace(truth, cameras=tuple(replace(one, size_px=(1024, 768)) for one in truth.cameras))
+    seen = network.image_points
+    assert surface_points._best_windows([], network, truth, seen, TiePointSettings(), 1) == windows
+    given = TiePointSettings(window_px=15)
+    assert surface_points._best_windows([], network, truth, seen, given, 1).side_px == 15
 
 
 def test_rays_that_do_not_fit_tell_nothing_of_the_surface() -> None:

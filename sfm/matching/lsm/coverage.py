@@ -7,6 +7,7 @@ result would be told too good, and no residual shows it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,23 +19,32 @@ from sfm.network import ImagePoints
 # That are tried. Larger ones tell no more where they cover a photograph, and where the surface is curved they
 # measure its mean depth over them, in all photographs alike, which no residual shows.
 WINDOWS_PX = (15, 11)
-# Ratio of precisions for the same pixels up to which the larger windows, which are fewer, are taken.
+# Ratio of precisions for the same pixels up to which the windows that are preferred are taken.
 ALIKE = 1.1
 SHARED = 0.15  # part of the pixels of a point, or of a window, that others may have measured
 SAMPLES = np.linspace(-0.42, 0.42, 6)  # of a window at which it is asked what is covered, in its sides
 
 
-def largest_alike(costs: Sequence[tuple[int, float]]) -> int:
-    """Return the side of the largest windows that are about as precise as the best for the same pixels, px.
+@dataclass(frozen=True)
+class Windows:
+    """Windows of least squares matching."""
+
+    side_px: int  # odd
+    model: str = "affine"  # or shift, with the linear part of its warp from the plane of the surface
+
+
+def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
+    """Return the first windows that are about as precise as the best for the same pixels.
 
     The standard deviation of a window's place falls with its side, the number of windows with the square of
-    that: for noise alone the product is the same for all. Where it grows, the surface is not plane over them.
+    that: for noise alone all together leave the same. Where larger ones leave more, the surface is not plane
+    over them.
 
     Args:
-        costs: side of the windows, px, and the spread of their places times the side; the largest first.
+        costs: windows and the standard deviation that their rays leave together, the preferred ones first.
     """
     best = min(cost for _, cost in costs)
-    return next(window for window, cost in costs if cost <= ALIKE * best)
+    return next(windows for windows, cost in costs if cost <= ALIKE * best)
 
 
 class Covered:

@@ -19,7 +19,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.threads import in_threads
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import Covered
+from sfm.matching.lsm.coverage import Covered, Windows
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -87,7 +87,7 @@ def find_covering_points(
     camera: IntArray,
     seen: ImagePoints,
     *,
-    window_px: int,
+    windows: Windows,
     side_px: int,
     references: Sequence[int] | None = None,
     min_rays: int = 3,
@@ -101,7 +101,7 @@ def find_covering_points(
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
         seen: image points of the tie points that fit, which tell the surface.
-        window_px: odd side of the windows.
+        windows: their side and model.
         side_px: of the squares that the windows are in the middle of; no two of them share pixels.
         references: photographs that points are taken from; all, those with the most tie points first, if not
             given.
@@ -112,14 +112,14 @@ def find_covering_points(
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
     m = len(photographs)
-    margin = window_px // 2 + BORDER_PX
+    margin = windows.side_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
     covered = Covered([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
     in_order = np.asarray(order).tolist()
-    for i in reported(f"photographs covered by windows of {window_px} px", in_order, len(in_order)):
+    for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
             continue
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
@@ -137,7 +137,7 @@ def find_covering_points(
             i,
             places.select(several),
             visible[:, several],
-            window_px,
+            windows,
             min_correlation,
             threads,
         )
@@ -181,7 +181,7 @@ def _followed(
     i: int,
     places: _Places,
     visible: BoolArray,
-    window_px: int,
+    windows: Windows,
     min_correlation: float,
     threads: int,
 ) -> _Rays:
@@ -204,7 +204,7 @@ def _followed(
     def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
         at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
         warp = plane_warps(
-            estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], window_px / 2
+            estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], windows.side_px / 2
         )
         with np.errstate(invalid="ignore"):  # of planes that a photograph does not see
             scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
@@ -216,7 +216,8 @@ def _followed(
             photographs[j],
             places.xy[rows[fits]],
             at[fits],
-            window_px=window_px,
+            model=windows.model,
+            window_px=windows.side_px,
             start=warp[fits],
             max_shift_px=max_shift_px,
             min_correlation=min_correlation,
