@@ -28,7 +28,7 @@ from sfm.camera import camera_from_values
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.report.html.view_page import write_view
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 FRAMES = 60
 WARM_UP = 20  # frames in which the pace of the scene is found
@@ -50,7 +50,7 @@ TURN = """(frames) => new Promise((done) => {
 })"""
 
 
-def flight(photographs: int, points: int, rays: int) -> StoredResult:
+def flight(photographs: int, points: int, rays: int) -> Solution:
     """Return photographs in rows above a hilly ground, with standard deviations."""
     rng = np.random.default_rng(1)
     camera = camera_from_values("camera", "brown", (6000, 4000), (0.004, 0.004), c_mm=24.0)
@@ -72,7 +72,7 @@ def flight(photographs: int, points: int, rays: int) -> StoredResult:
     sigma = rng.lognormal(np.log(2e-3), 0.4, points)
     covariance = np.eye(3) * (sigma[:, None, None] * np.array([1.0, 1.0, 2.0])) ** 2
     rotation = np.tile(np.eye(3), (photographs, 1, 1))
-    return StoredResult("flight", network, Estimate((camera,), X0, rotation, xyz), covariance, unit="m")
+    return Solution("flight", network, Estimate((camera,), X0, rotation, xyz), covariance, unit="m")
 
 
 def cpu_seconds() -> float:

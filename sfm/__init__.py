@@ -20,6 +20,7 @@ _MODULES = {
     "sfm.adjustment.solve": ("adjust",),
     "sfm.api": (
         "compare",
+        "distance",
         "fit_shape",
         "measure",
         "network_from_colmap",
@@ -27,14 +28,14 @@ _MODULES = {
         "run_survey",
         "write_result",
     ),
-    "sfm.camera": ("Camera", "camera_from_values"),
+    "sfm.camera": ("Camera", "camera_from_values", "project"),
     "sfm.errors": ("KolinearError",),
     "sfm.network": ("Estimate", "Network", "empty_estimate"),
     "sfm.orientation.incremental.sequence": ("orient",),
     "sfm.photographs.reading": ("read_photograph",),
     "sfm.result": ("SurveyResult",),
     "sfm.similarity": ("Similarity", "fit_similarity"),
-    "sfm.stored_result": ("StoredResult",),
+    "sfm.solution": ("Solution",),
     "sfm.survey.inputs.exterior_table": ("ObservedExterior",),
     "sfm.survey.inputs.given": ("KnownPoints", "Observations", "ScaleBar"),
     "sfm.survey.inputs.survey": ("CameraSetup", "Survey", "read_survey"),
@@ -48,6 +49,10 @@ def __getattr__(name: str) -> object:
     """Import a public name when it is first asked for."""
     from importlib import import_module
 
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("kolinear")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'sfm' has no attribute '{name}'")
     value = getattr(import_module(_MODULE_OF[name]), name)

@@ -5,6 +5,7 @@ from sfm.adjustment.datum import Datum as Datum
 from sfm.adjustment.result import Adjustment as Adjustment
 from sfm.adjustment.solve import adjust as adjust
 from sfm.api import compare as compare
+from sfm.api import distance as distance
 from sfm.api import fit_shape as fit_shape
 from sfm.api import measure as measure
 from sfm.api import network_from_colmap as network_from_colmap
@@ -13,6 +14,7 @@ from sfm.api import run_survey as run_survey
 from sfm.api import write_result as write_result
 from sfm.camera import Camera as Camera
 from sfm.camera import camera_from_values as camera_from_values
+from sfm.camera import project as project
 from sfm.errors import KolinearError as KolinearError
 from sfm.network import Estimate as Estimate
 from sfm.network import Network as Network
@@ -22,7 +24,7 @@ from sfm.photographs.reading import read_photograph as read_photograph
 from sfm.result import SurveyResult as SurveyResult
 from sfm.similarity import Similarity as Similarity
 from sfm.similarity import fit_similarity as fit_similarity
-from sfm.stored_result import StoredResult as StoredResult
+from sfm.solution import Solution as Solution
 from sfm.survey.inputs.exterior_table import ObservedExterior as ObservedExterior
 from sfm.survey.inputs.given import KnownPoints as KnownPoints
 from sfm.survey.inputs.given import Observations as Observations
@@ -32,3 +34,5 @@ from sfm.survey.inputs.survey import Survey as Survey
 from sfm.survey.inputs.survey import read_survey as read_survey
 from sfm.targets.detect import Targets as Targets
 from sfm.targets.detect import find_targets as find_targets
+
+__version__: str

@@ -12,8 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
 from sfm.comparison.significance import ResultComparison, compare_results
-from sfm.errors import BackendError, SurveyFileError
+from sfm.errors import BackendError, GeometryError, SurveyFileError
 from sfm.geometry.measured import measured_points
 from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.shapes.fit import fit_shape as fit_points
@@ -26,7 +29,7 @@ from sfm.result import SurveyResult
 from sfm.runtime.cores import cores
 from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution, solution_of
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.other_programs import OtherPrograms
@@ -89,7 +92,7 @@ def run_survey(
         )
 
 
-def read_result(path: str | Path) -> StoredResult:
+def read_result(path: str | Path) -> Solution:
     """Read a result: the folder of a survey, a COLMAP model, or another format that is known.
 
     Args:
@@ -109,18 +112,22 @@ def read_result(path: str | Path) -> StoredResult:
 
 
 def write_result(
-    result: SurveyResult, folder: str | Path, *, jobs: int | None = None, pictures_mb: float = 15.0
+    result: SurveyResult | Adjustment | Solution,
+    folder: str | Path,
+    *,
+    jobs: int | None = None,
+    pictures_mb: float = 15.0,
 ) -> Path:
-    """Write tables, figures and the report of a result into a folder, whole or not at all.
+    """Write a result into a folder, whole or not at all: of a survey tables, figures and the report.
 
     Args:
-        result: of a survey.
+        result: of a survey; of another solution, as of an adjustment, the tables are written.
         folder: an earlier result in it is replaced, anything else in it is an error.
         jobs: photographs drawn at the same time; as many as there are cores if not given.
         pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies in pictures/.
 
     Returns:
-        The path of report.html.
+        The path of report.html, or of points.csv.
 
     Raises:
         OutputError: the folder cannot be written, or holds something else than an earlier result.
@@ -130,6 +137,14 @@ def write_result(
         >>> sfm.write_result(result, result_folder).name
         'report.html'
     """
+    if not isinstance(result, SurveyResult):
+        from adapters.formats.content import Content
+        from adapters.formats.registry import write_content
+
+        write_content(
+            Path(folder), "tables", Content(solution_of(result, "write_result").with_joint_covariance)
+        )
+        return Path(folder) / "points.csv"
     from sfm.report.findings.findings import findings_of
     from sfm.report.output import write_result as write
 
@@ -144,8 +159,8 @@ def write_result(
 
 
 def compare(
-    a: SurveyResult | StoredResult,
-    b: SurveyResult | StoredResult,
+    a: SurveyResult | Adjustment | Solution,
+    b: SurveyResult | Adjustment | Solution,
     *,
     align: str = "points",
     control: tuple[str, ...] = (),
@@ -167,14 +182,41 @@ def compare(
         >>> sfm.compare(result, result).point_difference.max() < 1e-9
         np.True_
     """
-    first, second = (one.with_covariance if isinstance(one, SurveyResult) else one for one in (a, b))
+    first, second = (solution_of(one, "compare").with_joint_covariance for one in (a, b))
     return compare_results(
         first, second, align=align, control=(control,) if isinstance(control, str) else tuple(control)
     )
 
 
+def distance(result: SurveyResult | Adjustment | Solution, start: str, end: str) -> tuple[float, float]:
+    """Return the distance of two points and its standard deviation, object unit.
+
+    Args:
+        result: of a survey, of an adjustment, or read from files.
+        start: name of a point.
+        end: name of another.
+
+    Raises:
+        UnknownNameError: there is no point of that name.
+        GeometryError: both are in one place, or their joint covariance is not known.
+
+    Example:
+        >>> import sfm
+        >>> length, sigma = sfm.distance(result, "1", "2")
+        >>> bool(0 < sigma < length)
+        True
+    """
+    solution = solution_of(result, "distance")
+    between = solution.point(end).xyz - solution.point(start).xyz
+    length = float(np.linalg.norm(between))
+    if not length > 0:
+        raise GeometryError(f"distance: points {start} and {end} are in one place")
+    J = np.concatenate([-between, between]) / length
+    return length, float(np.sqrt(J @ solution.covariance_of((start, end)) @ J))
+
+
 def fit_shape(
-    result: SurveyResult | StoredResult,
+    result: SurveyResult | Adjustment | Solution,
     kind: str,
     points: Sequence[str] | None = None,
     *,
@@ -203,14 +245,16 @@ def fit_shape(
         >>> sfm.fit_shape(result, "plane", ["1", "2", "3", "4"]).redundancy
         1
     """
-    stored = result.with_covariance if isinstance(result, SurveyResult) else result
-    measured = measured_points(stored)
+    measured = measured_points(solution_of(result, "fit_shape").with_joint_covariance)
     chosen = None if points is None else measured.matching(points, f"{kind}: points")
     return fit_points(measured, kind, chosen, weights=weights, hold=hold, robust=robust, offset=offset)
 
 
 def measure(
-    result: SurveyResult | StoredResult, features: str | Path | None = None, *, allow_outside: bool = False
+    result: SurveyResult | Adjustment | Solution,
+    features: str | Path | None = None,
+    *,
+    allow_outside: bool = False,
 ) -> Measurement:
     """Measure a result: hidden points, alignment, shapes, distances, angles and tolerances.
 
@@ -229,7 +273,7 @@ def measure(
     """
     from adapters.formats.mesh import read_mesh
 
-    stored = result.with_covariance if isinstance(result, SurveyResult) else result
+    stored = solution_of(result, "measure").with_joint_covariance
     asked, paths = (
         (None, {}) if features is None else read_features_file(Path(features), allow_outside=allow_outside)
     )

@@ -18,7 +18,7 @@ from sfm.kernels.threads import own_threads
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
-from sfm.survey.adjusting.solution import Correspondences, Solution, solve_survey
+from sfm.survey.adjusting.solution import Correspondences, SolvedSurvey, solve_survey
 from sfm.survey.assembly import assemble_result
 from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.correspondences import find_correspondences
@@ -72,7 +72,7 @@ def run_survey(
 
 def _solve(
     survey: Survey, measured: Measurements, jobs: int, clock: StageClock
-) -> tuple[Orientation, Correspondences, Solution]:
+) -> tuple[Orientation, Correspondences, SolvedSurvey]:
     """Return what orientation, matching and adjustment make of the image points."""
     with clock.stage("orientation"):
         measured, start = agree_on_turns(survey, measured, orient_survey(survey, measured))

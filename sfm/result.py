@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.correlations import ExteriorCorrelations, OrientationCorrelation
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution
@@ -17,14 +16,12 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.comparison.baseline import BaselineComparison
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
-from sfm.conventions import FloatArray, IntArray, angles_from_rotation
+from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
-from sfm.errors import GeometryError
-from sfm.files.covariance_file import points_kept_together
-from sfm.network import Estimate, Network, index_of
+from sfm.network import Estimate, Network
 from sfm.point_table import Point, PointTable
 from sfm.remarks.remark import Remark
-from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
+from sfm.solution import NO_SCALE, OrientedImage, SeenTargets, Solution
 from sfm.targets.flags import LIKEST_FIRST, Flag, count_flags
 
 COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
@@ -93,26 +90,6 @@ class ControlCheck:
     def rms(self) -> FloatArray:
         """Root mean square difference in X, Y, Z, object unit, (3,)."""
         return np.asarray(np.sqrt((self.differences**2).mean(axis=0)))
-
-
-@dataclass(frozen=True)
-class OrientedImage:
-    """Exterior orientation of one photograph."""
-
-    name: str
-    position: FloatArray  # projection centre X0, object unit, (3,)
-    rotation: FloatArray  # R, image to object axes, (3, 3)
-    covariance: FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (6, 6)
-
-    @property
-    def angles(self) -> FloatArray:
-        """Omega, phi, kappa, rad, (3,)."""
-        return angles_from_rotation(self.rotation)
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (6,)."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
 
 
 @dataclass(frozen=True)
@@ -229,54 +206,26 @@ class SurveyResult:
         )
 
     @cached_property
-    def stored(self) -> StoredResult:
-        """The result as files hold it: accepted image points, solution and standard deviations."""
-        a = self.adjustment
-        return StoredResult(
-            self.survey,
-            replace(a.network, image_points=a.network.image_points.select(~a.rejected)),
-            a.estimate,
-            a.covariance.points,
-            a.covariance.exterior[:, :3, :3],
-            tuple(a.interior_sigma(k) for k in range(len(a.estimate.cameras))),
-            a.redundancy,
-            self.length_unit,
-            datum=a.datum,
-        )
-
-    @cached_property
-    def with_covariance(self) -> StoredResult:
-        """The same with the covariance of all points together, or of a sample of many of them."""
-        some = points_kept_together(self.adjustment.network.points)
-        try:
-            joint = marginal_of(self.adjustment).joint(np.zeros(0, dtype=np.int64), some)
-        except GeometryError:  # normal equations that cannot be solved have no covariance at all
-            return self.stored
-        if not np.isfinite(joint).all():
-            return self.stored
-        every = len(some) == len(self.adjustment.network.points)
-        return replace(self.stored, covariance=joint, covariance_points=None if every else some)
+    def solution(self) -> Solution:
+        """The accepted image points, with their solution and covariance."""
+        return replace(self.adjustment.solution, name=self.survey, unit=self.length_unit)
 
     @property
     def points(self) -> PointTable:
         """The adjusted object points, by name."""
-        return self.stored.points
+        return self.solution.points
 
     def point(self, name: str | int) -> Point:
         """Return an object point; UnknownNameError if there is none of that name."""
-        return self.stored.point(name)
+        return self.solution.point(name)
 
     def image(self, name: str) -> OrientedImage:
         """Return the exterior orientation of a photograph; UnknownNameError if there is none of that name."""
-        a = self.adjustment
-        i = a.network.image_index(name)
-        position, rotation = a.estimate.position[i], a.estimate.rotation[i]
-        return OrientedImage(name, position, rotation, a.covariance.exterior[i])
+        return self.solution.image(name)
 
     def camera(self, name: str) -> Camera:
         """Return an adjusted camera; UnknownNameError if there is none of that name."""
-        cameras = self.adjustment.estimate.cameras
-        return cameras[index_of([camera.name for camera in cameras], name, "camera")]
+        return self.solution.camera(name)
 
     def write(self, folder: str | Path, *, pictures_mb: float = 15.0) -> Path:
         """Write tables, figures and the report into a folder, whole or not at all; return report.html.
@@ -330,8 +279,7 @@ class SurveyResult:
     @property
     def has_scale(self) -> bool:
         """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
-        a = self.adjustment
-        return a.datum == "control" or len(a.network.scale_bars) > 0 or len(a.network.control) >= 2
+        return self.adjustment.has_scale
 
     @property
     def length_unit(self) -> str:

@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.distortion.models import COLMAP, MODELS
 from sfm.network import Estimate, ImagePoints, Network
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 SIZE_PX = (2000, 1500)
 PIXEL_MM = (0.005, 0.005)
@@ -191,16 +190,9 @@ def observed_anew(network: Network, truth: Estimate, noise_px: float, rng: np.ra
     return replace(network, image_points=replace(seen, xy=xy + noise_px * rng.standard_normal(xy.shape)))
 
 
-def stored_of(name: str, a: Adjustment) -> StoredResult:
+def stored_of(name: str, a: Adjustment) -> Solution:
     """Return an adjustment in metres as a result, with the covariance of all points together."""
-    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(len(a.network.points)))
-    return StoredResult(
-        *(name, a.network, a.estimate, a.covariance.points, None),
-        tuple(a.interior_sigma(k) for k in range(len(a.estimate.cameras))),
-        *(a.redundancy, "m"),
-        covariance=covariance,
-        datum=a.datum,
-    )
+    return replace(a.solution, name=name, unit="m").with_joint_covariance
 
 
 def _camera(name: str, model: str, free: tuple[str, ...], *, scale: float) -> Camera:

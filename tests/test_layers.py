@@ -27,7 +27,7 @@ LAYERS = (
             "sfm.units",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.remarks"),
+        *("sfm.point_table", "sfm.solution", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),

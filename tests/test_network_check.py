@@ -94,9 +94,9 @@ def test_short_ways_of_saying_it_work() -> None:
     network, truth = make_network(seed_of("check"), images=5, points=20)
     a = sfm.adjust(network, truth, datum="free", reject="none")
     assert a.datum == "free" and sfm.change_datum(a, "minimal").datum == "minimal"
-    assert sfm.StoredResult("a", network, truth).point(7).name == "7"
+    assert sfm.Solution("a", network, truth).point(7).name == "7"
     with pytest.raises(KolinearError, match=r"unknown point '77', expected one of 7"):
-        sfm.StoredResult("a", network, truth).point(77)
+        sfm.Solution("a", network, truth).point(77)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import inspect
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -21,11 +22,12 @@ from sfm.errors import UnknownNameError
 from sfm.files import csv_tables
 from sfm.result import SurveyResult
 from tests.surveys import write_observed_survey, write_photograph_survey
+from tests.synthetic import make_network, seed_of
 
 ROOT = Path(sfm.__file__).resolve().parent
 PUBLIC = {
     *("Adjustment", "Camera", "CameraSetup", "Datum", "Estimate", "KnownPoints", "KolinearError", "Network"),
-    *("Observations", "ObservedExterior", "ScaleBar", "Similarity", "StoredResult", "Survey", "SurveyResult"),
+    *("Observations", "ObservedExterior", "ScaleBar", "Similarity", "Solution", "Survey", "SurveyResult"),
     *(
         "Targets",
         "adjust",
@@ -33,11 +35,13 @@ PUBLIC = {
         "camera_from_values",
         "change_datum",
         "compare",
+        "distance",
         "find_targets",
         "fit_shape",
         "measure",
         "fit_similarity",
         "network_from_colmap",
+        "project",
     ),
     *("orient", "read_photograph", "read_result", "read_survey", "run_survey", "write_result"),
 }
@@ -233,7 +237,7 @@ def test_bad_arrays_are_refused(make: object, match: str) -> None:
 
 
 def test_networks_from_arrays_are_adjusted(result: SurveyResult) -> None:
-    seen = result.stored.network.image_points
+    seen = result.solution.network.image_points
     network = sfm.Network.from_arrays(
         [result.network.images[i] for i in seen.image],
         [result.network.points[j] for j in seen.point],
@@ -257,12 +261,67 @@ def test_names_are_indices(result: SurveyResult) -> None:
             ask("<x>")
 
 
+def test_a_network_from_arrays_becomes_a_solution_as_the_page_on_python_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Image points, orientation, adjustment, covariance of a distance, written, read and compared."""
+    network, truth = make_network(seed_of("arrays"), images=6, points=30, noise_px=0.1)
+    seen = network.image_points
+    names = {network.images[0]: "a.jpg"}
+    given = {
+        "image": [names.get(network.images[i], network.images[i]) for i in seen.image],
+        "point": [str(j + 1) for j in seen.point],
+        "xy": seen.xy,
+    }
+    page = (ROOT.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    code = page.split("```python\n")[2].split("```")[0]
+    lens = "sfm.camera_from_values("
+    assert code.count(lens) == 1 and "solution.write(" in code
+    code = "\n".join("camera = lens" if lens in line else line for line in code.splitlines())
+    monkeypatch.chdir(tmp_path)
+    given["lens"] = truth.cameras[0]
+    exec(compile(code, "python.md", "exec"), given)
+    a, C, again = given["adjustment"], given["C"], given["again"]
+    assert a.converged and 0.8 < a.sigma0 < 1.2
+    np.testing.assert_allclose(C[:3, :3], a.covariance.points[a.network.point_index("1")], rtol=1e-6)
+    of_first = a.covariance.exterior[a.network.image_index("a.jpg")]
+    np.testing.assert_allclose(C[6:, 6:], of_first, rtol=1e-6, atol=1e-6 * np.abs(of_first).max())
+    np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
+    assert np.linalg.eigvalsh(C / np.sqrt(np.outer(np.diag(C), np.diag(C)))).min() > -1e-9
+    assert sfm.distance(again, "1", "3") == pytest.approx(sfm.distance(a, "1", "3"), rel=1e-6)
+    np.testing.assert_allclose(again.covariance_of((), ["a.jpg"]), of_first)
+    with pytest.raises(sfm.KolinearError, match="joint covariance"):
+        again.covariance_of(["1"], ["a.jpg"])
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda network: sfm.compare(network, network),
+        lambda network: sfm.fit_shape(network, "plane"),
+        lambda network: sfm.measure(network),
+        lambda network: sfm.distance(network, "1", "2"),
+        lambda network: sfm.write_result(network, "never"),
+        lambda network: sfm.orient(network, network),
+        lambda network: sfm.orient(network, ["lens"]),
+    ],
+)
+def test_what_is_no_solution_is_refused_in_one_line(call: Callable[[sfm.Network], object]) -> None:
+    network, _ = make_network(seed_of("refused"), images=3, points=8)
+    with pytest.raises(sfm.KolinearError, match="expected"):
+        call(network)
+
+
+def test_the_version_is_that_of_the_installation() -> None:
+    assert sfm.__version__.count(".") == 2
+
+
 def test_notebooks_show_tables_in_which_names_are_escaped(result: SurveyResult) -> None:
     assert "sigma0" in repr(result) and "<table>" in result._repr_html_()
-    point = sfm.StoredResult("<script>", result.network, result.estimate)
+    point = sfm.Solution("<script>", result.network, result.estimate)
     assert "<script>" not in point._repr_html_() and "&lt;script&gt;" in point._repr_html_()
     assert repr(result.points).splitlines()[1].split() == ["point", "X", "Y", "Z", "sX", "sY", "sZ", "rays"]
-    for value in (result.network, result.estimate, result.adjustment, result.point("1"), result.stored):
+    for value in (result.network, result.estimate, result.adjustment, result.point("1"), result.solution):
         assert 20 < len(repr(value)) < 500, type(value)
 
 

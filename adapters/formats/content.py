@@ -16,7 +16,7 @@ from sfm.conventions import FloatArray
 from sfm.files.covariance_file import UNCODED
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
 from sfm.reduced_network import reduce_network
-from sfm.stored_result import NO_SCALE, StoredResult
+from sfm.solution import NO_SCALE, Solution
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ, cYZ
 
@@ -30,11 +30,9 @@ def _no_image_points() -> ImagePoints:
 class Content:
     """What was measured and solved, what took no part, and what the reader should know of it."""
 
-    result: StoredResult
+    result: Solution
     rejected: ImagePoints = field(default_factory=_no_image_points)  # measured, but left out as gross errors
     checks: ObjectPoints = field(default_factory=ObjectPoints)  # known points that only check the result
-    exterior_covariance: FloatArray | None = None  # of X0, Y0, Z0 and the angles, (m, 6, 6)
-    interior_covariance: tuple[FloatArray, ...] = ()  # of the free parameters of each camera, (f, f)
     sigma0: float | None = None  # of unit weight, by which the covariances are scaled
     sigma0_px: float | None = None  # a posteriori of an image coordinate
     notes: tuple[str, ...] = ()  # lines about what was read and is not used as it stands
@@ -145,9 +143,9 @@ def _interior_sigmas(content: Content) -> FloatArray:
 
 
 def _full(content: Content) -> FloatArray:
-    Q = content.exterior_covariance
+    Q = content.result.exterior_covariance
     parts = [] if Q is None else [Q.reshape(len(Q), -1)]
-    parts += [C.reshape(1, -1) for C in content.interior_covariance if len(C) > 1]
+    parts += [C.reshape(1, -1) for C in content.result.interior_covariance if len(C) > 1]
     return np.concatenate([part.ravel() for part in parts])[:, None] if parts else np.zeros((0, 1))
 
 
@@ -263,8 +261,15 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
     if not gone:
         return replace(content, result=replace(result, network=network, estimate=estimate)), gone
     network = replace(network, interior=InteriorObservations())
-    result = replace(result, network=network, estimate=estimate, interior_sigma=None)
-    content = replace(content, result=result, exterior_covariance=None, interior_covariance=())
+    result = replace(
+        result,
+        network=network,
+        estimate=estimate,
+        interior_sigma=None,
+        exterior_covariance=None,
+        interior_covariance=(),
+    )
+    content = replace(content, result=result)
     return replace(content, rejected=_no_image_points()) if "rejected" in gone else content, gone
 
 
@@ -279,7 +284,7 @@ def placed(content: Content) -> Content:
     rejected, checks = content.rejected, content.checks
     kept, known = images[rejected.image] & points[rejected.point], points[checks.point]
     image, point = np.cumsum(images) - 1, np.cumsum(points) - 1
-    C, Q, full = result.point_covariance, result.position_covariance, content.exterior_covariance
+    C, Q, full = result.point_covariance, result.position_covariance, result.exterior_covariance
     network, estimate = reduce_network(network, estimate, images, points, every)
     reduced = replace(
         result,
@@ -288,6 +293,7 @@ def placed(content: Content) -> Content:
         point_covariance=None if C is None else C[points],
         position_covariance=None if Q is None else Q[images],
         covariance=result.covariance if points.all() else None,
+        exterior_covariance=None if full is None else full[images],
     )
     rejected = rejected.select(kept)
     return replace(
@@ -295,7 +301,6 @@ def placed(content: Content) -> Content:
         result=reduced,
         rejected=replace(rejected, image=image[rejected.image], point=point[rejected.point]),
         checks=ObjectPoints(point[checks.point[known]], checks.xyz[known], checks.covariance[known]),
-        exterior_covariance=None if full is None else full[images],
     )
 
 

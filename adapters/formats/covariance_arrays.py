@@ -14,25 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from adapters.formats.content import Content
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 NAME = "covariances.npz"
 MAX_BYTES = 2**31  # of the file unpacked
 
 
-def write_covariances(path: Path, content: Content) -> None:
+def write_covariances(path: Path, solution: Solution) -> None:
     """Write the covariances of the orientations, as far as they are known."""
-    network, estimate = content.result.network, content.result.estimate
-    arrays: dict[str, Any] = {f"interior_{k}": Q for k, Q in enumerate(content.interior_covariance)}
-    if content.exterior_covariance is not None:
-        arrays |= {"image_names": np.array(network.images), "exterior": content.exterior_covariance}
+    network, estimate = solution.network, solution.estimate
+    arrays: dict[str, Any] = {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
+    if solution.exterior_covariance is not None:
+        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
     np.savez_compressed(path, camera_names=np.array([camera.name for camera in estimate.cameras]), **arrays)
 
 
-def read_covariances(path: Path, result: StoredResult) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
+def read_covariances(path: Path, result: Solution) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
     """Return the covariances of the exterior (m, 6, 6) and of each interior orientation, None and () without.
 
     Args:

@@ -19,7 +19,7 @@ from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, read_json
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.stored_result import CONTROL_COVARIANCE
+from sfm.solution import CONTROL_COVARIANCE
 
 ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates

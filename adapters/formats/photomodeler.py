@@ -46,7 +46,7 @@ from sfm.files.covariance_file import UNCODED
 from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 MODELS = ("brown", "brown_dbat")  # that its cameras may be in; they differ in what is minimised
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus ours, px
@@ -185,7 +185,7 @@ def read_export(
             "observed, --control FILE does"
         )
     estimate = Estimate(cameras, exterior[:, :3].copy(), np.array(rotation).reshape(-1, 3, 3), xyz)
-    result = StoredResult(
+    result = Solution(
         *(path.name, network, estimate),
         point_covariance=_covariance_of(point_sigma),
         position_covariance=_covariance_of(np.array(outer_sigma).reshape(-1, 3)),
@@ -254,7 +254,7 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
 
 def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, title: str = "Kolinear") -> None:
     """Write a network and its solution; see `write_export`."""
-    write_export(path, Content(StoredResult(title, network, estimate)))
+    write_export(path, Content(Solution(title, network, estimate)))
 
 
 def write_export(path: Path, content: Content) -> None:

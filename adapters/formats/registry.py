@@ -48,7 +48,7 @@ from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
 Writer = Callable[[Path, Network, Estimate], None]
@@ -299,7 +299,7 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
         network = replace(network, points=uncoded)
     return Content(
-        StoredResult(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1]),
+        Solution(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1]),
         notes=notes,
     )
 
@@ -309,7 +309,7 @@ def _names_points(form: FileFormat, path: Path) -> bool:
     return (path / SIDE_FILE).is_file() if form.name in ("colmap", "colmap-text") else form.names[0]
 
 
-def read_comparable(path: Path, name: str | None = None) -> StoredResult:
+def read_comparable(path: Path, name: str | None = None) -> Solution:
     """Read whatever can be compared: tables with standard deviations, any other format without.
 
     Raises:
@@ -335,7 +335,7 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
     """Write a network and its solution; see `write_content`."""
-    write_content(path, name, Content(StoredResult(path.name, network, estimate)))
+    write_content(path, name, Content(Solution(path.name, network, estimate)))
 
 
 def write_content(path: Path, name: str, content: Content) -> None:

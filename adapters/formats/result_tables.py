@@ -43,7 +43,7 @@ from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.network_check import CORRELATION_LIMIT
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
@@ -53,7 +53,7 @@ PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
-def read_result(folder: Path) -> StoredResult:
+def read_result(folder: Path) -> Solution:
     """Read the tables of a result, rejected image points left out.
 
     Raises:
@@ -79,7 +79,7 @@ def read_result(folder: Path) -> StoredResult:
     network = Network(images, camera, points, seen.select(~rejected))
     known = table.values.shape[1] > 3
     joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
-    return StoredResult(
+    found = Solution(
         summary.survey or folder.name,
         network,
         Estimate(cameras, position, rotation, table.values[:, :3].copy()),
@@ -92,6 +92,8 @@ def read_result(folder: Path) -> StoredResult:
         summary.datum.kind if summary.datum else "",
         covariance_points=of_points,
     )
+    exterior, interior = read_covariances(folder / COVARIANCES, found)
+    return replace(found, exterior_covariance=exterior, interior_covariance=interior)
 
 
 def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, BoolArray, FloatArray]:
@@ -146,7 +148,7 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
     return found["scale bar"], found["control point"]
 
 
-def write_tables(folder: Path, result: StoredResult) -> None:
+def write_tables(folder: Path, result: Solution) -> None:
     """Write a result as `write_content` does."""
     write_content(folder, Content(result))
 
@@ -172,8 +174,8 @@ def write_content(folder: Path, content: Content) -> None:
     angles = np.rad2deg(angles_from_rotation(estimate.rotation))
     point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
     position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
-    if content.exterior_covariance is not None and len(sigmas_of_images):
-        variance = np.diagonal(content.exterior_covariance, axis1=1, axis2=2)[:, 3:]
+    if result.exterior_covariance is not None and len(sigmas_of_images):
+        variance = np.diagonal(result.exterior_covariance, axis1=1, axis2=2)[:, 3:]
         position_sigma = np.hstack([position_sigma, np.degrees(np.sqrt(variance))])
         sigmas_of_images = (*sigmas_of_images, "somega_deg", "sphi_deg", "skappa_deg")
     seen = joined_image_points(network.image_points, content.rejected)
@@ -243,8 +245,8 @@ def write_content(folder: Path, content: Content) -> None:
         )
         if result.covariance is not None:
             write_covariance(folder, result.covariance, network.points, result.covariance_points)
-        if content.exterior_covariance is not None or any(map(len, content.interior_covariance)):
-            write_covariances(folder / COVARIANCES, content)
+        if result.exterior_covariance is not None or any(map(len, result.interior_covariance)):
+            write_covariances(folder / COVARIANCES, result)
         write_given(folder / "given.csv", network, estimate)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -293,14 +295,11 @@ def read_content(folder: Path) -> Content:
             rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
         ),
     )
-    exterior, of_interior = read_covariances(folder / COVARIANCES, result)
     summary = read_json(folder / "summary.json", _Statistics, "the summary of a result")
     return Content(
         replace(result, network=network, estimate=replace(result.estimate, cameras=cameras)),
         seen.select(rejected),
         checks,
-        exterior,
-        of_interior,
         summary.sigma0,
         summary.sigma0_px,
     )
@@ -318,7 +317,7 @@ def _first_of(folder: Path, cameras: tuple[Camera, ...], owner: str, parameter: 
     raise SurveyFileError(f"{folder}/given.csv: {parameter} of camera '{owner}', which is not in cameras.csv")
 
 
-def _with_shared(result: StoredResult) -> tuple[Camera, ...]:
+def _with_shared(result: Solution) -> tuple[Camera, ...]:
     """Return the cameras, those of single photographs with what they share with one another.
 
     They are called as a survey with `per_photograph` calls them, by camera and photograph, and what they

@@ -14,7 +14,7 @@ import numpy as np
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.network import Network
-from sfm.stored_result import MEASURED, SeenTargets
+from sfm.solution import MEASURED, SeenTargets
 
 OUTLINE = ("a_px", "b_px", "angle_deg")
 

@@ -21,7 +21,7 @@ from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
-from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
+from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
 from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
@@ -123,6 +123,38 @@ class Marginal:
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
         return np.asarray(self.adjustment.sigma0**2 * cofactor)
+
+
+class JointOnDemand:
+    """Joint covariances of an adjustment; its normal equations are formed when they are first asked for."""
+
+    def __init__(self, adjustment: Adjustment) -> None:
+        """Of what `adjust` returned."""
+        self._adjustment = adjustment
+
+    @cached_property
+    def _marginal(self) -> Marginal:
+        return marginal_of(self._adjustment)
+
+    def __call__(self, points: IntArray, images: IntArray) -> FloatArray:
+        """Return that of X Y Z of points (p,) and X0 Y0 Z0 omega phi kappa of photographs (m,), by indices.
+
+        Raises:
+            GeometryError: the normal equations cannot be solved.
+        """
+        with own_threads():
+            m, p = self._marginal, 3 * len(points)
+            columns = (6 * np.asarray(images)[:, None] + np.arange(6)).ravel()
+            found = m.joint(columns, np.asarray(points))
+        u = len(columns)
+        T = np.zeros((p + u, u + p))
+        T[np.arange(p), u + np.arange(p)] = 1.0
+        turned = angle_jacobian(m.optimum.state.M)[np.asarray(images, dtype=np.int64)]
+        for k in range(len(images)):
+            own = slice(p + 6 * k, p + 6 * k + 6)
+            T[own, 6 * k : 6 * k + 6] = np.eye(6)
+            T[p + 6 * k + 3 : p + 6 * k + 6, 6 * k + 3 : 6 * k + 6] = turned[k]
+        return np.asarray(T @ found @ T.T)
 
 
 def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
+from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution
 
 # Of an image coordinate. Computed ones are exact to some 1e-15 of themselves, and to 1e-10 where errors of
 # control strain their network; measured ones to 1e-7 at best.
@@ -102,6 +104,33 @@ class Adjustment:
     remarks: tuple[Remark, ...] = ()  # what of the robust test could not be carried through
     error_correlation: ErrorCorrelation | None = None  # of neighbours, that the covariance has in it
     independent: Covariance | None = None  # covariance without that correlation, None where there is none
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The accepted image points, with their solution and covariance."""
+        from sfm.adjustment.covariance import JointOnDemand
+
+        exterior = self.covariance.exterior
+        return Solution(
+            "adjustment",
+            replace(self.network, image_points=self.network.image_points.select(~self.rejected)),
+            self.estimate,
+            self.covariance.points,
+            exterior[:, :3, :3],
+            tuple(self.interior_sigma(k) for k in range(len(self.estimate.cameras))),
+            self.redundancy,
+            OBJECT_UNITS if self.has_scale else NO_SCALE,
+            datum=self.datum,
+            exterior_covariance=exterior,
+            interior_covariance=self.covariance.interior,
+            joint=JointOnDemand(self),
+        )
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
+        network = self.network
+        return self.datum == "control" or len(network.scale_bars) > 0 or len(network.control) >= 2
 
     @property
     def vPv(self) -> float:

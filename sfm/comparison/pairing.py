@@ -20,7 +20,7 @@ from sfm.errors import GeometryError
 from sfm.files.covariance_file import UNCODED
 from sfm.network import rows_of
 from sfm.similarity import Similarity, extended_axes, fit_similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
 SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
@@ -46,7 +46,7 @@ class Pairing:
     # or as directions where one of them is corrected for distortion or counted from another origin
 
 
-def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
+def pair_results(a: Solution, b: Solution) -> Pairing:
     """Return which points and photographs of a are which of b.
 
     Args:
@@ -88,7 +88,7 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
     )
 
 
-def identified(result: StoredResult) -> BoolArray:
+def identified(result: Solution) -> BoolArray:
     """Return whether the name of each determined point identifies it, (n,)."""
     if not result.points_named:
         return np.zeros(len(result.network.points), dtype=bool)
@@ -129,7 +129,7 @@ def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
 
 
 def _images_by_image_points(
-    a: StoredResult, b: StoredResult, images: IntArray
+    a: Solution, b: Solution, images: IntArray
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """Pair photographs without names by measurements at the same places, then by rays of the same direction.
 
@@ -148,7 +148,7 @@ def _images_by_image_points(
     return np.concatenate([images, found]), of_rays if len(found) else as_they_are
 
 
-def directions(result: StoredResult) -> FloatArray:
+def directions(result: Solution) -> FloatArray:
     """Return the tangents of the rays of all image points, NaN where distortion is not invertible, (k, 2)."""
     seen = result.network.image_points
     uv = np.full(seen.xy.shape, np.nan)
@@ -159,7 +159,7 @@ def directions(result: StoredResult) -> FloatArray:
 
 
 def _images_of_places(
-    a: StoredResult, b: StoredResult, xy: tuple[FloatArray, FloatArray], images: IntArray, same_px: float
+    a: Solution, b: Solution, xy: tuple[FloatArray, FloatArray], images: IntArray, same_px: float
 ) -> IntArray:
     """Pair photographs, of which none is paired yet, by image points that lie at the same places."""
     none = np.empty((0, 2), dtype=np.int64)
@@ -180,8 +180,8 @@ def _images_of_places(
 
 
 def _points_by_image_points(
-    a: StoredResult,
-    b: StoredResult,
+    a: Solution,
+    b: Solution,
     xy: tuple[FloatArray, FloatArray],
     images: IntArray,
     points: IntArray,
@@ -213,7 +213,7 @@ def _points_by_image_points(
     return _best(votes, weight, MAJORITY * np.minimum(shared_a[votes[:, 0]], shared_b[votes[:, 1]]))
 
 
-def _frame(a: StoredResult, b: StoredResult, points: IntArray, images: IntArray) -> Similarity | None:
+def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Similarity | None:
     """Return a_from_b by what is paired so far, or as they are if they coincide; None where nothing tells."""
     for pairs, ours, theirs in (
         (points, a.estimate.points, b.estimate.points),

@@ -9,7 +9,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.files.covariance_file import MAX_POINTS
 from sfm.similarity import Similarity, mean_distance
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 ROUNDING = 1e-9  # of the extent of the object: what computing in double precision and writing cost at most
 HELD = 1e-12  # variance over the mean one below which a coordinate is held
@@ -61,7 +61,7 @@ class PointPairs:
 
 
 def pairs_of_results(
-    a: StoredResult, b: StoredResult, points: IntArray, scale: float | None
+    a: Solution, b: Solution, points: IntArray, scale: float | None
 ) -> tuple[PointPairs, IntArray, BoolArray]:
     """Return points that two results have in common, and which of them these are.
 
@@ -122,7 +122,7 @@ def coordinates_of(points: IntArray) -> IntArray:
     return np.asarray((3 * points[:, None] + np.arange(3)).ravel())
 
 
-def _has_sigma(a: StoredResult, b: StoredResult, points: IntArray) -> BoolArray:
+def _has_sigma(a: Solution, b: Solution, points: IntArray) -> BoolArray:
     """Return whether the covariance of either point is known, (n,)."""
     known = [
         np.isfinite(one.point_covariance[p]).all(axis=(1, 2))
@@ -132,7 +132,7 @@ def _has_sigma(a: StoredResult, b: StoredResult, points: IntArray) -> BoolArray:
     return np.any(known, axis=0) if known else np.zeros(len(points), dtype=bool)
 
 
-def _covariance_of(result: StoredResult, points: IntArray, joint: bool) -> FloatArray:
+def _covariance_of(result: Solution, points: IntArray, joint: bool) -> FloatArray:
     """Return the covariance of points together, that of each single one, or 0 where none is known."""
     n = len(points)
     if joint and result.covariance is not None:

@@ -17,7 +17,7 @@ from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
 
@@ -46,8 +46,8 @@ class PointTest:
 
 
 def judge_points(
-    a: StoredResult,
-    b: StoredResult,
+    a: Solution,
+    b: Solution,
     pairing: Pairing,
     pairs: tuple[PointPairs, IntArray, BoolArray],
     transform: Similarity,
@@ -174,7 +174,7 @@ def _single_tests(
     return statistic, single, critical_value(alpha / 2, 3 * tested, redundancy)
 
 
-def known_scale(a: StoredResult, b: StoredResult) -> float | None:
+def known_scale(a: Solution, b: Solution) -> float | None:
     """Return the scale of a over b where both have one, None where it has to be estimated."""
     if not (a.has_scale and b.has_scale):
         return None
@@ -183,6 +183,6 @@ def known_scale(a: StoredResult, b: StoredResult) -> float | None:
     return METRES[b.unit] / METRES[a.unit] if a.unit in METRES and b.unit in METRES else None
 
 
-def has_sigma(result: StoredResult) -> bool:
+def has_sigma(result: Solution) -> bool:
     """Whether the standard deviation of any point is known."""
     return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())

@@ -31,7 +31,7 @@ from sfm.errors import GeometryError
 from sfm.network import Network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity, fit_similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 ALIGNMENTS = ("points", "cameras", "control", "none")
 SAME_PX = 1e-3  # image points closer than this are one measurement
@@ -100,8 +100,8 @@ class ResultComparison:
 
 
 def compare_results(
-    a: StoredResult,
-    b: StoredResult,
+    a: Solution,
+    b: Solution,
     *,
     align: str = "points",
     control: tuple[str, ...] = (),
@@ -192,7 +192,7 @@ def _chosen(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> Boo
 
 
 def _align(
-    a: StoredResult, b: StoredResult, align: str, pairing: Pairing, chosen: BoolArray, scale: float | None
+    a: Solution, b: Solution, align: str, pairing: Pairing, chosen: BoolArray, scale: float | None
 ) -> Similarity:
     if align == "none":
         return Similarity(1.0, np.eye(3), np.zeros(3))
@@ -227,7 +227,7 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
     return float(same.sum() / len(ours))
 
 
-def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
+def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
     """Differences of the cameras that took the same photographs, or bear one name, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))

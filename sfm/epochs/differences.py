@@ -28,7 +28,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted
 from sfm.epochs.epoch import SAME, Epoch, given_observations
 from sfm.errors import GeometryError
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -130,20 +130,20 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     )
 
 
-def _of_own_photographs(result: StoredResult, prefix: str) -> StoredResult:
+def _of_own_photographs(result: Solution, prefix: str) -> Solution:
     """Return a result whose photographs are told from those of another epoch, which may bear their names."""
     names = tuple(f"{prefix}/{name}" for name in result.network.images)
     return replace(result, network=replace(result.network, images=names))
 
 
-def _others(result: StoredResult, paired: IntArray) -> tuple[str, ...]:
+def _others(result: Solution, paired: IntArray) -> tuple[str, ...]:
     left = np.ones(len(result.network.points), dtype=bool)
     left[paired] = False
     left &= result.estimate.determined
     return tuple(result.network.points[j] for j in np.flatnonzero(left))
 
 
-def _held_cameras(a: StoredResult, b: StoredResult) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _held_cameras(a: Solution, b: Solution) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return cameras with values other than 0 held alike in both epochs, and those with others held."""
     ours, theirs = _held_values(a), _held_values(b)
     names = tuple(dict.fromkeys((*ours, *theirs)))
@@ -151,7 +151,7 @@ def _held_cameras(a: StoredResult, b: StoredResult) -> tuple[tuple[str, ...], tu
     return alike, tuple(name for name in names if name not in alike)
 
 
-def _held_values(result: StoredResult) -> dict[str, tuple[tuple[str, float], ...]]:
+def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
     found = {}
     for camera in result.estimate.cameras:
         held = ~camera.free & (camera.parameters != 0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.network import ObjectPoints, ScaleBars
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 SAME = 1e-9  # relative difference of two given values that are the same one
 
@@ -29,7 +29,7 @@ class Epoch:
     """One epoch: a result, and what it was given."""
 
     name: str
-    result: StoredResult
+    result: Solution
     bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
     control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
     interior: tuple[tuple[str, str, float, float], ...] = ()  # camera, parameter, value and sigma observed

@@ -21,7 +21,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import index_of
 from sfm.similarity import similarity_motions
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 # Change with a motion over the largest that derivatives of this size could have, below which there is none:
 # those of a fit are taken at adjusted points, so that residuals of a hundredth of the size still pass.
@@ -158,7 +158,7 @@ class MeasuredPoints:
         return np.asarray((change > INVARIANT * most.max(axis=1, keepdims=True)).any(axis=1))
 
 
-def measured_points(result: StoredResult) -> MeasuredPoints:
+def measured_points(result: Solution) -> MeasuredPoints:
     """Return the points of a result that have coordinates, with the covariance that is known of them.
 
     Where only that of a sample of the points is known together, all others count by themselves.

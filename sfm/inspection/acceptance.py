@@ -24,7 +24,7 @@ from sfm.geometry.measured import measured_points
 from sfm.geometry.tolerance import COVERAGE, OUT, UNDECIDED, UNKNOWN, decide
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 MIN_LINES = 7
 MIN_LENGTHS = 5  # of a line
@@ -118,7 +118,7 @@ def read_lengths(path: Path) -> CalibratedLengths:
 
 
 def accept_result(
-    result: StoredResult,
+    result: Solution,
     lengths: CalibratedLengths,
     *,
     a: float,

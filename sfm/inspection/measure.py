@@ -47,7 +47,7 @@ from sfm.inspection.features_file import (
 )
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 SIGMAS = ("sX", "sY", "sZ")
 HEADLINES: Mapping[Level, str] = {
@@ -126,7 +126,7 @@ class Measurement:
 
 
 def measure_result(
-    result: StoredResult,
+    result: Solution,
     features: FeaturesFile | None = None,
     *,
     paths: Mapping[str, Path] | None = None,
@@ -160,7 +160,7 @@ class _Work:
 
     def __init__(
         self,
-        result: StoredResult,
+        result: Solution,
         features: FeaturesFile,
         paths: Mapping[str, Path],
         read_mesh: MeshReader | None,
@@ -430,7 +430,7 @@ def _nominal(path: Path) -> Nominal:
     return Nominal(names, table.values[:, :3].copy(), covariance)
 
 
-def _rays(result: StoredResult) -> tuple[IntArray, FloatArray]:
+def _rays(result: Solution) -> tuple[IntArray, FloatArray]:
     """Return point and camera position of each ray; points count among those with coordinates."""
     network, estimate = result.network, result.estimate
     seen = network.image_points

@@ -21,7 +21,7 @@ from sfm.planning.stations import Stations
 from sfm.rendering.planned_targets import INK, PAPER, write_planned_photographs
 from sfm.rendering.scene import UNCODED, Optics
 from sfm.similarity import fit_similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 
@@ -268,7 +268,7 @@ backend = "none"
 """
 
 
-def achieved(plan: PlannedSurvey, codes: str, result: StoredResult, sigma_px: float) -> Achieved:
+def achieved(plan: PlannedSurvey, codes: str, result: Solution, sigma_px: float) -> Achieved:
     """Return what a simulated survey achieved against its plan.
 
     Args:

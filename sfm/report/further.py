@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,12 @@ from sfm.report.page_files import write_files
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 FILES = ("exterior.csv", "points.csv", "more.html")
 
 
-def write_further(found: Further, result: StoredResult, out: Path) -> Path:
+def write_further(found: Further, result: Solution, out: Path) -> Path:
     """Write the photographs to be added into a folder and return the path of its page.
 
     Args:
@@ -46,16 +47,7 @@ def write_further(found: Further, result: StoredResult, out: Path) -> Path:
         )
     )
     a = found.adjustment
-    scene = scene_of_stored(
-        StoredResult(
-            result.name,
-            a.network,
-            a.estimate,
-            a.covariance.points,
-            a.covariance.exterior[:, :3, :3],
-            unit=result.unit,
-        )
-    )
+    scene = scene_of_stored(replace(a.solution, name=result.name, unit=result.unit))
     page = render(
         "more.html",
         viewer=viewer_of(scene, Pictures()),
@@ -76,7 +68,7 @@ def write_further(found: Further, result: StoredResult, out: Path) -> Path:
     return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
 
 
-def headline(found: Further, result: StoredResult) -> str:
+def headline(found: Further, result: Solution) -> str:
     """Return what the photographs give, in a sentence."""
     known = np.isfinite(found.before)
     before, after = (_length(result, float(s[known].max())) for s in (found.before, found.after))
@@ -89,7 +81,7 @@ def _level(found: Further) -> str:
     return "bad" if found.adjustment.undetermined else "good"
 
 
-def weakest(found: Further, result: StoredResult) -> list[tuple[str, str, str]]:
+def weakest(found: Further, result: Solution) -> list[tuple[str, str, str]]:
     """Return name and sigma before and after of the weakest points."""
     return [
         (
@@ -101,6 +93,6 @@ def weakest(found: Further, result: StoredResult) -> list[tuple[str, str, str]]:
     ]
 
 
-def _length(result: StoredResult, value: float) -> str:
+def _length(result: Solution, value: float) -> str:
     factor, unit = finer_unit(result.unit, value)
     return f"{significant(value * factor)} {unit or 'object units'}"

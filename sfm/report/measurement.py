@@ -25,7 +25,7 @@ from sfm.report.html.page import render
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 POINT_COLUMNS = ("id", "X", "Y", "Z", "sX", "sY", "sZ", "group")
 SHAPE_COLUMNS = ("shape", "kind", "parameter", "axis", "value", "sigma", "unit")
@@ -41,7 +41,7 @@ Writer = Callable[[Path], None]
 
 
 def write_measurement(
-    found: Measurement, result: StoredResult, out: Path, *, drawings: Sequence[tuple[str, Writer]] = ()
+    found: Measurement, result: Solution, out: Path, *, drawings: Sequence[tuple[str, Writer]] = ()
 ) -> Path:
     """Write a measured result into a folder and return the path of its page.
 
@@ -235,7 +235,7 @@ def words_of_measured(found: Measurement) -> str:
     return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(told)}."
 
 
-def scene_viewer(found: Measurement, result: StoredResult) -> Viewer | None:
+def scene_viewer(found: Measurement, result: Solution) -> Viewer | None:
     """Return the scene in the system of the measurement; None without photographs."""
     if not result.estimate.oriented.any():
         return None

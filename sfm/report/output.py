@@ -132,7 +132,7 @@ def write_result(
         report_time = StageTime("report", time.perf_counter() - started)
         timed = replace(findings, result=replace(result, seconds=(*result.seconds, report_time)))
         write_summary(timed, folder)
-        joint = result.with_covariance
+        joint = result.solution.with_joint_covariance
         if joint.covariance is not None:
             write_covariance(folder, joint.covariance, joint.network.points, joint.covariance_points)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")

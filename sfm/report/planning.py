@@ -25,7 +25,7 @@ from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
 from sfm.report.viewer.scene import ViewerScene
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 FILES = ("points.csv", "image_points.csv", "exterior.csv", "shots.csv", "plan.json", "plan.html")
 POINTS = ("id", "X", "Y", "Z", "nX", "nY", "nZ", "sX", "sY", "sZ", "rays", "angle_deg", "coded")
@@ -185,9 +185,7 @@ def plan_scene(plan: Plan) -> ViewerScene:
     of_position = np.full((len(p.stations), 3, 3), np.nan)
     used = p.photograph >= 0
     of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
-    return scene_of_stored(
-        StoredResult(plan.name, network, estimate, covariance, of_position, unit=plan.unit)
-    )
+    return scene_of_stored(Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit))
 
 
 def plan_summary(plan: Plan) -> dict[str, Any]:

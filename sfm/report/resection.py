@@ -11,7 +11,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.files.plain_text import or_none
 from sfm.orientation.resection.by_method import Resected
-from sfm.orientation.resection.candidates import Solution
+from sfm.orientation.resection.candidates import ResectionSolution
 from sfm.orientation.resection.dlt import DirectLinearTransformation
 
 
@@ -129,7 +129,7 @@ def _interior(found: DirectLinearTransformation) -> dict[str, float]:
     }
 
 
-def _plain(solution: Solution, c: float) -> dict[str, Any]:
+def _plain(solution: ResectionSolution, c: float) -> dict[str, Any]:
     X0, Y0, Z0 = solution.position.tolist()
     omega, phi, kappa = np.degrees(angles_from_rotation(solution.rotation)).tolist()
     return {

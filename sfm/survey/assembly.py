@@ -9,7 +9,7 @@ from sfm.conventions import IntArray
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
-from sfm.survey.adjusting.solution import Correspondences, Solution
+from sfm.survey.adjusting.solution import Correspondences, SolvedSurvey
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
@@ -23,7 +23,7 @@ def assemble_result(
     measured: Measurements,
     start: Orientation,
     matched: Correspondences,
-    solution: Solution,
+    solution: SolvedSurvey,
     compared: SurveyComparison,
     clock: StageClock,
 ) -> SurveyResult:

@@ -12,7 +12,7 @@ from sfm.errors import KolinearError, MissingLibraryError
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import StageClock
-from sfm.survey.adjusting.solution import Solution
+from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.inputs.photograph_list import PhotographList
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
@@ -43,7 +43,7 @@ class SurveyComparison:
 
 
 def compare_solution(
-    solution: Solution, others: OtherPrograms, clock: StageClock, *, files: PhotographList | None = None
+    solution: SolvedSurvey, others: OtherPrograms, clock: StageClock, *, files: PhotographList | None = None
 ) -> SurveyComparison:
     """Compare a solution with those of other programs.
 

@@ -12,7 +12,7 @@ import pytest
 
 from adapters.formats.result_tables import write_tables
 from sfm import cli
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
@@ -234,7 +234,7 @@ def test_a_folder_that_is_none_is_one_line(
 def test_more_photographs_for_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A result of the tables of a network; what its report says is how to ask for this."""
     network, truth = make_network(seed_of("more"), images=5, points=25, free=())
-    write_tables(tmp_path / "five", StoredResult("five", network, truth, unit="m", redundancy=40))
+    write_tables(tmp_path / "five", Solution("five", network, truth, unit="m", redundancy=40))
     out = tmp_path / "more"
     assert plan(tmp_path / "five", "--photographs", 2, "--out", out, command="more") == 0
     printed = capsys.readouterr().out

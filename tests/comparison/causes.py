@@ -23,7 +23,7 @@ from sfm.epochs.findings import verdict_of_epochs
 from sfm.epochs.series import analyse_epochs
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import kinds_of
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 NOISE_PX, BAR_SIGMA = 0.1, 2e-5
@@ -46,7 +46,7 @@ EXPECTED = {
 """causes by case; in epochs points that moved are `displaced`"""
 
 
-def pair(case: str, number: int) -> tuple[StoredResult, StoredResult]:
+def pair(case: str, number: int) -> tuple[Solution, Solution]:
     """Return two results, the second of which differs as the case says."""
     rng = seed_of(f"cause {case} {number}")
     points = int(rng.integers(25, 70))
@@ -80,7 +80,7 @@ def _directions(rng: np.random.Generator, n: int) -> FloatArray:
     return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-def _measured(name: str, truth: Estimate, network: Network, rng: np.random.Generator) -> StoredResult:
+def _measured(name: str, truth: Estimate, network: Network, rng: np.random.Generator) -> Solution:
     seen = observed_anew(network, truth, NOISE_PX, rng)
     for a, b in ((0, 7), (3, 15)):
         length = float(np.linalg.norm(truth.points[a] - truth.points[b]))
@@ -90,7 +90,7 @@ def _measured(name: str, truth: Estimate, network: Network, rng: np.random.Gener
     return stored_of(name, adjust(seen, truth, sigma_px=NOISE_PX, reject="none"))
 
 
-def _changed(result: StoredResult, case: str, rng: np.random.Generator) -> StoredResult:
+def _changed(result: Solution, case: str, rng: np.random.Generator) -> Solution:
     """Return a result in a frame of its own, with what the case does to scale, handedness and names."""
     n = len(result.network.points)
     J = rotation_from_vector(rng.standard_normal(3))
@@ -108,7 +108,7 @@ def _changed(result: StoredResult, case: str, rng: np.random.Generator) -> Store
     return transformed(result, J, rng.standard_normal(3), order)
 
 
-def transformed(result: StoredResult, J: FloatArray, shift: FloatArray, order: IntArray) -> StoredResult:
+def transformed(result: Solution, J: FloatArray, shift: FloatArray, order: IntArray) -> Solution:
     """Return a result with coordinates J x + shift, and with points in another order under the old names."""
     assert result.covariance is not None and result.point_covariance is not None
     n, e = len(order), result.estimate

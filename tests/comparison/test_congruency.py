@@ -20,7 +20,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import words_of_scale
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 DATUMS = ("free", "minimal", "control")
@@ -34,7 +34,7 @@ def scene() -> tuple[Network, Estimate]:
     return make_network(seed_of("congruency"), images=8, points=60, model="opencv", noise_px=0.0)
 
 
-def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float = 1.0) -> StoredResult:
+def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float = 1.0) -> Solution:
     """One epoch, adjusted in a datum; its scale bar is `bar` times as long as stated."""
     network, truth = scene()
     rng = np.random.default_rng(seed)
@@ -50,7 +50,7 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
     return stored_of(f"{datum} {seed}", a)
 
 
-def sampled(result: StoredResult, points: np.ndarray) -> StoredResult:
+def sampled(result: Solution, points: np.ndarray) -> Solution:
     """The same with the covariance of some points only."""
     assert result.covariance is not None
     rows = (3 * points[:, None] + np.arange(3)).ravel()

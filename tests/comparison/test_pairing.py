@@ -17,7 +17,7 @@ from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import Similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 CODED = 12  # of the points bear codes, the others numbers of one run
@@ -29,7 +29,7 @@ def named(network: Network) -> Network:
     return replace(network, points=tuple(str(100 + j) if j < CODED else f"u{j + 1:03d}" for j in range(n)))
 
 
-def run_again(network: Network, truth: Estimate, *, turn: Similarity | None = None) -> StoredResult:
+def run_again(network: Network, truth: Estimate, *, turn: Similarity | None = None) -> Solution:
     """Another run on the same photographs: uncoded points numbered anew, measured anew, maybe elsewhere."""
     rng = seed_of("again")
     n = len(network.points)
@@ -40,7 +40,7 @@ def run_again(network: Network, truth: Estimate, *, turn: Similarity | None = No
     names = tuple(network.points[j] for j in range(n))  # the numbers stay, the points behind them do not
     again = replace(network, points=names, image_points=replace(seen, point=place[seen.point], xy=xy))
     estimate = replace(truth, points=truth.points[order])
-    return StoredResult("again", again, estimate if turn is None else turn.apply_estimate(estimate))
+    return Solution("again", again, estimate if turn is None else turn.apply_estimate(estimate))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def run() -> tuple[Network, Estimate]:
 
 
 def test_uncoded_points_are_recognised_by_their_image_points(run: tuple[Network, Estimate]) -> None:
-    found = compare_results(StoredResult("first", *run), run_again(*run))
+    found = compare_results(Solution("first", *run), run_again(*run))
     assert len(found.points) == 60
     assert (found.pairing.points_by_name, found.pairing.points_by_image_points) == (CODED, 60 - CODED)
     assert np.abs(found.point_difference).max() < 1e-12
@@ -60,7 +60,7 @@ def test_and_by_their_place_where_the_photographs_are_others(run: tuple[Network,
     turn = Similarity(2.0, rotation_from_vector(np.array([0.3, -0.8, 0.2])), np.array([3.0, 1.0, -2.0]))
     other = run_again(*run, turn=turn)
     other = replace(other, network=replace(other.network, images=tuple(f"b{i}" for i in range(6))))
-    found = compare_results(StoredResult("first", *run), other)
+    found = compare_results(Solution("first", *run), other)
     assert found.pairing.points_by_name == CODED and found.pairing.points_by_place > 40
     assert np.abs(found.point_difference).max() < 1e-9
     assert len(found.images) == 0
@@ -71,7 +71,7 @@ def test_one_point_moved_is_still_recognised(run: tuple[Network, Estimate]) -> N
     points = other.estimate.points.copy()
     points[30] += [0.01, 0, 0]
     found = compare_results(
-        StoredResult("first", *run), replace(other, estimate=replace(other.estimate, points=points))
+        Solution("first", *run), replace(other, estimate=replace(other.estimate, points=points))
     )
     assert np.sort(np.linalg.norm(found.point_difference, axis=1))[-1] == pytest.approx(0.01, rel=0.05)
 
@@ -81,11 +81,11 @@ def test_numbers_that_mean_nothing_are_never_compared(run: tuple[Network, Estima
     network, truth = run
     uncoded = replace(network, points=tuple(f"u{j + 1:03d}" for j in range(60)))
     turn = Similarity(2.0, rotation_from_vector(np.array([0.3, -0.8, 0.2])), np.array([3.0, 1.0, -2.0]))
-    other = StoredResult(
+    other = Solution(
         "b", replace(uncoded, images=tuple(f"b{i}" for i in range(6))), turn.apply_estimate(truth)
     )
     with pytest.raises(GeometryError, match="no points and no photographs in common"):
-        compare_results(StoredResult("a", uncoded, truth), other)
+        compare_results(Solution("a", uncoded, truth), other)
 
 
 @pytest.mark.parametrize("form", ["colmap-text", "bal", "sba", "tables"])
@@ -103,7 +103,7 @@ def test_a_result_is_paired_with_its_own_file_of_any_format(form: str, tmp_path:
     path = tmp_path / ("net.txt" if form == "bal" else "files")
     write_any(path, form, network, truth)
     stored = read_comparable(path, form)
-    found = compare_results(StoredResult("own", network, truth), stored)
+    found = compare_results(Solution("own", network, truth), stored)
     assert len(found.points) == 40 and len(found.images) == 6
     assert found.points == network.points and found.images == network.images
     assert np.abs(found.point_difference).max() < 1e-6
@@ -125,13 +125,13 @@ def test_image_points_corrected_for_distortion_are_recognised_by_their_rays(
     turn = Similarity(2.0, rotation_from_vector(np.array([0.3, -0.8, 0.2])), np.array([3.0, 1.0, -2.0]))
     path = tmp_path / ("net.txt" if form == "bal" else "files")
     write_any(path, form, straight, turn.apply_estimate(ideal))
-    found = compare_results(StoredResult("own", network, truth), read_comparable(path, form))
+    found = compare_results(Solution("own", network, truth), read_comparable(path, form))
     assert found.pairing.points_by_image_points == 40 and found.points == network.points
     assert found.images == network.images and found.same_share == 1.0
     assert np.abs(found.point_difference).max() < 1e-6
 
 
 def test_pairs_are_one_to_one(run: tuple[Network, Estimate]) -> None:
-    pairing = pair_results(StoredResult("first", *run), run_again(*run))
+    pairing = pair_results(Solution("first", *run), run_again(*run))
     for column in (*pairing.points.T, *pairing.images.T):
         assert len(np.unique(column)) == len(column)

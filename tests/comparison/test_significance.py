@@ -20,13 +20,13 @@ from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.similarity import Similarity
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 TURN = Similarity(1000.0, rotation_from_vector(np.array([0.3, -1.1, 0.7])), np.array([10.0, -20.0, 5.0]))
 
 
-def measured(name: str, *, shift: np.ndarray | None = None, model: str = "opencv") -> StoredResult:
+def measured(name: str, *, shift: np.ndarray | None = None, model: str = "opencv") -> Solution:
     """One epoch of an object of 60 points, of which some may have moved, adjusted free."""
     network, truth = make_network(seed_of("object"), model=model, images=10, noise_px=0.0)
     points = truth.points if shift is None else truth.points + shift
@@ -41,7 +41,7 @@ def measured(name: str, *, shift: np.ndarray | None = None, model: str = "opencv
         s = np.full(len(camera.names), np.nan)
         s[camera.free] = np.sqrt(np.diag(Q))
         sigma.append(s)
-    return StoredResult(
+    return Solution(
         name,
         network,
         a.estimate,
@@ -53,7 +53,7 @@ def measured(name: str, *, shift: np.ndarray | None = None, model: str = "opencv
 
 
 @pytest.fixture(scope="module")
-def epochs() -> tuple[StoredResult, StoredResult]:
+def epochs() -> tuple[Solution, Solution]:
     first, second = measured("one"), measured("two")
     moved = TURN.apply_estimate(second.estimate)
     J = TURN.scale * TURN.rotation
@@ -62,7 +62,7 @@ def epochs() -> tuple[StoredResult, StoredResult]:
     return first, replace(second, estimate=moved, point_covariance=covariance)
 
 
-def test_two_epochs_without_change_differ_by_their_sigmas(epochs: tuple[StoredResult, StoredResult]) -> None:
+def test_two_epochs_without_change_differ_by_their_sigmas(epochs: tuple[Solution, Solution]) -> None:
     found = compare_results(*epochs)
     assert found.a_from_b.scale == pytest.approx(1e-3, rel=1e-3)
     assert len(found.points) == 60 and len(found.images) == 10
@@ -75,7 +75,7 @@ def test_two_epochs_without_change_differ_by_their_sigmas(epochs: tuple[StoredRe
     assert np.nanmax(np.abs(found.interior[0].difference / found.interior[0].sigma)) < 4
 
 
-def test_a_moved_point_is_found(epochs: tuple[StoredResult, StoredResult]) -> None:
+def test_a_moved_point_is_found(epochs: tuple[Solution, Solution]) -> None:
     shift = np.zeros((60, 3))
     shift[17] = [0.0, 0.002, 0.0]
     found = compare_results(epochs[0], measured("three", shift=shift))
@@ -85,7 +85,7 @@ def test_a_moved_point_is_found(epochs: tuple[StoredResult, StoredResult]) -> No
 
 
 @pytest.mark.parametrize("align", ["points", "cameras", "control"])
-def test_alignments_bring_the_datum_back(align: str, epochs: tuple[StoredResult, StoredResult]) -> None:
+def test_alignments_bring_the_datum_back(align: str, epochs: tuple[Solution, Solution]) -> None:
     first, _ = epochs
     turned = replace(first, estimate=TURN.apply_estimate(first.estimate), point_covariance=None)
     found = compare_results(first, turned, align=align, control=("1", "5", "9", "20"))
@@ -99,7 +99,7 @@ def test_alignments_bring_the_datum_back(align: str, epochs: tuple[StoredResult,
 
 
 def test_without_alignment_and_covariance_differences_remain_and_no_test_is_made(
-    epochs: tuple[StoredResult, StoredResult],
+    epochs: tuple[Solution, Solution],
 ) -> None:
     first, _ = epochs
     bare = replace(first, point_covariance=None, estimate=TURN.apply_estimate(first.estimate))
@@ -110,7 +110,7 @@ def test_without_alignment_and_covariance_differences_remain_and_no_test_is_made
 
 
 def test_results_are_matched_by_name_and_models_are_converted(
-    epochs: tuple[StoredResult, StoredResult],
+    epochs: tuple[Solution, Solution],
 ) -> None:
     first, _ = epochs
     brown = measured("four", model="brown")
@@ -135,7 +135,7 @@ def test_results_are_matched_by_name_and_models_are_converted(
         compare_results(first, nothing)
 
 
-def test_tables_go_round_to_the_last_digit(epochs: tuple[StoredResult, StoredResult], tmp_path: Path) -> None:
+def test_tables_go_round_to_the_last_digit(epochs: tuple[Solution, Solution], tmp_path: Path) -> None:
     first, _ = epochs
     write_tables(tmp_path, first)
     again = read_result(tmp_path)
@@ -164,7 +164,7 @@ def test_tables_go_round_to_the_last_digit(epochs: tuple[StoredResult, StoredRes
 )
 @pytest.mark.parametrize("part", [0.0, 0.4, 0.8])
 def test_truncated_tables_are_refused(
-    name: str, part: float, epochs: tuple[StoredResult, StoredResult], tmp_path: Path
+    name: str, part: float, epochs: tuple[Solution, Solution], tmp_path: Path
 ) -> None:
     write_tables(tmp_path, epochs[0])
     data = (tmp_path / name).read_bytes()
@@ -176,18 +176,16 @@ def test_truncated_tables_are_refused(
         read_result(tmp_path)
 
 
-def test_colmap_model_is_compared_with_tables(
-    epochs: tuple[StoredResult, StoredResult], tmp_path: Path
-) -> None:
+def test_colmap_model_is_compared_with_tables(epochs: tuple[Solution, Solution], tmp_path: Path) -> None:
     first, _ = epochs
     write_model(tmp_path / "colmap", first.network, first.estimate)
     network, estimate = read_model(tmp_path / "colmap")
-    found = compare_results(first, StoredResult("colmap", network, estimate))
+    found = compare_results(first, Solution("colmap", network, estimate))
     assert np.abs(found.point_difference).max() < 1e-12
     assert np.abs(found.interior[0].difference).max() < 1e-9
 
 
-def test_baseline_is_compared_at_the_targets(epochs: tuple[StoredResult, StoredResult]) -> None:
+def test_baseline_is_compared_at_the_targets(epochs: tuple[Solution, Solution]) -> None:
     network, truth = make_network(seed_of("baseline"), model="opencv", images=8, noise_px=0.1)
     a = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
     # a baseline that oriented six of eight photographs, in a frame of its own, and a camera wrong by 1 px

@@ -27,7 +27,7 @@ from sfm.errors import KolinearError
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.given import (
     read_control,
@@ -142,7 +142,7 @@ def _results(folder: Path) -> list[Seed]:
     plain = camera.with_parameters(camera.parameters[[1, 1, 2, 3, 4, 5, 6, 7]] * ([1] * 4 + [0] * 4))
     ideal = replace(truth, cameras=(plain,))
     sigma = np.tile(np.eye(3) * 1e-6, (8, 1, 1))
-    write_tables(folder / "result", StoredResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
+    write_tables(folder / "result", Solution("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
     write_any(folder / "m.xml", "metashape", network, truth)
     write_any(folder / "bal.txt", "bal", network, ideal)
     write_any(folder / "sba", "sba", network, ideal)

@@ -8,11 +8,10 @@ from functools import lru_cache
 import numpy as np
 
 import sfm
-from sfm.adjustment.covariance import marginal_of
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import seed_of
 
 SIZE_PX = (2000, 1500)
@@ -71,7 +70,7 @@ def bench_network(seed: str, *, images: int = 10) -> tuple[Network, Estimate]:
     return network, Estimate((camera,), position, rotation, xyz)
 
 
-def bench_result(seed: str) -> StoredResult:
+def bench_result(seed: str) -> Solution:
     """Return an adjusted network as files hold it, with the covariance of all points.
 
     Nothing is rejected: its noise has no gross errors. Data snooping at 0.1 % takes 1.8 good image points of
@@ -80,21 +79,15 @@ def bench_result(seed: str) -> StoredResult:
     """
     network, truth = bench_network(seed)
     a = sfm.adjust(network, truth, reject="none")
-    n = len(network.points)
-    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(n))
-    blocks = np.stack([joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])
-    return StoredResult(
-        "bench", network, a.estimate, blocks, a.covariance.exterior[:, :3, :3], redundancy=a.redundancy,
-        unit="m", covariance=joint, datum=a.datum,
-    )  # fmt: skip
+    return replace(a.solution, name="bench", unit="m").with_joint_covariance
 
 
 @lru_cache
-def one_bench() -> StoredResult:
+def one_bench() -> Solution:
     """Return the same result for all tests of a module."""
     return bench_result("one bench")
 
 
-def without_covariance(result: StoredResult) -> StoredResult:
+def without_covariance(result: Solution) -> Solution:
     """Return a result as another program would give it."""
     return replace(result, point_covariance=None, covariance=None, position_covariance=None)

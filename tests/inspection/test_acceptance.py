@@ -18,7 +18,7 @@ from sfm.inspection.acceptance import Acceptance, CalibratedLengths, accept_resu
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.remarks.remark import remark
 from sfm.report.acceptance import write_acceptance
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.inspection.benches import one_bench
 from tests.synthetic import seed_of
 
@@ -26,18 +26,16 @@ DIRECTIONS = [[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1], [1, 0, 0], [0, 1, 0
 SIGMA = 0.002  # of the calibration, mm
 
 
-def result_of(names: list[str], xyz: np.ndarray) -> StoredResult:
+def result_of(names: list[str], xyz: np.ndarray) -> Solution:
     none = np.zeros(0, dtype=np.int64)
     network = Network((), none, tuple(names), ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2))))
     estimate = Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), xyz)
     n = len(names)
-    return StoredResult("volume", network, estimate, np.tile(1e-4 * np.eye(3), (n, 1, 1)), unit="mm",
+    return Solution("volume", network, estimate, np.tile(1e-4 * np.eye(3), (n, 1, 1)), unit="mm",
                         covariance=1e-4 * np.eye(3 * n), datum="free")  # fmt: skip
 
 
-def volume(
-    *, error: float = 0.0, lines: int = 7, sigma: float = SIGMA
-) -> tuple[StoredResult, CalibratedLengths]:
+def volume(*, error: float = 0.0, lines: int = 7, sigma: float = SIGMA) -> tuple[Solution, CalibratedLengths]:
     """Return a cube of 1 m with lines through its centre, five lengths on each; its longest are too long."""
     rng = seed_of("volume")
     names, xyz, rows = ["s1", "s2"], [[0.0, 0, -400], [300, 0, -400]], []
@@ -57,7 +55,7 @@ def volume(
     )
 
 
-def accepted(result: StoredResult, lengths: CalibratedLengths, **options: Any) -> Acceptance:
+def accepted(result: Solution, lengths: CalibratedLengths, **options: Any) -> Acceptance:
     return accept_result(result, lengths, **{"a": 0.02, "k": 2e-5, "bars": ["s1 - s2"]} | options)
 
 

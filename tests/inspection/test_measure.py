@@ -19,7 +19,7 @@ from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.remarks.remark import kinds_of
 from sfm.report.measurement import words_of_measured, write_measurement
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.inspection.benches import (
     DIAMETERS,
     FOCAL_LENGTH,
@@ -116,7 +116,7 @@ def features_folder(folder: Path, text: str = FEATURES) -> Path:
     return path
 
 
-def measured(folder: Path, text: str, result: StoredResult | None = None) -> Measurement:
+def measured(folder: Path, text: str, result: Solution | None = None) -> Measurement:
     features, paths = read_features_file(features_folder(folder, text))
     return measure_result(result or one_bench(), features, paths=paths, read_mesh=read_mesh)
 

@@ -27,7 +27,7 @@ from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest, write_further
 from sfm.report.planning import write_plan
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 
@@ -57,7 +57,7 @@ def test_further_photographs_help_the_weakest_points(tmp_path: Path) -> None:
     alone = further_photographs(network, estimate, sigma_px=0.1, count=1, candidate_count=60)
     assert found.after.max() < alone.after.max() < before.max()
     assert np.allclose(alone.stations.position[0], found.stations.position[0])
-    result = StoredResult("plate", network, estimate, unit="m")
+    result = Solution("plate", network, estimate, unit="m")
     page = write_further(found, result, tmp_path / "more").read_text(encoding="utf-8")
     assert headline(found, result) in page and weakest(found, result)[0][1] in page
     assert (tmp_path / "more" / "exterior.csv").read_text(encoding="utf-8").count("\n") == 3
@@ -85,7 +85,7 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     assert np.allclose(read.stations.rotation, stations.rotation, atol=1e-9)
     path = write_simulation(read, tmp_path)
     result = sfm.run_survey(path, compare_with="none")
-    found = achieved(read, "ring14", result.stored, result.adjustment.sigma0_px)
+    found = achieved(read, "ring14", result.solution, result.adjustment.sigma0_px)
     assert found.points == found.planned == 20
     # 60 coordinates, correlated through the datum: 10 % of sampling error, and sigma0 of some 200 redundancy
     assert found.ratio == pytest.approx(1.0, abs=0.25) and found.error == pytest.approx(1.0, abs=0.35)

@@ -25,7 +25,7 @@ from sfm.report.html.content_policy import content_policy
 from sfm.report.html.page import render
 from sfm.report.output import write_result
 from sfm.report.validation import write_validation
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.places import ROOT
 from tests.surveys import write_photograph_survey
@@ -106,7 +106,7 @@ def validation_page(folder: Path) -> str:
 
 def differences_page(folder: Path) -> str:
     network, truth = make_network(seed_of("policy"), model="opencv", images=5, points=20)
-    found = compare_results(StoredResult(EVIL, network, truth), StoredResult("b", network, truth))
+    found = compare_results(Solution(EVIL, network, truth), Solution("b", network, truth))
     return write_differences(found, truth.points, folder / "out").read_text(encoding="utf-8")
 
 

@@ -24,7 +24,7 @@ from sfm.network import Network
 from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import largest_difference, write_differences
 from sfm.report.validation import COLUMNS, verdict_of_validation, write_validation
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
@@ -137,8 +137,8 @@ def moved() -> tuple[ResultComparison, np.ndarray]:
     covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
     points = truth.points.copy()
     points[4] += 0.003
-    a = StoredResult("before", network, truth, covariance, redundancy=100, unit="m")
-    b = StoredResult(
+    a = Solution("before", network, truth, covariance, redundancy=100, unit="m")
+    b = Solution(
         "after <b>", measured_again(network), replace(truth, points=points), covariance, redundancy=100
     )
     found = compare_results(a, b, align="control", control=("1", "2", "9", "15"))
@@ -175,9 +175,7 @@ def test_comparison_is_written_with_every_point(
 
 def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("bare"), model="opencv", images=5, points=20)
-    found = compare_results(
-        StoredResult("a", network, truth), StoredResult("b", measured_again(network), truth)
-    )
+    found = compare_results(Solution("a", network, truth), Solution("b", measured_again(network), truth))
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
     verdict = verdict_of_comparison(found)
     assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.remarks[0].text in page
@@ -187,7 +185,7 @@ def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
 def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("same"), model="opencv", images=5, points=20)
     covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
-    a, b = (StoredResult(name, network, truth, covariance) for name in "ab")
+    a, b = (Solution(name, network, truth, covariance) for name in "ab")
     found = compare_results(a, b)
     assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
@@ -205,10 +203,10 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
     )
     for align in ("points", "cameras", "none"):
         with pytest.raises(GeometryError, match="a and b have no points and no photographs in common"):
-            compare_results(StoredResult("a", network, truth), StoredResult("b", other, truth), align=align)
+            compare_results(Solution("a", network, truth), Solution("b", other, truth), align=align)
     photographs_only = compare_results(
-        StoredResult("a", network, truth),
-        StoredResult("b", replace(other, images=network.images), truth),
+        Solution("a", network, truth),
+        Solution("b", replace(other, images=network.images), truth),
         align="cameras",
     )
     assert kinds_of(verdict_of_comparison(photographs_only).remarks) == ("no_common_points",)
@@ -222,8 +220,8 @@ def test_sigmas_of_one_result_are_enough() -> None:
     unknown = np.full((20, 3, 3), np.nan)
     some = covariance.copy()
     some[3] = np.nan
-    a = StoredResult("a", network, truth, some)
-    b = StoredResult("b", measured_again(network), truth, unknown)
+    a = Solution("a", network, truth, some)
+    b = Solution("b", measured_again(network), truth, unknown)
     found = compare_results(a, b)
     assert found.has_sigma == (True, False)
     assert np.isnan(found.statistic).tolist() == [j == 3 for j in range(20)]

@@ -11,7 +11,7 @@ import pytest
 
 from sfm.comparison.significance import compare_results
 from sfm.report.differences import write_differences
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import make_network, seed_of
 
@@ -26,7 +26,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shift = np.zeros((20, 3))
     shift[:, 0] = np.arange(20) ** 2 * 1e-4 * (-1.0) ** np.arange(20)
     other = replace(truth, points=truth.points + shift)
-    a, b = StoredResult("a", network, truth, unit="m"), StoredResult("b", network, other, unit="m")
+    a, b = Solution("a", network, truth, unit="m"), Solution("b", network, other, unit="m")
     return write_differences(
         compare_results(a, b, align="none"), truth.points, tmp_path_factory.mktemp("page") / "out"
     )

@@ -18,7 +18,7 @@ from sfm.report.viewer.container import packed_scene
 from sfm.report.viewer.embedded import sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.places import ROOT
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
@@ -51,9 +51,9 @@ def test_locked_packages_name_no_host() -> None:
     assert all("integrity" in package for path, package in lock["packages"].items() if path)
 
 
-def stored(name: str) -> StoredResult:
+def stored(name: str) -> Solution:
     network, truth = make_network(seed_of(name), images=6, points=40, noise_px=0.1)
-    return StoredResult(name, network, truth)
+    return Solution(name, network, truth)
 
 
 def unpacked(text: str) -> tuple[dict[str, object], bytes]:

@@ -19,7 +19,7 @@ from sfm.report.html.view_page import view_page, write_view
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
@@ -79,7 +79,7 @@ def small_scene() -> ViewerScene:
     network = replace(network, points=(EVIL, *network.points[1:]), images=(EVIL, *network.images[1:]))
     rejected = np.zeros(len(network.image_points), dtype=bool)
     rejected[REJECTED] = True
-    stored = StoredResult("viewer", network, truth, own, unit="m", covariance=joint)
+    stored = Solution("viewer", network, truth, own, unit="m", covariance=joint)
     made = scene_of_stored(stored, rejected=rejected)
     ellipse = np.tile([float(RADIUS_PX), float(RADIUS_PX), 0.0], (len(made.rays), 1))
     marks = Marks(np.array([0, 0]), np.array([[50.0, 60.0], [80.0, 60.0]]), np.array([1, 0]), REASONS)
@@ -453,7 +453,7 @@ def test_the_scene_is_on_paper(tab: Tab) -> None:
 
 def test_large_scenes_turn_with_fewer_points_and_say_so(browser: Any, tmp_path: Path) -> None:
     network, truth = make_network(seed_of("many"), images=3, points=6000, planar=True, visibility=0.5)
-    many = scene_of_stored(StoredResult("many", network, truth, unit="m"))
+    many = scene_of_stored(Solution("many", network, truth, unit="m"))
     tab = Tab(browser, write_view(many, tmp_path / "many.html", source="here", paths={}))
     page = tab.ready()
     page.evaluate("() => { document.getElementById('explore').viewer.scene.mean = 1000 }")  # a slow machine

@@ -17,7 +17,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
 from sfm.survey.inputs.given import read_image_points
 from tests.surveys import survey_of
@@ -98,7 +98,7 @@ def test_no_sigma_is_invented_in_the_tables(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("no sigma"), images=5, points=15)
     seen = network.image_points
     unknown = replace(network, image_points=replace(seen, stated=np.zeros(len(seen), dtype=bool)))
-    write_tables(tmp_path / "tables", StoredResult("x", unknown, truth))
+    write_tables(tmp_path / "tables", Solution("x", unknown, truth))
     header = (tmp_path / "tables" / "image_points.csv").read_text("utf-8").splitlines()[0]
     assert header == "image,point,x_px,y_px"
     assert read_image_points(tmp_path / "tables" / "image_points.csv").sigma is None

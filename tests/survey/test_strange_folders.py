@@ -37,7 +37,7 @@ from sfm.matching.tracks.natural_points import natural_points
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
@@ -100,7 +100,7 @@ def results(folder: Path) -> tuple[Path, Path]:
         network = replace(network, image_points=replace(seen, xy=seen.xy + noise))
         a = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
         joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(8))
-        found = StoredResult(
+        found = Solution(
             *("r", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m", joint, "free")
         )
         write_tables(folder / f"r{seed}", found)

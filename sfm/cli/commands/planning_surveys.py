@@ -43,7 +43,7 @@ def simulate_command(
                 result = run_survey(survey, compare_with="none", progress=True)
                 result.write(part / "result")
                 (part / ".result.lock").unlink(missing_ok=True)
-                found = achieved(planned, codes, result.stored, result.adjustment.sigma0_px)
+                found = achieved(planned, codes, result.solution, result.adjustment.sigma0_px)
                 text = json.dumps(asdict(found), indent=2, allow_nan=False)
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
     print(f"{found.points} of {found.planned} planned points measured")

@@ -15,7 +15,7 @@ from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.conventions import BoolArray, FloatArray
-    from sfm.stored_result import StoredResult
+    from sfm.solution import Solution
 
 PICTURES = "pictures"  # folder of the photographs in that of a result
 
@@ -106,7 +106,7 @@ def view(
         print("No browser could be opened here: open the page by hand.")
 
 
-def _with_rejected(folder: Path, stored: StoredResult) -> tuple[StoredResult, BoolArray, FloatArray]:
+def _with_rejected(folder: Path, stored: Solution) -> tuple[Solution, BoolArray, FloatArray]:
     """Return a result with its rejected image points, which these are, and w of all."""
     from dataclasses import replace
 

@@ -11,14 +11,14 @@ fit the result are photographs oriented anew, with them or, if they lead nowhere
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.given_values import start_from_given
@@ -64,7 +64,7 @@ class Orientation:
 
 def orient(
     network: Network,
-    estimate: Estimate,
+    estimate: Estimate | Sequence[Camera],
     *,
     seed: int = 0,
     refine: Refine | None = None,
@@ -78,7 +78,8 @@ def orient(
 
     Args:
         network: measured facts; image points without a known object point belong out of it.
-        estimate: cameras with start values; exterior orientation and points NaN, or given where known.
+        estimate: cameras with start values, or an estimate in which exterior orientation and points are NaN,
+            or given where known.
         seed: of all random choices.
         refine: adjusts a fully determined part of the network (no NaN in it) and returns it adjusted; the
             cameras it is given have as many free parameters as the part can determine. Its result
@@ -96,17 +97,19 @@ def orient(
         point that its rays do not determine.
 
     Raises:
-        GeometryError: no two photographs could be oriented, with the given values or without them.
+        GeometryError: no two photographs could be oriented, with the given values or without them, or fewer
+            cameras than the network has.
 
     Source: Luhmann et al. (2020), sec. 4.4.4 (orientation of image networks), with resection by Fischler and
     Bolles (1981) in every photograph.
 
     Example:
         >>> import sfm
-        >>> start = sfm.empty_estimate(result.network, result.estimate.cameras)
-        >>> sfm.orient(result.network, start).failures
+        >>> sfm.orient(result.network, result.estimate.cameras).failures
         ()
     """
+    if not isinstance(estimate, Estimate):
+        estimate = empty_estimate(network, _as_cameras(estimate, int(network.camera.max()) + 1))
 
     def begin(values: Estimate, share: float = 1.0) -> Growth:
         diagonal = np.array([np.hypot(*camera.size_px) for camera in values.cameras])
@@ -158,6 +161,16 @@ def orient(
         else remark("approximate_contradicts_control")
     )
     return replace(without, remarks=(*without.remarks, unused))
+
+
+def _as_cameras(cameras: Sequence[Camera], count: int) -> tuple[Camera, ...]:
+    """Return the cameras of a network; GeometryError for anything else."""
+    found = tuple(cameras) if isinstance(cameras, Sequence) else ()
+    if len(found) < count or not all(isinstance(one, Camera) for one in found):
+        raise GeometryError(
+            f"orient: {type(cameras).__name__}, expected an Estimate or {counted(count, 'camera')}"
+        )
+    return found
 
 
 def _holds_control(network: Network, found: Orientation) -> bool:

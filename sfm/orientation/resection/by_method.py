@@ -11,7 +11,7 @@ from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
     LineFit,
-    Solution,
+    ResectionSolution,
     checked_points,
     choose_by_line,
     rotation_from_position,
@@ -52,7 +52,7 @@ class Resected:
 
     method: str
     points: int  # how many were given
-    solutions: tuple[Solution, ...]  # the best first
+    solutions: tuple[ResectionSolution, ...]  # the best first
     sigma0_mm: float | None = None  # of an image coordinate, mm; NaN without redundancy
     redundancy: int | None = None
     dispersion: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, (6, 6)
@@ -116,7 +116,7 @@ def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
 
 
 def _closed(
-    method: str, function: Callable[[FloatArray, FloatArray], tuple[Solution, ...]]
+    method: str, function: Callable[[FloatArray, FloatArray], tuple[ResectionSolution, ...]]
 ) -> Callable[[Task], Resected]:
     return lambda task: Resected(method, len(task.points), function(task.tangents, task.points))
 
@@ -131,7 +131,7 @@ def _church(task: Task) -> Resected:
 def _dlt(task: Task) -> Resected:
     checked_points("dlt", task.xy_mm, task.points, needed=6)
     result = resect_dlt(task.xy_mm, task.points)
-    solution = Solution(result.position, result.rotation, result.residuals / task.c)
+    solution = ResectionSolution(result.position, result.rotation, result.residuals / task.c)
     return Resected(
         "dlt",
         len(task.points),
@@ -154,7 +154,7 @@ def _robust(task: Task) -> Resected:
     return Resected(
         "robust",
         len(task.points),
-        (Solution(result.position, result.rotation, result.residuals[result.inliers]),),
+        (ResectionSolution(result.position, result.rotation, result.residuals[result.inliers]),),
         sigma0_mm=result.sigma0 * task.c,
         redundancy=int(2 * result.inliers.sum() - 6),
         dispersion=result.covariance,
@@ -173,7 +173,7 @@ def _least_squares(task: Task) -> Resected:
     return Resected(
         "least-squares",
         len(task.points),
-        (Solution(result.position, result.rotation, result.residuals),),
+        (ResectionSolution(result.position, result.rotation, result.residuals),),
         sigma0_mm=result.sigma0 * task.c,
         redundancy=result.redundancy,
         dispersion=result.covariance,

@@ -16,7 +16,7 @@ MIN_TO_CHOOSE = 4  # three points are fitted by every solution
 
 
 @dataclass(frozen=True)
-class Solution:
+class ResectionSolution:
     """An exterior orientation and how it fits the image points it was tested on."""
 
     position: FloatArray  # projection centre X0, object unit, (3,)
@@ -33,7 +33,7 @@ class Solution:
 
 def solution_of(
     position: FloatArray, rotation: FloatArray, tangents: FloatArray, points: FloatArray
-) -> Solution:
+) -> ResectionSolution:
     """Return an exterior orientation with its residuals at the given points.
 
     Args:
@@ -42,7 +42,7 @@ def solution_of(
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
         points: object points, shape (n, 3), object unit.
     """
-    return Solution(position, rotation, tangents_of(position, rotation, points) - tangents)
+    return ResectionSolution(position, rotation, tangents_of(position, rotation, points) - tangents)
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class LineFit:
 
 
 def choose_by_line(
-    solutions: tuple[Solution, ...], tangents: FloatArray
-) -> tuple[Solution, tuple[LineFit, ...]]:
+    solutions: tuple[ResectionSolution, ...], tangents: FloatArray
+) -> tuple[ResectionSolution, tuple[LineFit, ...]]:
     """Return the solution whose computed image coordinates lie nearest to the line computed = measured.
 
     Args:
@@ -130,7 +130,7 @@ def rotation_from_position(tangents: FloatArray, points: FloatArray, position: F
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-def ordered(solutions: list[Solution]) -> tuple[Solution, ...]:
+def ordered(solutions: list[ResectionSolution]) -> tuple[ResectionSolution, ...]:
     """Return solutions with the smallest residuals first."""
     return tuple(sorted(solutions, key=lambda solution: solution.rms))
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import Solution, checked_points, solution_of
+from sfm.orientation.resection.candidates import ResectionSolution, checked_points, solution_of
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents
 
 MIN_POINTS = 3
@@ -23,7 +23,7 @@ _I, _J = np.array([0, 1, 2]), np.array([1, 2, 0])
 class ChurchResection:
     """The solution that Church's iteration reaches from its start, and the way there."""
 
-    solution: Solution
+    solution: ResectionSolution
     history: FloatArray  # projection centre before the first and after every step, object unit, (s + 1, 3)
 
 

@@ -10,7 +10,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled_fused
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
+from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # numbers of scratch space
@@ -32,7 +32,7 @@ class Poses:
     legs: FloatArray  # distances from the projection centre to the points, object unit, (k, 4, 3)
 
 
-def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientations from the first three points, the one that all points confirm first.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
-    Solution,
+    ResectionSolution,
     checked_points,
     rotation_from_position,
     solution_of,
@@ -19,7 +19,7 @@ COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residu
 PARALLEL = 1e-12  # |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel
 
 
-def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientation from four or more points in one plane.
 
     Args:

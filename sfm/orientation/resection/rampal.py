@@ -9,7 +9,7 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
-    Solution,
+    ResectionSolution,
     checked_points,
     ordered,
     rotation_from_position,
@@ -27,7 +27,7 @@ SAME = 1e-6  # distance of two positions, in extents of the points, below which 
 MAX_TRIPLES = 20
 
 
-def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientation by Rampal, which needs no approximate values.
 
     Args:
@@ -49,7 +49,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[Solution, .
     linearised and repeated.
     """
     uv, xyz = checked_points("rampal", tangents, points, needed=MIN_POINTS)
-    found: list[Solution] = []
+    found: list[ResectionSolution] = []
     failure = GeometryError("rampal: no solution")
     for triple in islice(combinations(range(len(xyz)), 3), MAX_TRIPLES):
         order = [*triple, *(i for i in range(len(xyz)) if i not in triple)]

@@ -8,7 +8,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
+from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
 from sfm.orientation.resection.fischler_bolles import (
     MAX_SOLUTIONS,
     NEAR,
@@ -23,7 +23,7 @@ from sfm.orientation.resection.fischler_bolles import (
 MIN_POINTS = 3
 
 
-def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientations by Zeng and Wang, the one that the further points confirm first.
 
     Args:

@@ -24,7 +24,7 @@ from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
 from sfm.result import SurveyResult
-from sfm.stored_result import CONTROL_COVARIANCE, MEASURED
+from sfm.solution import CONTROL_COVARIANCE, MEASURED
 
 USUAL_R0 = 2 / 3  # of the largest image radius
 

@@ -10,12 +10,12 @@ from sfm.comparison.stable_points import point_blocks
 from sfm.epochs.displacements import Displacements
 from sfm.report.viewer.scene import ViewerScene
 from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 
 
-def scene_of_displacements(found: Displacements, first: StoredResult) -> ViewerScene:
+def scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
     """Return the scene of an epoch with the displacement of every point and what the test says of it.
 
     Standard deviations and ellipsoids are those of the displacements.

@@ -27,7 +27,7 @@ def scene_of_result(findings: Findings) -> ViewerScene:
         a.rejected[order],
         ellipse[order],
     )
-    joint = result.with_covariance
+    joint = result.solution.with_joint_covariance
     bars = network.scale_bars
     length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
     return ViewerScene(

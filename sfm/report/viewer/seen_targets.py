@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from sfm.conventions import FloatArray, IntArray
 from sfm.report.viewer.scene import Marks
 from sfm.result import likest_first
-from sfm.stored_result import SeenTargets
+from sfm.solution import SeenTargets
 
 SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
 UNUSED = "measured, not part of the result"

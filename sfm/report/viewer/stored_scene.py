@@ -10,11 +10,11 @@ from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
 from sfm.report.viewer.seen_targets import joined_targets
-from sfm.stored_result import SeenTargets, StoredResult
+from sfm.solution import SeenTargets, Solution
 
 
 def scene_of_stored(
-    stored: StoredResult,
+    stored: Solution,
     *,
     w: FloatArray | None = None,
     rejected: BoolArray | None = None,
@@ -104,7 +104,7 @@ def scene_of_stored(
     )
 
 
-def _residuals(stored: StoredResult, seen: ImagePoints) -> FloatArray:
+def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
     """Return computed minus measured position of every image point, px; NaN where not known, (k, 2)."""
     network, estimate = stored.network, stored.estimate
     computed = np.full(seen.xy.shape, np.nan)

@@ -29,7 +29,7 @@ from sfm.result import (
     PhotographTargets,
 )
 from sfm.runtime.progress import report_step
-from sfm.stored_result import NO_SCALE
+from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
     datum_remarks,
@@ -91,7 +91,7 @@ class Correspondences:
 
 
 @dataclass(frozen=True)
-class Solution:
+class SolvedSurvey:
     """The final adjustment, and what happened on the way to it."""
 
     adjustment: Adjustment
@@ -109,7 +109,7 @@ def refine(network: Network, estimate: Estimate) -> Estimate:
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
-def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
+def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
 
     Points that keep too few rays and photographs that keep too few points leave the network, and the rest
@@ -143,7 +143,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     report_step("testing the assumptions")
     plates = _plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)
-    return Solution(
+    return SolvedSurvey(
         final,
         solved.check,
         _dropped(start, solved),

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.significance import compare_results
@@ -22,7 +21,7 @@ from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import mean_distance
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 
 MIN_RAYS = 2
 
@@ -77,7 +76,7 @@ def tell_second_objects(found: Orientation, groups: tuple[SecondObject, ...]) ->
     return replace(found, failures=failures)
 
 
-def _adjusted(network: Network, found: Orientation) -> StoredResult | None:
+def _adjusted(network: Network, found: Orientation) -> Solution | None:
     """Return the image points that fit in an orientation adjusted by themselves; None without a solution."""
     alone = Network(network.images, network.camera, network.points, network.image_points)
     images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
@@ -85,15 +84,10 @@ def _adjusted(network: Network, found: Orientation) -> StoredResult | None:
     a = adjust(part, start, datum=Datum("free"), reject="tau")
     if not a.converged or a.undetermined:
         return None
-    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(len(part.points)))
-    return StoredResult(
-        "", part, a.estimate, a.covariance.points, redundancy=a.redundancy, covariance=joint, datum=a.datum
-    )
+    return a.solution.with_joint_covariance
 
 
-def _reason(
-    others: StoredResult | None, group: StoredResult | None, images: tuple[str, ...]
-) -> Remark | None:
+def _reason(others: Solution | None, group: Solution | None, images: tuple[str, ...]) -> Remark | None:
     """Return why photographs do not fit the others; None where they show the same object or too little."""
     if others is None or group is None:
         return None

@@ -15,7 +15,7 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_camera
 from sfm.comparison.significance import compare_results
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 CAMERAS, POINTS = 5, 14
@@ -76,7 +76,7 @@ def test_numbers_are_no_names_and_what_coincides_is_paired_by_place(tmp_path: Pa
     named = replace(network, points=tuple(str(j) for j in order))
     write_any(tmp_path / "problem.txt", "bal", named, truth)
     convert(tmp_path / "problem.txt", tmp_path / "tables")
-    found = compare_results(StoredResult("own", named, truth), read_comparable(tmp_path / "tables"))
+    found = compare_results(Solution("own", named, truth), read_comparable(tmp_path / "tables"))
     assert len(found.points) == 30 and found.pairing.points_by_name == 0
     assert np.abs(found.point_difference).max() < 1e-9
 

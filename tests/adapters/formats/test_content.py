@@ -23,7 +23,7 @@ from sfm.network import (
     ScaleBars,
 )
 from sfm.pipeline import run_survey
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.synthetic import make_network, seed_of
 
@@ -113,13 +113,15 @@ def survey(form: str, rng: np.random.Generator) -> Content:
     sigma = np.where(camera.free, 0.01, np.nan)
     count = int(camera.free.sum())
     known = bool(count) and chance(rng)
-    result = StoredResult(
+    result = Solution(
         *("survey", network, truth, marginal, position),
         interior_sigma=(sigma,) if known else None,
         redundancy=int(rng.integers(10, 99)) if chance(rng) else None,
         unit=str(rng.choice(["", "mm", "m"])),
         covariance=joint,
         datum=str(rng.choice(["", "free", "control"])),
+        exterior_covariance=exterior_covariance,
+        interior_covariance=tuple(covariances(rng, 1, count)) if known else (),
     )
     checks = ObjectPoints(chosen[8:10], truth.points[chosen[8:10]], covariances(rng, 2, 3, diagonal=True))
     bad = ImagePoints(
@@ -134,8 +136,6 @@ def survey(form: str, rng: np.random.Generator) -> Content:
         replace(result, network=network),
         **({"rejected": bad} if with_bad else {}),
         **({"checks": checks} if chance(rng) else {}),
-        exterior_covariance=exterior_covariance,
-        interior_covariance=tuple(covariances(rng, 1, count)) if known else (),
         sigma0=float(rng.uniform(0.5, 2)) if chance(rng) else None,
     )
 
@@ -166,7 +166,7 @@ def test_tables_are_a_survey_with_all_that_was_given(unit: str, tmp_path: Path) 
         ),
     )
     checks = ObjectPoints(np.array([8, 9]), truth.points[8:10], sigma[:2])
-    content = Content(StoredResult("whole", network, truth, unit=unit, datum="control"), checks=checks)
+    content = Content(Solution("whole", network, truth, unit=unit, datum="control"), checks=checks)
     a = run_of(content, tmp_path / "out")
     survey = read_survey(tmp_path / "out" / "survey.toml")
     assert (survey.unit, survey.datum.kind) == (unit, "control")
@@ -187,7 +187,7 @@ def test_cameras_of_single_photographs_share_what_they_shared(tmp_path: Path) ->
         for camera, image in zip(truth.cameras, network.images, strict=True)
     )
     truth = replace(truth, cameras=cameras)
-    a = run_of(Content(StoredResult("own", network, truth, datum="free")), tmp_path / "out")
+    a = run_of(Content(Solution("own", network, truth, datum="free")), tmp_path / "out")
     b = adjust(network, truth, reject="none")
     assert a.redundancy == b.redundancy == 2 * len(network.image_points) - 6 * 6 - 3 * 25 - 6 - 1 + 7
     assert [camera.name for camera in a.estimate.cameras] == [camera.name for camera in cameras]
@@ -203,7 +203,7 @@ def test_rejected_points_come_back_as_rejected_and_are_found_again(tmp_path: Pat
     assert np.flatnonzero(a.rejected).tolist() == [7]
     seen = a.network.image_points
     content = Content(
-        StoredResult("r", replace(network, image_points=seen.select(~a.rejected)), a.estimate),
+        Solution("r", replace(network, image_points=seen.select(~a.rejected)), a.estimate),
         rejected=seen.select(a.rejected),
     )
     again = run_of(content, tmp_path / "out")
@@ -224,15 +224,15 @@ def test_what_has_no_coordinates_is_named_where_it_goes(tmp_path: Path) -> None:
         write_content(tmp_path / form, form, content)
         again = read_content(tmp_path / form).result
         assert (len(again.network.images), len(again.network.points)) == (IMAGES - 1, POINTS - 1)
-    C = read_content(tmp_path / "tables").exterior_covariance
-    assert (C is None) == (content.exterior_covariance is None)
+    C = read_content(tmp_path / "tables").result.exterior_covariance
+    assert (C is None) == (content.result.exterior_covariance is None)
 
 
 def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network, truth = make_network(seed_of("named"), images=5, points=12, model="opencv")
     bar = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-4]))
     network = replace(network.with_control(["1", "2"], truth.points[:2]), scale_bars=bar)
-    content = Content(StoredResult("x", network, truth, unit="mm", datum="free", redundancy=7))
+    content = Content(Solution("x", network, truth, unit="mm", datum="free", redundancy=7))
     write_content(tmp_path / "in", "tables", content)
     convert(tmp_path / "in", tmp_path / "out.xml")
     told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
@@ -286,9 +286,9 @@ def test_what_is_lost_is_what_is_named(form: str, tmp_path: Path) -> None:
 def test_damaged_covariances_are_refused(damage: Callable[[Path], None], tmp_path: Path) -> None:
     network, truth = make_network(seed_of("damaged"), images=IMAGES, points=POINTS)
     C = covariances(seed_of("damaged C"), IMAGES, 6)
-    write_content(tmp_path / "t", "tables", Content(StoredResult("x", network, truth), exterior_covariance=C))
+    write_content(tmp_path / "t", "tables", Content(Solution("x", network, truth, exterior_covariance=C)))
     again = read_content(tmp_path / "t")
-    np.testing.assert_array_equal(again.exterior_covariance, C)
+    np.testing.assert_array_equal(again.result.exterior_covariance, C)
     damage(tmp_path / "t" / "covariances.npz")
     with pytest.raises(SurveyFileError, match=r"covariances\.npz"):
         read_content(tmp_path / "t")

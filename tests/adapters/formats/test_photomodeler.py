@@ -18,7 +18,7 @@ from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.places import SHARED
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -207,7 +207,7 @@ def test_posterior_sigma_of_adjusted_control_is_no_prior(tmp_path: Path) -> None
 def test_uncoded_points_get_numbers_that_no_other_has(tmp_path: Path) -> None:
     network, truth = made()
     names = (*(f"u{j + 1:03d}" for j in range(12)), "3", "7", "200", "1")
-    content = Content(StoredResult("x", replace(network, points=names), truth))
+    content = Content(Solution("x", replace(network, points=names), truth))
     write_export(tmp_path / "pm", content)
     again = read_export(tmp_path / "pm").result.network
     numbers = np.array([int(name) for name in again.points])

@@ -23,7 +23,7 @@ from adapters.reading.text_lines import Lines
 from adapters.reading.xml_lines import read_xml
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
-from sfm.stored_result import StoredResult
+from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 HUGE_BYTES = 10_000_000_000
@@ -39,7 +39,7 @@ def made() -> tuple[Network, Estimate]:
 def folder(made: tuple[Network, Estimate], tmp_path: Path) -> Path:
     network, truth = made
     sigma = np.tile(np.eye(3) * 1e-6, (6, 1, 1))
-    write_tables(tmp_path / "t", StoredResult("t", network, truth, sigma, sigma[:4], None, 7, "mm"))
+    write_tables(tmp_path / "t", Solution("t", network, truth, sigma, sigma[:4], None, 7, "mm"))
     return tmp_path / "t"
 
 
@@ -130,7 +130,7 @@ def test_an_image_point_twice_is_refused(folder: Path) -> None:
 
 def test_sigmas_that_nobody_knows_are_none(made: tuple[Network, Estimate], tmp_path: Path) -> None:
     network, truth = made
-    write_tables(tmp_path, StoredResult("t", network, truth))
+    write_tables(tmp_path, Solution("t", network, truth))
     assert (tmp_path / "points.csv").read_text().splitlines()[0] == "id,X,Y,Z"
     found = read_result(tmp_path)
     assert found.point_covariance is None and found.position_covariance is None

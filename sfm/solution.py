@@ -1,0 +1,258 @@
+"""Solution: a network that is solved, with its covariance, whoever solved it.
+
+`adjust` and `run_survey` have it as `.solution`, `read_result` returns it; comparison, shapes, measurement,
+epochs and files take it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.display import html_table, text_table
+from sfm.errors import GeometryError
+from sfm.files.covariance_file import points_kept_together
+from sfm.network import Estimate, Network, index_of
+from sfm.point_table import Point, PointTable
+
+NO_SCALE = "network units"
+"""unit of lengths in a network whose scale is undefined"""
+OBJECT_UNITS = "object units"
+"""unit of lengths in a network of which nobody has said which one it is"""
+CONTROL_COVARIANCE = "control covariance"  # kind of a row of given.csv
+MEASURED = "measured"
+"""what targets.csv says of a target in the place of a reason for its rejection"""
+
+
+@dataclass(frozen=True)
+class SeenTargets:
+    """What was measured, and what was rejected, in the photographs of a result."""
+
+    image: IntArray  # index of the photograph in the network of the result, (k,)
+    xy: FloatArray  # centres, px, (k, 2)
+    ellipse: (
+        FloatArray  # semi-axes, larger first, px, and angle from x towards y, rad; NaN if rejected, (k, 3)
+    )
+    reason: tuple[str, ...]  # why it was not measured, in words; empty where it was, (k,)
+
+    @property
+    def measured(self) -> BoolArray:
+        """Which were measured, (k,)."""
+        return np.array([not words for words in self.reason], dtype=bool)
+
+
+@dataclass(frozen=True)
+class OrientedImage:
+    """Exterior orientation of one photograph."""
+
+    name: str
+    position: FloatArray  # projection centre X0, object unit, (3,)
+    rotation: FloatArray  # R, image to object axes, (3, 3)
+    covariance: (
+        FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad); NaN where not known, (6, 6)
+    )
+
+    @property
+    def angles(self) -> FloatArray:
+        """Omega, phi, kappa, rad, (3,)."""
+        return angles_from_rotation(self.rotation)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (6,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+
+JointCovariance = Callable[[IntArray, IntArray], FloatArray]
+"""Returns the joint covariance of X Y Z of points (p,) and X0 Y0 Z0 omega phi kappa of photographs (m,), by
+their indices, in object units and rad, (3 p + 6 m, 3 p + 6 m)."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Solution:
+    """A network with its solution: Kolinear's own, COLMAP's or another program's.
+
+    Example:
+        >>> import sfm
+        >>> solution = sfm.adjust(result.network, result.estimate).solution
+        >>> solution.point("1").xyz.shape, solution.covariance_of(["1", "2"], ["image 1"]).shape
+        ((3,), (12, 12))
+    """
+
+    name: str  # what people call it
+    network: Network
+    estimate: Estimate
+    point_covariance: FloatArray | None = None  # marginal, object unit^2, (n, 3, 3)
+    position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
+    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
+    redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
+    unit: str = ""  # of lengths, as people call it; empty where nobody knows
+    covariance: FloatArray | None = None  # of all coordinates of points together, object unit^2, (3k, 3k)
+    datum: str = ""  # free | minimal | control; empty where nobody knows
+    points_named: bool = True  # whether names of points identify them, or are mere numbers
+    images_named: bool = True  # likewise of photographs
+    covariance_points: IntArray | None = (
+        None  # of which k points `covariance` is, all n where not given, (k,)
+    )
+    exterior_covariance: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, unit and rad, (m, 6, 6)
+    interior_covariance: tuple[FloatArray, ...] = ()  # of the free parameters of each camera, (f, f)
+    joint: JointCovariance | None = None  # of an adjustment in memory; None where only what is above is known
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether lengths are in a known unit, from scale bars or control."""
+        return self.unit not in ("", NO_SCALE)
+
+    @property
+    def solution(self) -> Solution:
+        """Itself, as an adjustment and a survey have theirs."""
+        return self
+
+    @cached_property
+    def with_joint_covariance(self) -> Solution:
+        """The same with the covariance of all points together, or of a sample of many of them.
+
+        It is the solution as it is where that is not known.
+        """
+        if self.covariance is not None or self.joint is None:
+            return self
+        some = points_kept_together(self.network.points)
+        try:
+            found = self.joint(some, np.zeros(0, dtype=np.int64))
+        except GeometryError:  # normal equations that cannot be solved have no covariance at all
+            return self
+        if not np.isfinite(found).all():
+            return self
+        every = len(some) == len(self.network.points)
+        return replace(self, covariance=found, covariance_points=None if every else some)
+
+    def covariance_of(self, points: Sequence[str] = (), images: Sequence[str] = ()) -> FloatArray:
+        """Return the joint covariance of some points and photographs, by their names.
+
+        Args:
+            points: p names.
+            images: m names of photographs.
+
+        Returns:
+            Covariance of X Y Z of each point, then of X0, Y0, Z0, omega, phi, kappa of each photograph, in
+            object units and rad, (3 p + 6 m, 3 p + 6 m).
+
+        Raises:
+            UnknownNameError: there is none of that name.
+            GeometryError: it is not known, as that between points of a result of another program.
+        """
+        rows = np.array([self.network.point_index(name) for name in points], dtype=np.int64)
+        photographs = np.array([self.network.image_index(name) for name in images], dtype=np.int64)
+        if self.joint is not None:
+            return self.joint(rows, photographs)
+        if not len(photographs) and self.covariance is not None:
+            kept = self.covariance_rows(rows)
+            if (kept >= 0).all():
+                own = (3 * kept[:, None] + np.arange(3)).ravel()
+                return np.asarray(self.covariance[np.ix_(own, own)])
+        if len(rows) == 1 and not len(photographs) and self.point_covariance is not None:
+            return np.asarray(self.point_covariance[rows[0]])
+        if len(photographs) == 1 and not len(rows) and self.exterior_covariance is not None:
+            return np.asarray(self.exterior_covariance[photographs[0]])
+        raise GeometryError(
+            f"result {self.name}: the joint covariance of these points and photographs is not in it; "
+            "adjust the network with sfm.adjust"
+        )
+
+    def covariance_rows(self, points: IntArray) -> IntArray:
+        """Return the row of points among those that `covariance` is of, -1 where it is not of them.
+
+        Args:
+            points: indices, (k,).
+        """
+        if self.covariance_points is None:
+            return points
+        row = np.full(len(self.network.points), -1, dtype=np.int64)
+        row[self.covariance_points] = np.arange(len(self.covariance_points))
+        return np.asarray(row[points])
+
+    @property
+    def points(self) -> PointTable:
+        """The object points by name."""
+        n = len(self.network.points)
+        covariance = self.point_covariance
+        if covariance is None:
+            covariance = np.full((n, 3, 3), np.nan)
+        return PointTable(
+            self.network.points, self.estimate.points, covariance, self.network.rays(), self.unit
+        )
+
+    def point(self, name: str | int) -> Point:
+        """Return an object point by its name, which of a coded target is its number.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+        """
+        found: Point = self.points[str(name)]
+        return found
+
+    def write(self, folder: str | Path) -> Path:
+        """Write the tables of the solution into a folder, whole or not at all; return points.csv.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        import sfm  # files stand above the solution, and are reached by their public name
+
+        path: Path = sfm.write_result(self, folder)
+        return path
+
+    def image(self, name: str) -> OrientedImage:
+        """Return the exterior orientation of a photograph; UnknownNameError if there is none of that name."""
+        i = self.network.image_index(name)
+        covariance = np.full((6, 6), np.nan)
+        if self.exterior_covariance is not None:
+            covariance = self.exterior_covariance[i]
+        elif self.position_covariance is not None:
+            covariance[:3, :3] = self.position_covariance[i]
+        return OrientedImage(name, self.estimate.position[i], self.estimate.rotation[i], covariance)
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera; UnknownNameError if there is none of that name."""
+        cameras = self.estimate.cameras
+        return cameras[index_of([camera.name for camera in cameras], name, "camera")]
+
+    def _rows(self) -> list[tuple[str, str]]:
+        known = self.point_covariance is not None
+        return [
+            ("photographs", str(len(self.network.images))),
+            ("points", f"{len(self.network.points)}{', with' if known else ', without'} standard deviations"),
+            ("image points", str(len(self.network.image_points))),
+            ("cameras", ", ".join(f"{c.name} ({c.model})" for c in self.estimate.cameras)),
+        ]
+
+    def __repr__(self) -> str:
+        return text_table(f"Result {self.name}", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Result {self.name}", ("", ""), self._rows())
+
+
+def solution_of(result: Any, what: str) -> Solution:
+    """Return the solution of what an adjustment, a survey or a file gave.
+
+    Args:
+        result: a Solution, or what has one as `.solution`.
+        what: asks for it, for messages.
+
+    Raises:
+        GeometryError: it has none.
+    """
+    found = getattr(result, "solution", None)
+    if not isinstance(found, Solution):
+        raise GeometryError(
+            f"{what}: {type(result).__name__}, expected what run_survey, adjust or read_result returned"
+        )
+    return found
