@@ -1,1 +1,1 @@
-"""Photographs as files: `reading` (pixels), `exif` (camera and sensor), `file_checks` (untrusted files)."""
+"""Photographs as files: `reading` (pixels), `exif`, `satellite_positions`, `file_checks` (untrusted)."""

@@ -1,15 +1,17 @@
-"""What the EXIF data of a photograph say about its camera and sensor."""
+"""What the EXIF data of a photograph say about its camera and sensor, its time and its place."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags, Image
 
 from sfm.photographs.file_checks import opened_header
+from sfm.photographs.satellite_positions import SatellitePosition, satellite_position
 
 # Beyond these what EXIF data say is no camera: principal distance and pixel in mm.
 FOCAL_MM = (0.1, 1e5)
@@ -40,6 +42,10 @@ class Metadata:
     """model of the lens"""
     taken_px: tuple[int, int] | None = None
     """width and height as the camera says it took them, px"""
+    taken: datetime | None = None
+    """when, by the clock of the camera"""
+    position: SatellitePosition | None = None
+    """where, by satellite navigation"""
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -59,9 +65,10 @@ def read_metadata(path: str | Path) -> Metadata:
         size = image.size
         try:
             exif = image.getexif()
-            camera = exif.get_ifd(ExifTags.IFD.Exif)
         except Exception:  # damaged EXIF data, on which Pillow fails in many ways, are as good as none
-            exif, camera = Image.Exif(), {}
+            exif = Image.Exif()
+        camera, gps = _directory(exif, ExifTags.IFD.Exif), _directory(exif, ExifTags.IFD.GPSInfo)
+        xmp = image.info.get("xmp", b"")
     focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
     equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
     orientation = exif.get(ExifTags.Base.Orientation, 1)
@@ -76,7 +83,28 @@ def read_metadata(path: str | Path) -> Metadata:
         serial=_text(camera.get(ExifTags.Base.BodySerialNumber)),
         lens=_text(camera.get(ExifTags.Base.LensModel)),
         taken_px=_size_taken(camera),
+        taken=_moment(camera),
+        position=satellite_position(gps, xmp if isinstance(xmp, bytes) else b""),
     )
+
+
+def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:
+    """Return a directory of EXIF data by tag, empty where it is damaged."""
+    try:
+        return exif.get_ifd(which)
+    except Exception:  # see `read_metadata`
+        return {}
+
+
+def _moment(camera: Any) -> datetime | None:
+    """Return when a photograph was taken, with the fraction of the second where it is stated."""
+    text = _text(camera.get(ExifTags.Base.DateTimeOriginal))
+    try:
+        moment = datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S")  # cameras know no zone
+    except ValueError:
+        return None
+    digits = _text(camera.get(ExifTags.Base.SubsecTimeOriginal)) or ""
+    return moment.replace(microsecond=int(f"{digits:0<6.6}")) if digits.isdecimal() else moment
 
 
 def _size_taken(camera: Any) -> tuple[int, int] | None:
