@@ -21,7 +21,12 @@ from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.tracks.features import Features, matched_features
 from sfm.matching.tracks.natural_points import NaturalPoints
-from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
+from sfm.matching.tracks.overlap import (
+    common_features,
+    connected_parts,
+    connecting_pairs,
+    overlapping_pairs,
+)
 from sfm.network import rows_of
 from sfm.runtime.progress import reported
 
@@ -66,6 +71,7 @@ def find_tie_points(
     seed: int = 0,
     threads: int = 1,
     known: Matches | None = None,
+    neighbours: Sequence[IntArray] = (),
 ) -> TiePoints:
     """Find and measure points that several photographs have in common, knowing nothing of their orientation.
 
@@ -78,6 +84,7 @@ def find_tie_points(
         seed: of the random samples.
         threads: pairs of photographs worked on at a time.
         known: see `link_features`.
+        neighbours: see `link_features`.
 
     Returns:
         The tie points; n may be 0.
@@ -88,7 +95,9 @@ def find_tie_points(
     return measure_tracks(
         photographs,
         natural,
-        link_features(natural, min_rays=min_rays, seed=seed, threads=threads, known=known),
+        link_features(
+            natural, min_rays=min_rays, seed=seed, threads=threads, known=known, neighbours=neighbours
+        ),
         window_px=window_px,
         min_rays=min_rays,
         min_correlation=min_correlation,
@@ -103,10 +112,11 @@ def link_features(
     seed: int = 0,
     threads: int = 1,
     known: Matches | None = None,
+    neighbours: Sequence[IntArray] = (),
 ) -> Tracks:
     """Match the features of photographs that overlap and put together what belongs to one point.
 
-    Where the matches leave the photographs in several parts, all pairs between these are matched, too.
+    Where the matches leave the photographs in several parts, pairs between these are matched, too.
 
     A point has one feature in a photograph: matches are taken the most distinctive first, and one that would
     put two features of a photograph together is left: a wrong match splits a track and does not lose it.
@@ -117,10 +127,12 @@ def link_features(
         seed: of the random samples.
         threads: pairs worked on at a time.
         known: matches of pairs of photographs that need not be matched again; the others are added.
+        neighbours: photographs that were taken near each, see `overlapping_pairs`.
     """
     known = {} if known is None else known
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
-    pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
+    score = common_features([one.descriptor for one in features], [one.scale for one in features])
+    pairs = overlapping_pairs(score, neighbours=neighbours)
 
     def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
         every = [(i, j) for i, j in of.tolist()]
@@ -135,9 +147,7 @@ def link_features(
     linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
     part = connected_parts(linked, len(features))
     if part.max(initial=0):
-        rest = np.column_stack(np.triu_indices(len(features), 1))
-        tried = np.isin(rest @ [len(features), 1], pairs @ [len(features), 1])
-        rest = rest[~tried & (part[rest[:, 0]] != part[rest[:, 1]])]
+        rest = connecting_pairs(score, part, pairs)
         pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
     edges = [np.zeros((0, 2), dtype=np.int64)]
     edges += [

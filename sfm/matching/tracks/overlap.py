@@ -13,38 +13,65 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.matching.tracks.features import RATIO
 
 FEATURES = 250  # of each photograph, the coarsest
-PARTNERS = 10  # with which a photograph is matched
+PARTNERS = 10  # that what they show chooses for each photograph
+NEIGHBOURS = 4  # that were taken near each photograph, whatever they show
 CLEAR = 6  # features that choose each other by which an overlap is more than chance
+# Partners of a photograph with few clear ones, and of one that is not connected with the others. So many hold
+# nearly all that overlap (96 to 100 % where 3 of 10 features are found again); pairs grow with photographs.
+MANY_PARTNERS = 30
 
 
 def overlapping_pairs(
-    descriptors: Sequence[AnyArray], scales: Sequence[FloatArray], *, partners: int = PARTNERS
+    score: IntArray, *, partners: int = PARTNERS, neighbours: Sequence[IntArray] = ()
 ) -> IntArray:
     """Return pairs of photographs (i < j) that are worth matching, (p, 2).
 
-    Every photograph has its `partners` best ones; one with clear ones for less than half has all others.
+    Every photograph has its `partners` best ones and its nearest neighbours. One with clear partners for less
+    than half has MANY_PARTNERS and all its neighbours.
 
     Args:
-        descriptors: of the features of m photographs, unit vectors, m arrays (k_i, 128).
-        scales: sizes of the features, m arrays (k_i,).
+        score: features that photographs have in common, see `common_features`, (m, m).
         partners: how many others every photograph is matched with, at least; all, if there are no more.
+        neighbours: photographs that were taken near each, the nearest first, negative for none: an array
+            (m, k) for each way to tell.
     """
-    m = len(descriptors)
-    first, second = np.triu_indices(m, 1)
+    m = len(score)
     if m <= partners + 1:
-        return np.column_stack([first, second])
-    score = common_features(descriptors, scales)
-    score += score.T
-    wanted = np.zeros((m, m), dtype=bool)
-    best = np.argsort(-score, axis=1, kind="stable")[:, :partners]
-    wanted[np.arange(m)[:, None], best] = True
-    wanted[(score >= CLEAR).sum(axis=1) < partners / 2] = True
-    wanted |= wanted.T
-    return np.column_stack([first, second])[wanted[first, second]]
+        return np.column_stack(np.triu_indices(m, 1))
+    both = score + score.T
+    lost = (both >= CLEAR).sum(axis=1) < partners / 2
+    wanted = _best(both, np.where(lost, MANY_PARTNERS, partners))
+    for near in neighbours:
+        used = (near >= 0) & (lost[:, None] | (np.arange(near.shape[1]) < NEIGHBOURS))
+        wanted[np.nonzero(used)[0], near[used]] = True
+    return np.argwhere(np.triu(wanted | wanted.T, 1))
+
+
+def connecting_pairs(score: IntArray, part: IntArray, tried: IntArray) -> IntArray:
+    """Return pairs of photographs (i < j) that may connect parts: MANY_PARTNERS for each photograph, (p, 2).
+
+    Args:
+        score: features that photographs have in common, see `common_features`, (m, m).
+        part: which part each photograph belongs to, (m,).
+        tried: pairs that were matched, (q, 2).
+    """
+    apart = part[:, None] != part
+    apart[tried[:, 0], tried[:, 1]] = apart[tried[:, 1], tried[:, 0]] = False
+    wanted = _best(np.where(apart, score + score.T, -1), np.full(len(score), MANY_PARTNERS)) & apart
+    return np.argwhere(np.triu(wanted | wanted.T, 1))
+
+
+def _best(score: IntArray, count: IntArray) -> BoolArray:
+    """Return which others have the highest scores with each photograph, as many as it has to have, (m, m)."""
+    ranked = np.where(np.eye(len(score), dtype=bool), -2, score)
+    order = np.argsort(-ranked, axis=1, kind="stable")[:, : len(score) - 1]
+    best = np.zeros(score.shape, dtype=bool)
+    np.put_along_axis(best, order, np.arange(order.shape[1]) < count[:, None], axis=1)
+    return best
 
 
 def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray]) -> IntArray:

@@ -30,6 +30,15 @@ ROWS = (
         "Add a third photograph.",
     ),
     Kind(
+        "pairs_matched",
+        "note",
+        "{pairs} of {possible} pairs of photographs were matched: those with most in common[[, neighbours in "
+        "the series of {in_sequence:photograph} (EXIF time or numbers in the names)]][[, neighbours by "
+        "satellite navigation of {by_position:photograph} (EXIF)]].",
+        "matching all pairs takes time with the square of the number of photographs",
+        "Nothing needs to be done. If photographs that overlap are not connected, take one between them.",
+    ),
+    Kind(
         "photographs_uneven",
         "warning",
         "The photographs differ in precision (Bartlett's test, {p:<}): sigma0 of {photograph} is {ratio} "

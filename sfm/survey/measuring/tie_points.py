@@ -13,9 +13,11 @@ from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
 from sfm.matching.tracks.natural_points import NaturalPoints, natural_points
+from sfm.matching.tracks.overlap import PARTNERS
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import PhotographFiles, read_photograph
+from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
@@ -24,6 +26,7 @@ from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
+from sfm.survey.measuring.neighbours import neighbours_by_position, neighbours_in_sequence
 from sfm.survey.measuring.photographs import each_photograph
 
 # Image points of a photograph: matches of a repeated pattern are wrong together, and few of them may fit.
@@ -70,17 +73,28 @@ def tie_photographs(
     read = sorted(found)
     names = tuple(photographs.names[k] for k in read)
     camera: IntArray = photographs.camera[read]
+    metadata = [found[k][0] for k in read]
     cameras = start_cameras(
-        survey.cameras, survey.source, tuple(found[k][0] for k in read), camera, names, survey.start_cameras
+        survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([photographs.paths[k] for k in read])
     natural = [found[k][2] for k in read]
 
+    neighbours = (
+        neighbours_by_position(metadata, PARTNERS),
+        neighbours_in_sequence(names, metadata, PARTNERS),
+    )
     matches: Matches = {}
 
     def tie() -> TiePoints:
         return find_tie_points(
-            pictures, natural, window_px=settings.window_px, min_rays=MIN_RAYS, threads=jobs, known=matches
+            pictures,
+            natural,
+            window_px=settings.window_px,
+            min_rays=MIN_RAYS,
+            threads=jobs,
+            known=matches,
+            neighbours=neighbours,
         )
 
     tied = tie()
@@ -111,6 +125,21 @@ def tie_photographs(
         failed,
         tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
         photographs,
+        remarks=_remarks_on_pairs(len(matches), neighbours),
+    )
+
+
+def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remark, ...]:
+    """Return which pairs of photographs were matched, where it is not all of them."""
+    m = len(neighbours[0])
+    possible = m * (m - 1) // 2
+    if pairs == possible:
+        return ()
+    by_position, in_sequence = (int((near >= 0).any(axis=1).sum()) or None for near in neighbours)
+    return (
+        remark(
+            "pairs_matched", pairs=pairs, possible=possible, by_position=by_position, in_sequence=in_sequence
+        ),
     )
 
 
