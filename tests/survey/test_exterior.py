@@ -166,7 +166,9 @@ def test_too_little_to_place_the_network_is_said(tmp_path: Path) -> None:
     path, truth = written(tmp_path, "too little")
     X, Y, Z = truth.position[0].tolist()
     (tmp_path / "exterior.csv").write_text(f"image,X,Y,Z\nimage 1,{X!r},{Y!r},{Z!r}\n", encoding="utf-8")
-    needed = "1 place of projection centres and control points, and the angles of 0 photographs"
+    needed = (
+        "1 place of projection centres and control points with X, Y and Z, and the angles of 0 photographs"
+    )
     with pytest.raises(GeometryError, match=needed):
         solved(path)
 
@@ -179,7 +181,7 @@ def test_projection_centres_on_a_line_do_not_place_a_network(tmp_path: Path, off
     )
     (tmp_path / "exterior.csv").write_text(CENTRES + rows, encoding="utf-8")
     with pytest.raises(
-        GeometryError, match="places on a line of projection centres and control points, and the angles of 0"
+        GeometryError, match="places of projection centres and control points with X, Y and Z, on a line, and"
     ):
         solved(path)
 

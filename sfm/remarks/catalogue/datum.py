@@ -41,6 +41,24 @@ ROWS = (
         "Correct the names in datum.points.",
     ),
     Kind(
+        "exif_positions",
+        "note",
+        "Projection centres of {positions} of {photographs} photographs are observed in EXIF data: X to the "
+        "east, Y to the north and Z up (WGS 84) from latitude {latitude:.3f}, longitude {longitude:.3f}, "
+        "height 0.",
+        "[exterior] exif_sigma_m. Heights are as stated; EXIF data do not say whether above sea level or the "
+        "ellipsoid. Errors that photographs have in common are in no standard deviation: the receiver's, of "
+        "metres over minutes, and where its antenna is on the camera",
+        "Use bars or control for scale and coordinates that must be better than the receiver.",
+    ),
+    Kind(
+        "exif_positions_far",
+        "warning",
+        "The positions of {far} in EXIF data are more than {limit} from the others and were not used.",
+        "a receiver without reception that stated its last or a default position",
+        "Correct or remove the position if the photograph belongs to the survey.",
+    ),
+    Kind(
         "exterior_unused",
         "note",
         "Observed exterior orientation takes no part in datum '{datum}'.",

@@ -114,7 +114,8 @@ def _placed(
     elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
         similarity = fit_similarity(source, target, weights=weight)
     else:
-        raise GeometryError(_too_few(len(target), 0, on_a_line=True))
+        how = "on a line" if length > SURE * noise else "no farther apart than their standard deviations"
+        raise GeometryError(_too_few(len(target), 0, f", {how}"))
     return similarity.apply_estimate(estimate)
 
 
@@ -152,11 +153,10 @@ def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
     return float(spread[0]), float(spread[1])
 
 
-def _too_few(places: int, turned: int, *, on_a_line: bool = False) -> str:
+def _too_few(places: int, turned: int, how: str = "") -> str:
     """Say why observed exterior orientation and control do not place the network."""
-    how = " on a line" if on_a_line else ""
     return (
-        f"datum 'control': the network has {counted(places, 'place')}{how} of projection centres and control "
-        f"points, and the angles of {counted(turned, 'photograph')}; needed three places that are not on a "
-        "line, or two and the angles of a photograph"
+        f"datum 'control': the network has {counted(places, 'place')} of projection centres and control "
+        f"points with X, Y and Z{how}, and the angles of {counted(turned, 'photograph')}; needed three "
+        'places that are not on a line, or two and the angles of a photograph; for the shape alone, "free"'
     )

@@ -11,12 +11,13 @@ from textwrap import fill
 
 import numpy as np
 
-from sfm.display import counted
+from sfm.display import agreeing, counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.file_checks import conversion_of
+from sfm.photographs.satellite_positions import USUAL_SIGMAS_M
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
@@ -78,11 +79,12 @@ def draft_survey(
         )
     trial = try_targets([folder / name for name in used], store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
+    positions = sum(metadata[one].position is not None for one in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     return Draft(
         name,
-        _text(name, grouping, trial, pitch, left_out),
-        _found(grouping, trial),
+        _text(name, grouping, trial, pitch, left_out, positions),
+        _found(grouping, trial, positions),
         _remarks(grouping, trial, pitch),
         left_out,
     )
@@ -132,6 +134,7 @@ def _text(
     trial: TargetTrial,
     pitch: float | None,
     left_out: Sequence[tuple[str, str]],
+    positions: int,
 ) -> str:
     lines = [
         "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
@@ -148,6 +151,7 @@ def _text(
     if trial.plate is None:
         lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
         lines += ["", *_example_lines(trial)]
+        lines += _position_lines(positions) if positions else []
     else:
         lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
         for plate in trial.plates[1:]:
@@ -267,7 +271,20 @@ def _example_lines(trial: TargetTrial) -> list[str]:
     ]
 
 
-def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...]:
+def _position_lines(positions: int) -> list[str]:
+    """Return how positions in EXIF data are asked for, of so many photographs."""
+    east, _, up = USUAL_SIGMAS_M
+    state = agreeing(positions, "states|state")
+    return [
+        "#",
+        f"# {counted(positions, 'photograph')} {state} a position (EXIF), no better than the receiver.",
+        '# For scale and datum from positions, "control" and:',
+        "# [exterior]",
+        f"# exif_sigma_m = [{east:g}, {up:g}]  # m, in the plane and of the height, where none is stated",
+    ]
+
+
+def _found(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
     """What was found, for the terminal."""
     found = [
         (
@@ -289,6 +306,10 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
         found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
         found.append(("targets", "none with codes: points of natural texture"))
+    if positions:
+        found.append(
+            ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")
+        )
     return tuple(found)
 
 

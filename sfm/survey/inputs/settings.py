@@ -196,7 +196,10 @@ class ControlSettings(Section):
 class ExteriorSettings(Section):
     """[exterior]: observed exterior orientation, as by satellite positioning, a tracker or known stations."""
 
-    file: Name  # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
+    # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
+    file: Name | None = None
+    # in place of file, positions in EXIF data, with their standard deviations in the plane and of the height
+    exif_sigma_m: TwoLengths | None = None  # where a photograph states none, m
 
 
 class ScaleBarSettings(Section):

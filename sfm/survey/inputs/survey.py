@@ -45,6 +45,7 @@ from sfm.survey.inputs.settings import (
     CameraSettings,
     CompareSettings,
     DatumSettings,
+    ExteriorSettings,
     Head,
     PlateSettings,
     Section,
@@ -102,6 +103,7 @@ class Survey:
     compare: CompareSettings = field(default_factory=CompareSettings)  # other programs beside the survey
     control: KnownPoints | None = None
     exterior: ObservedExterior | None = None
+    exif_sigma_m: tuple[float, float] | None = None  # in its place positions in EXIF data, see [exterior]
     scale_bars: tuple[ScaleBar, ...] = ()
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
@@ -140,6 +142,9 @@ class Survey:
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
             "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
         }
+        if self.exif_sigma_m is not None:
+            given = {"exif_sigma_m": self.exif_sigma_m}
+            values["exif_sigma_m"] = _section(ExteriorSettings, given, f"{where}: exterior").exif_sigma_m
         if self.tie_points is not None:
             values["tie_points"] = _section(TiePointSettings, self.tie_points, f"{where}: tie_points")
         for name, value in values.items():
@@ -240,6 +245,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         compare=file.compare,
         control=read(read_control, file.control.file if file.control else None),
         exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
+        exif_sigma_m=file.exif_sigma_m,
         scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
         observations=read(read_image_points, file.observations.file if file.observations else None),
         diameters=read(read_diameters, file.targets.diameters),

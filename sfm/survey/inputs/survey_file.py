@@ -91,6 +91,11 @@ class SurveyFile(Section):
         return self.approximate.points
 
     @property
+    def exif_sigma_m(self) -> tuple[float, float] | None:
+        """Standard deviations of positions in EXIF data, where they are observed."""
+        return self.exterior.exif_sigma_m if self.exterior else None
+
+    @property
     def allow_outside(self) -> bool:
         """Whether the survey may name files outside its own folder."""
         return self._allow_outside

@@ -12,12 +12,9 @@ from scipy.spatial import cKDTree
 
 from sfm.conventions import IntArray
 from sfm.photographs.exif import Metadata
-from sfm.photographs.satellite_positions import local_coordinates
+from sfm.photographs.satellite_positions import USUAL_SIGMAS_M, local_coordinates
 
 NONE = -1  # in place of a photograph
-# Of a telephone under open sky, where it states none, east, north and up, m. Source: van Diggelen and Enge
-# (2015), ION GNSS+ (4.9 m for the plane); heights are twice as uncertain.
-SIGMAS_M = (5.0, 5.0, 10.0)
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
 # their errors: errors alone make 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
@@ -40,7 +37,7 @@ def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray
         return found
     _, places = local_coordinates(positions)
     sigma = np.array([one.sigma_m for one in positions])
-    places /= np.median(np.where(np.isnan(sigma), SIGMAS_M, sigma), axis=0)
+    places /= np.median(np.where(np.isnan(sigma), USUAL_SIGMAS_M, sigma), axis=0)
     up = places[:, 2]
     up[np.isnan(up)] = np.median(up[~np.isnan(up)]) if not np.isnan(up).all() else 0.0
     if np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)) < MIN_SPREAD_SIGMAS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -23,6 +24,7 @@ from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
 from sfm.targets.codes.families import FAMILIES
 from sfm.targets.codes.plates import PLATES
+from tests.satellite import at, state_position
 from tests.surveys import write_photograph_survey
 
 PHOTOS = """
@@ -66,6 +68,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (photographs / "broken.jpg").write_bytes(b"no photograph")
     cv2.imwrite(str(photographs / "screenshot.png"), np.full((300, 200), 90, dtype=np.uint8))
     return photographs
+
+
+def test_positions_are_named_and_observations_only_if_asked_for(tmp_path: Path) -> None:
+    folder = tmp_path / "positions"
+    write_photograph_survey(folder, "positions", photographs=3).unlink()
+    without = draft_survey(folder)
+    for k in (1, 2):
+        state_position(folder / f"photo {k}.png", at(0.3 * k, 0.0, 25.0))
+    draft = draft_survey(folder)
+    assert "positions" not in dict(without.found) and "exif_sigma_m" not in without.text
+    assert "2 photographs" in dict(draft.found)["positions"]
+    assert "exterior" not in tomllib.loads(draft.text)
+    asked = re.sub(r"^# (\[exterior\]|exif_sigma_m)", r"\1", draft.text, flags=re.M)
+    (tmp_path / "survey.toml").write_text(asked, encoding="utf-8")
+    assert read_survey_file(tmp_path / "survey.toml").exif_sigma_m == (5, 10)
 
 
 def test_a_folder_becomes_a_result(

@@ -24,6 +24,7 @@ from sfm.survey.inputs.settings import (
     CameraSettings,
     CompareSettings,
     DatumSettings,
+    ExteriorSettings,
     ScaleBarSettings,
     TargetSettings,
     TiePointSettings,
@@ -92,6 +93,10 @@ class SurveySettings(Protocol):
         """Observed exterior orientation, or its table."""
 
     @property
+    def exif_sigma_m(self) -> tuple[float, float] | None:
+        """Standard deviations of positions in EXIF data, where they are observed."""
+
+    @property
     def start_points(self) -> object:
         """Approximate object points, or their table."""
 
@@ -150,7 +155,9 @@ def refuse_contradictions(survey: SurveySettings) -> None:
     plate = plate_control(survey.targets)
     if plate is not None and survey.control is not None and not isinstance(survey.control, KnownPoints):
         raise SurveyFileError(f"{where}: [control] beside a calibration plate, which is the control itself")
-    known = survey.control is not None or survey.exterior is not None or plate is not None
+    _refuse_contradicting_exterior(survey)
+    observed = survey.exterior is not None or survey.exif_sigma_m is not None
+    known = survey.control is not None or observed or plate is not None
     if survey.datum.kind == "control" and not known:
         raise SurveyFileError(
             f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
@@ -168,6 +175,21 @@ def refuse_contradictions(survey: SurveySettings) -> None:
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of "
             f"{', '.join((*FAMILIES, *PLATES))} nor a table file in {survey.folder}"
+        )
+
+
+def _refuse_contradicting_exterior(survey: SurveySettings) -> None:
+    """Raise SurveyFileError where exterior orientation is observed in no way or in two."""
+    table = survey.exterior.file if isinstance(survey.exterior, ExteriorSettings) else survey.exterior
+    if survey.exterior is not None and (table is None) == (survey.exif_sigma_m is None):
+        found = "neither is" if table is None else "both are"
+        raise SurveyFileError(
+            f"{survey.source}: [exterior]: file and exif_sigma_m, {found} given, one is needed"
+        )
+    if survey.exif_sigma_m is not None and survey.observations is not None:
+        raise SurveyFileError(
+            f"{survey.source}: exterior.exif_sigma_m needs photographs, the survey has [observations]; "
+            "give exterior.file"
         )
 
 

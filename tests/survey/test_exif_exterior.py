@@ -1,0 +1,139 @@
+"""Positions in EXIF data as observed projection centres: what they give, and what wrong ones do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of, of_kind
+from sfm.result import SurveyResult
+from sfm.survey.inputs.exif_exterior import observed_positions, plausible_positions
+from sfm.survey.inputs.survey import read_survey
+from tests.satellite import at, state_position
+from tests.survey.test_exterior import written
+from tests.surveys import stations, write_photograph_survey
+from tests.synthetic import seed_of
+
+SIGMA_M = (0.02, 0.04)  # of the positions of the synthetic networks, of some 7 m
+
+
+def test_photographs_with_positions_are_placed_by_them(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "placed", "positions in photographs")
+    truth = stations(6)[0] - [0.0, 0.0, 900.0]  # mm; heights below sea level
+    error = 0.5 * seed_of("errors of positions").standard_normal(truth.shape)
+    for k, place in enumerate(1e-3 * (truth + error), 1):
+        if k != 4:  # which states none
+            state_position(path.parent / f"photo {k}.png", at(*place.tolist()))
+    asked = path.read_text() + "[exterior]\nexif_sigma_m = [0.0005, 0.0005]\n"
+    path.write_text(asked + '[datum]\nkind = "control"\n', encoding="utf-8")
+    result = run_survey(read_survey(path))
+    a = result.adjustment
+    assert a.datum == "control" and len(a.network.images) == 6
+    (found,) = of_kind(result.remarks, "exif_positions")
+    assert (found.number("positions"), found.number("photographs")) == (5, 6)
+    assert (found.number("latitude"), abs(found.number("longitude"))) == (0, 180)
+    assert np.abs(a.estimate.position - truth).max() < 5 * 0.5  # with the axes: east, north, up
+    # without being asked for, they give nothing
+    path.write_text(asked + '[datum]\nkind = "free"\n', encoding="utf-8")
+    free = run_survey(read_survey(path))
+    assert "exterior_unused" in kinds_of(free.remarks)
+    assert free.adjustment.datum == "free" and not len(free.adjustment.network.exterior)
+
+
+def run_with(
+    folder: Path,
+    name: str,
+    change: Callable[[FloatArray], FloatArray],
+    sigma_m: tuple[float, float] = SIGMA_M,
+) -> tuple[SurveyResult, FloatArray]:
+    """Return the result with changed positions, and the true projection centres."""
+    path, truth = written(folder, name)
+    noise = seed_of(name).standard_normal(truth.position.shape) * [SIGMA_M[0], SIGMA_M[0], SIGMA_M[1]]
+    places = change(truth.position + noise)
+    named = {f"image {k + 1}": at(*one) for k, one in enumerate(places.tolist()) if np.isfinite(one[0])}
+    _, exterior = observed_positions(plausible_positions(named), sigma_m, "m")
+    return run_survey(replace(read_survey(path), exterior=exterior)), truth.position
+
+
+@pytest.mark.parametrize("off", [100.0, 50_000.0, 3e6])
+def test_one_photograph_far_off_is_left_out(tmp_path: Path, off: float) -> None:
+    def change(places: FloatArray) -> FloatArray:
+        places[2, 0] += off
+        return places
+
+    result, truth = run_with(tmp_path, f"off by {off:g}", change)
+    left = of_kind(result.remarks, "given_left_out")
+    assert [one.names("given") for one in left] == ([("image 3",)] if off < 1e5 else [])
+    assert len(result.adjustment.network.exterior) == 7
+    assert np.abs(result.adjustment.estimate.position - truth).max() < 0.1
+
+
+def test_every_other_photograph_is_enough(tmp_path: Path) -> None:
+    def change(places: FloatArray) -> FloatArray:
+        places[::2] = np.nan
+        return places
+
+    result, truth = run_with(tmp_path, "half of them", change)
+    assert len(result.adjustment.network.exterior) == 4
+    assert np.abs(result.adjustment.estimate.position - truth).max() < 0.1
+
+
+@pytest.mark.parametrize("sigma_m", [SIGMA_M, (5.0, 10.0)])
+def test_positions_that_do_not_differ_give_no_datum(tmp_path: Path, sigma_m: tuple[float, float]) -> None:
+    """All the same, and those of a telephone at a close range."""
+    same = (lambda places: np.tile(places[:1], (len(places), 1))) if sigma_m == SIGMA_M else (lambda e: e)
+    with pytest.raises(GeometryError, match=r"8 places .*, no farther apart than their standard deviations"):
+        run_with(tmp_path, "same", same, sigma_m)
+
+
+def test_heights_may_be_missing(tmp_path: Path) -> None:
+    def change(places: FloatArray) -> FloatArray:
+        places[3:, 2] = np.nan
+        return places
+
+    result, truth = run_with(tmp_path, "three heights", change)
+    assert np.isinf(result.adjustment.network.exterior.covariance[3:, 2, 2]).all()
+    assert np.abs(result.adjustment.estimate.position - truth).max() < 0.2
+
+
+def test_stated_standard_deviations_go_before_those_of_the_survey() -> None:
+    named = {"a": at(0, 0, 5, (0.01, 0.02, np.nan)), "b": at(10, 0, 5), "c": at(0, 20, np.nan)}
+    _, found = observed_positions(named, (3.0, 6.0), "cm")
+    np.testing.assert_allclose(
+        found.sigma[:, :3], [[1, 2, 600], [300, 300, 600], [300, 300, np.inf]], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        found.value[:, :2] - found.value[0, :2], [[0, 0], [1000, 0], [0, 2000]], atol=0.1
+    )
+    assert np.isnan(found.value[2, 2]) and np.isinf(found.sigma[:, 3:]).all()
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("exif_sigma_m = [3.0, 6.0]", r"exif_sigma_m needs photographs, the survey has \[observations\]"),
+        ('file = "exterior.csv"\nexif_sigma_m = [3.0, 6.0]', "both are given, one is needed"),
+        ("", "neither is given, one is needed"),
+        ("exif_sigma_m = [3.0]", "needed 2 values"),
+        ("exif_sigma_m = [3.0, -1.0]", "needed more than 0"),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, section: str, message: str) -> None:
+    path, _ = written(tmp_path, "refused")
+    path.write_text(path.read_text().replace('file = "exterior.csv"', section), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=message):
+        read_survey(path)
+
+
+def test_photographs_without_positions_are_named(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "none", "no positions", photographs=2)
+    path.write_text(path.read_text() + "[exterior]\nexif_sigma_m = [3.0, 6.0]\n", encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"none of 2 photographs has one; leave it out, or give a file"):
+        run_survey(read_survey(path))
