@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from sfm.conventions import IntArray
+from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
 from sfm.photographs.exif import Metadata
 from sfm.photographs.satellite_positions import SatellitePosition
+from sfm.remarks.remark import of_kind
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.survey import CameraSetup, Survey
+from sfm.survey.measuring import tie_points
 from sfm.survey.measuring.neighbours import NONE, neighbours_by_position, neighbours_in_sequence
+from tests.satellite import state_position
 from tests.synthetic import seed_of
+from tests.textures import natural_texture
 
 SILENT = Metadata((64, 48), "Maker", "Model", None, None, None, 1)
 START = datetime(2026, 11, 26, 13, 0, 0)
@@ -87,3 +100,32 @@ def test_heights_tell_neighbours_on_a_façade() -> None:
     alone = [SILENT, at(0.0, 0.0), SILENT]
     assert (neighbours_by_position(alone, 2) == NONE).all()
     assert neighbours_by_position([at(0, 0), at(200, 0)], 2).tolist() == [[1, NONE], [0, NONE]]
+
+
+def test_the_survey_matches_neighbours_and_states_its_pairs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photographs along a strip, each moved by an eighth of its width; the last third states positions."""
+    m, step = 18, 24
+    strip = natural_texture(seed_of("strip of photographs"), (192 + m * step, 144))
+    for k in range(m):
+        path = tmp_path / f"p{k:02d}.png"
+        cv2.imwrite(str(path), np.clip(strip[:, k * step : k * step + 192], 0, 255).astype(np.uint8))
+        if k >= 12:
+            state_position(path, SatellitePosition(0.001 * k, 7.0, 30.0, (np.nan,) * 3))
+    camera = CameraSetup(name="one", images="p*.png", pixel_mm=(0.01, 0.01), c_mm=2.0)
+    survey = Survey(name="strip", cameras=(camera,), tie_points=TiePointSettings(), folder=tmp_path)
+    used: list[Sequence[IntArray]] = []
+
+    def find(*arguments: Any, neighbours: Sequence[IntArray], **options: Any) -> TiePoints:
+        used.append(neighbours)
+        return find_tie_points(*arguments, neighbours=neighbours, **options)
+
+    monkeypatch.setattr(tie_points, "find_tie_points", find)
+    measured = tie_points.tie_photographs(survey, find_photographs(survey))
+    by_position, in_sequence = used[0]
+    assert (by_position[:12] == NONE).all() and set(by_position[14, :2]) == {13, 15}
+    assert in_sequence[5, :4].tolist() == [6, 4, 7, 3]
+    (found,) = of_kind(measured.remarks, "pairs_matched")
+    assert found.number("possible") == m * (m - 1) / 2 > found.number("pairs") >= 10 * m / 2
+    assert (found.number("by_position"), found.number("in_sequence")) == (6, m)
