@@ -19,6 +19,7 @@ SEMI_MAJOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
 ORIGIN_DECIMALS = 3  # of the degrees of an origin: 0.001 deg are 111 m
 MAX_HEIGHT_M = 100_000.0  # beyond it a number is no height of a camera
 BELOW = (1, 3)  # GPSAltitudeRef: below sea level, below the reference of EXIF 3.0
+MIN_SIGMA_M = 0.001  # no receiver on a camera is better, and smaller numbers are in another unit or unknown
 VOID = "V"  # GPSStatus of a receiver without a fix
 # Of a telephone under open sky, where it states none, to the east, to the north and of the height, m.
 # Source: van Diggelen and Enge (2015), ION GNSS+, for the plane; heights are twice as uncertain.
@@ -172,5 +173,5 @@ def _number(value: Any) -> float:
 
 
 def _sigma(value: float) -> float:
-    """Return a standard deviation, NaN for 0, which writers use for unknown."""
-    return value if value > 0 else math.nan
+    """Return a standard deviation, NaN where it is none; writers use 0 for unknown."""
+    return value if value >= MIN_SIGMA_M else math.nan

@@ -74,6 +74,17 @@ def test_neighbours_are_partners_whatever_the_photographs_show() -> None:
     assert with_near == alike | by_place
 
 
+def test_a_photograph_that_shows_little_has_many_partners_and_all_its_neighbours() -> None:
+    m = 80
+    score = np.triu(np.full((m, m), 20), 1)
+    score[7], score[:, 7] = 0, 0
+    score[7, 70:] = 1
+    near = np.tile(np.arange(50, 60), (m, 1))
+    pairs = overlapping_pairs(score, neighbours=(near,))
+    partners = set(pairs[(pairs == 7).any(axis=1)].ravel().tolist()) - {7}
+    assert partners >= {*range(70, 80), *range(50, 60)} and 30 <= len(partners) <= 40
+
+
 def test_pairs_grow_with_the_photographs_only() -> None:
     def count(m: int) -> int:
         """Photographs in a strip of which each has two partners, and features in common by chance."""

@@ -87,6 +87,7 @@ def test_standard_deviations_that_receivers_state() -> None:
 
     assert np.isnan(sigma({})).all()
     assert sigma({31: 4.7}) == pytest.approx((4.7, 4.7, np.nan), nan_ok=True)
+    assert np.isnan(sigma({31: 1e-9})).all() and np.isnan(sigma({31: -5.0})).all()
     assert sigma({31: 4.7}, DJI) == (0.011, 0.012, 0.025)
     zero = b"<drone-dji:RtkStdLon>0.0</drone-dji:RtkStdLon><drone-dji:RtkStdHgt>0.03</drone-dji:RtkStdHgt>"
     assert sigma({31: IFDRational(0, 0)}, zero) == pytest.approx((np.nan, np.nan, 0.03), nan_ok=True)
