@@ -43,12 +43,12 @@ ROWS = (
     Kind(
         "exif_positions",
         "note",
-        "Projection centres of {positions} of {photographs} photographs are observed in EXIF data: X to the "
-        "east, Y to the north and Z up (WGS 84) from latitude {latitude:.3f}, longitude {longitude:.3f}, "
-        "height 0.",
-        "[exterior] exif_sigma_m. Heights are as stated; EXIF data do not say whether above sea level or the "
-        "ellipsoid. Errors that photographs have in common are in no standard deviation: the receiver's, of "
-        "metres over minutes, and where its antenna is on the camera",
+        "Projection centres of {positions} of {photographs} photographs are observed in EXIF data: X east "
+        "and Y north (WGS 84) from latitude {latitude:.3f}, longitude {longitude:.3f}, Z the height as "
+        "stated, above sea level or the ellipsoid.",
+        "[exterior] exif_sigma_m; EXIF data do not say what heights are above. Errors that photographs have "
+        "in common are in no standard deviation: the receiver's, of metres over minutes, and where its "
+        "antenna is on the camera",
         "Use bars or control for scale and coordinates that must be better than the receiver.",
     ),
     Kind(
