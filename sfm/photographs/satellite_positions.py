@@ -91,8 +91,8 @@ def local_coordinates(positions: Sequence[SatellitePosition]) -> tuple[LocalSyst
     height = np.array([one.height_m for one in positions])
     x, y, z = np.median(_normals(latitude, longitude), axis=0)  # knows of no date line
     origin = LocalSystem(
-        round(math.degrees(math.atan2(z, math.hypot(x, y))), ORIGIN_DECIMALS),
-        round(math.degrees(math.atan2(y, x)), ORIGIN_DECIMALS),
+        round(math.degrees(math.atan2(z, math.hypot(x, y))), ORIGIN_DECIMALS) + 0.0,  # no -0
+        round(math.degrees(math.atan2(y, x)), ORIGIN_DECIMALS) + 0.0,
     )
     known = np.isfinite(height)
     usual = float(np.median(height[known])) if known.any() else 0.0

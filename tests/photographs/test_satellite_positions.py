@@ -124,3 +124,8 @@ def test_the_date_line_and_the_southern_half_are_places_like_others(
 def test_one_position_far_off_does_not_move_the_origin() -> None:
     near = [at(52.51 + 1e-5 * k, 13.4, 30.0) for k in range(5)]
     assert local_coordinates([*near, at(-33.0, 151.0)])[0] == local_coordinates(near)[0]
+
+
+def test_the_origin_has_no_negative_zero() -> None:
+    origin, _ = local_coordinates([at(-1e-5, -1e-5)])
+    assert str(origin.latitude_deg) == str(origin.longitude_deg) == "0.0"
