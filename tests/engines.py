@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sfm.batch.job import Comparers, SurveyRow
+from sfm.cli.commands.batching import InProcess
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Tell
-from sfm.runtime.in_process import InProcess
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import OtherPrograms
 

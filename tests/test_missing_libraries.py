@@ -10,11 +10,11 @@ import pytest
 
 import sfm
 from sfm import cli
+from sfm.cli.commands.batching import in_process_engine
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.kernels import warmed
 from sfm.remarks.remark import Remark
 from sfm.runtime.executor import Call, Done, Event, Lost, Tell, Told, Work
-from sfm.runtime.in_process import in_process_engine
 from tests.surveys import write_observed_survey
 
 INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*'"

@@ -6,6 +6,10 @@ The ray of every point of the photograph is intersected with the plane of the fa
 perspective and through the distortion as it is, not as an ellipse drawn at its centre. A cell of the
 photograph that an edge crosses gets the area inside; the blur is applied on a finer raster than the pixels,
 which are then means over their areas.
+
+Painting order: which face of a scene hides which, seen from a camera.
+
+Truth of a rendered photograph: where each target of a scene is in it, and whether it is whole.
 """
 
 from __future__ import annotations
@@ -14,25 +18,32 @@ import argparse
 import math
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.display import counted
 from sfm.errors import GeometryError, OutputError
 from sfm.files.manifest import refuse_foreign_files
 from sfm.files.plain_text import csv_text
 from sfm.files.whole_files import whole_files
 from sfm.rendering.area import Lamp, cover_with, fill_face, paint_mark
-from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
-from sfm.rendering.visibility import ProjectedTargets, project_targets
 from sfm.runtime.faults import ending_of
 from sfm.runtime.folder_settings import refuse_folder_settings
+
+# A ray meets this many points of the rim when the truth asks whether a target is hidden.
+RIM = 16
+# Corners of the polygon whose centre of area is the centre of the image of a circle.
+OUTLINE = 256
+
+# Faces that reach into each other by less than this part of the largest one only touch.
+TOUCHING = 1e-6
 
 TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
 
@@ -315,3 +326,109 @@ def main() -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+def painting_order(scene: Scene, position: FloatArray) -> IntArray:
+    """Return the faces turned to the camera, from back to front (painter's algorithm).
+
+    Of two faces whose images overlap, one is painted first if it lies on the far side of the plane of the
+    other, or the other on the near side of its own.
+
+    Source: Newell, Newell and Sancha (1972), Proc. ACM National Conference, p. 443 (tests 2 to 4).
+    """
+    faces = scene.faces
+    normal = faces.normals()
+    turned = np.flatnonzero(np.einsum("fi,fi->f", normal, position - faces.centre) > 0)
+    corners = faces.corners()
+    # Height of the corners of face g above the plane of face f.
+    above = np.einsum("fi,fgci->fgc", normal, corners[None] - faces.centre[:, None, None])
+    slack = TOUCHING * np.abs(faces.half).max(initial=0.0)
+    far = (above <= slack).all(axis=2).T  # [g, f]: g is on the far side of f
+    near = (above >= -slack).all(axis=2).T
+    may_precede = far | near.T  # [g, f]: g may be painted before f
+    must_precede = may_precede & ~may_precede.T
+    distance = np.linalg.norm(faces.centre - position, axis=1)
+    rest = list(turned[np.argsort(-distance[turned], kind="stable")])
+    must_precede &= ~_apart(corners - position, slack)
+    order: list[int] = []
+    while rest:
+        ready = [g for g in rest if not any(must_precede[f, g] for f in rest)]
+        # Faces that overlap in a circle have no order; then the farthest goes first.
+        order.append(int((ready or rest)[0]))
+        rest.remove(order[-1])
+    return np.array(order, dtype=np.int64)
+
+
+def _apart(corners: FloatArray, slack: float) -> BoolArray:
+    """Return which faces have images apart from each other, (f, f), from corners (f, 4, 3) off the camera.
+
+    Two convex images are apart if a plane through the camera and an edge of one has the other outside.
+    """
+    sight = np.cross(corners, np.roll(corners, -1, axis=1))  # normals of these planes
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    side = np.einsum("fei,gci->fegc", sight, corners)
+    inner = np.einsum("fei,fi->fe", sight, corners.mean(axis=1))
+    outside = (side * -np.sign(inner)[:, :, None, None] >= -slack).all(axis=3).any(axis=1)
+    return np.asarray(outside | outside.T)
+
+
+@dataclass(frozen=True)
+class ProjectedTargets:
+    """Where each target of the scene is in a photograph."""
+
+    centre: FloatArray  # image of the centre of the circle, px, NaN behind the camera, (n, 2)
+    outline_centre: FloatArray  # centre of area of the image of the circle, px, (n, 2)
+    diameter: FloatArray  # largest diameter of the image, px, (n,)
+    visible: BoolArray  # whole in the photograph, seen from the front and not hidden, (n,)
+
+
+def project_targets(
+    scene: Scene, camera: Camera, position: FloatArray, rotation: FloatArray
+) -> ProjectedTargets:
+    """Return where the targets of a scene are in a photograph and which are whole in it."""
+    faces, targets = scene.faces, scene.targets
+    n = len(targets)
+    angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rim = targets.centre[:, None] + targets.radius[:, None, None] * circle
+    outline = faces.place(np.repeat(targets.face, OUTLINE), rim.reshape(-1, 2))
+    centre = project(camera, position, rotation, faces.place(targets.face, targets.centre))
+    outline_px = project(camera, position, rotation, outline).reshape(n, OUTLINE, 2)
+    width, height = camera.size_px
+    inside = ((outline_px > 0) & (outline_px < (width - 1, height - 1))).all(axis=(1, 2))
+    normal = faces.normals()
+    front = np.einsum("fi,fi->f", normal, position - faces.centre)[targets.face] > 0
+    seen = outline.reshape(n, OUTLINE, 3)[:, :: OUTLINE // RIM]
+    hidden = np.array(
+        [_hidden(scene, position, points, own) for points, own in zip(seen, targets.face, strict=True)],
+        dtype=bool,
+    )
+    across = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2)
+    diameter = across.max(axis=1, initial=0.0)
+    return ProjectedTargets(centre, _centre_of_area(outline_px), diameter, inside & front & ~hidden)
+
+
+def _hidden(scene: Scene, position: FloatArray, points: FloatArray, own: int) -> bool:
+    """Return whether any face stands between the camera and any of the points of one face."""
+    faces = scene.faces
+    direction = points - position
+    for f, normal in enumerate(faces.normals()):
+        height = float(normal @ (position - faces.centre[f]))
+        if f == own or height <= 0:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = -height / (direction @ normal)
+            hit = position + part[:, None] * direction - faces.centre[f]
+        within = (np.abs(hit @ faces.axes[f].T) < faces.half[f]).all(axis=1)
+        if (within & (part > 0) & (part < 1 - 1e-9)).any():
+            return True
+    return False
+
+
+def _centre_of_area(polygon: FloatArray) -> FloatArray:
+    """Return the centres of area of polygons with corners (n, k, 2), taken about their first corner."""
+    p = polygon - polygon[:, :1]
+    q = np.roll(p, -1, axis=1)
+    cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    moment = ((p + q) * cross[..., None]).sum(axis=1)
+    return np.asarray(polygon[:, 0] + moment / (3 * cross.sum(axis=1))[:, None])

@@ -18,8 +18,7 @@ from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.report.findings.findings import findings_of
 from sfm.report.html.report_page import report_page
 from sfm.report.tables.summary import summary
-from sfm.report.text.filters import WIDTH
-from sfm.report.text.text_report import text_report
+from sfm.report.text.text_report import WIDTH, text_report
 from sfm.result import SurveyResult
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 

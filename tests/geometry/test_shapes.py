@@ -8,9 +8,8 @@ import pytest
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.measured import MeasuredPoints
-from sfm.geometry.shapes.fit import ShapeFit, fit_shape
+from sfm.geometry.shapes.fit import ShapeFit, fit_shape, parameters_of
 from sfm.geometry.shapes.kinds import KINDS
-from sfm.geometry.shapes.parameters import parameters_of
 from sfm.geometry.shapes.shape import Shape
 from tests.geometry.simulated import (
     design_of,

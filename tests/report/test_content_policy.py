@@ -21,8 +21,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
 from sfm.report.differences import write_differences
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.content_policy import content_policy
-from sfm.report.html.page import render
+from sfm.report.html.page import content_policy, render
 from sfm.report.output import write_result
 from sfm.report.validation import write_validation
 from sfm.solution import Solution

@@ -21,8 +21,7 @@ from sfm.report.html.report_page import report_page
 from sfm.report.phrases import MAX_BINS, points_by_rays
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text.filters import WIDTH
-from sfm.report.text.text_report import text_report
+from sfm.report.text.text_report import WIDTH, text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_points
 from tests.places import SHARED

@@ -32,9 +32,8 @@ from sfm.remarks.verdict import lines_of
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.figures.plotted import plot_data
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.findings import comparison_of, findings_of
 from sfm.report.findings.geometry import geometry_of
-from sfm.report.findings.other_adjuster import comparison_of
 from sfm.report.html.page import environment
 from sfm.report.html.report_page import report_page
 from sfm.report.numbers import (
@@ -50,9 +49,8 @@ from sfm.report.output import WRITTEN, write_result
 from sfm.report.phrases import words_left_out, words_of_precision
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.report.text.filters import WIDTH, wrapped
+from sfm.report.text.text_report import WIDTH, text_report, wrapped
 from sfm.report.text.text_report import _environment as text_environment
-from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import LIKEST_FIRST, Flag

@@ -50,8 +50,7 @@ from sfm.report.numbers import signed
 from sfm.report.phrases import words_of_fixed, words_of_sigma0, words_of_test, words_of_weights
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text.filters import WIDTH
-from sfm.report.text.text_report import text_report
+from sfm.report.text.text_report import WIDTH, text_report
 from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.synthetic import make_network, seed_of
 

@@ -304,7 +304,7 @@ def test_a_model_that_is_not_dependable_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _model(tmp_path)
-    monkeypatch.setattr("sfm.survey.refining.final_adjustment.MAX_ITERATIONS", 1)
+    monkeypatch.setattr("sfm.survey.refining.refinement.MAX_ITERATIONS", 1)
     with pytest.raises(SystemExit, match="1"):
         refine(tmp_path / "model", tmp_path)
     assert "error: The adjustment did not converge in " in capsys.readouterr().out

@@ -19,12 +19,12 @@ from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
+from sfm.survey.assembly import told_settings
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import plate_bars
-from sfm.survey.told_settings import told_settings
 from sfm.targets.codes import boards
 from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.detect import find_targets

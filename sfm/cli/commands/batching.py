@@ -1,4 +1,9 @@
-"""Command about many surveys: batch."""
+"""Command about many surveys: batch.
+
+Who does the work of a batch: Dask on this computer or elsewhere, or this process where it is missing.
+
+An engine without processes: one call after the other, here, where no library for more is installed.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +23,17 @@ from sfm.runtime.faults import FAULT
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
     from sfm.survey.other_programs import OtherPrograms
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from types import ModuleType
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from sfm.errors import MissingLibraryError, one_line
+from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Told, Work
+
+INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
 
 def batch(
@@ -70,7 +86,7 @@ def batch(
         from sfm.batch.job import Comparers
         from sfm.batch.run import calls_of, find_surveys, run_batch
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
-        from sfm.cli.commands.batch_engine import batch_engine
+        from sfm.cli.commands.batching import batch_engine
 
     files = find_surveys(surveys)
     compile_first()
@@ -103,3 +119,90 @@ def _others_of_worker(survey: Survey) -> OtherPrograms:
     from sfm.api import programs_of
 
     return programs_of(survey.compare.backend, survey.compare.baseline, threads=1)
+
+
+def batch_engine(
+    busy: Callable[[], int], *, jobs: int | None, cluster: str | None, tell: Callable[[str], None]
+) -> AbstractContextManager[Engine]:
+    """Return the engine of a batch.
+
+    Args:
+        busy: returns how many calls can run at a time at most; more workers would wait for nothing.
+        jobs: workers on this computer; as many as it bears if not given.
+        cluster: address of a Dask scheduler in place of them.
+        tell: is told in one line that surveys run one after the other, and why.
+
+    Raises:
+        MissingLibraryError: a scheduler is asked for, and Dask is not installed.
+        BackendError: no scheduler answers at the address.
+    """
+    dask = _dask_cluster()
+    if dask is None:
+        if cluster is not None:
+            raise MissingLibraryError(f"--cluster {cluster}: Dask is not installed: {INSTALL_DASK}")
+        tell(f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}")
+        return in_process_engine()
+    engine: AbstractContextManager[Engine]
+    if cluster is not None:
+        engine = dask.remote_engine(cluster)
+    else:
+        engine = dask.local_engine(min(jobs or dask.fitting_workers(), busy()))
+    return engine
+
+
+def _dask_cluster() -> ModuleType | None:
+    """Return the module that uses Dask, None where Dask is not installed."""
+    try:
+        from adapters import dask_cluster
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] not in ("dask", "distributed"):
+            raise
+        return None
+    return dask_cluster
+
+
+class InProcess:
+    """Runs one piece of work after the other in this process, see sfm.runtime.executor.Engine.
+
+    What a call tells is passed on when it has returned.
+    """
+
+    workers = 1
+
+    def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
+        """Run all work and yield what happens; one call at a time, whatever is asked for.
+
+        Raises:
+            KolinearError: what a called function raised.
+        """
+        for work in works:
+            try:
+                parts = []
+                for part in work.parts:
+                    value, said = _called(part)
+                    yield from (Told(work.key, message) for message in said)
+                    parts.append(value)
+                value, said = _called(work.whole, parts)
+            except KolinearError:
+                raise
+            except Exception as error:
+                yield Lost(work.key, f"it failed: {type(error).__name__}: {one_line(error)}")
+                continue
+            yield from (Told(work.key, message) for message in said)
+            yield Done(work.key, value)
+
+
+@contextmanager
+def in_process_engine() -> Iterator[InProcess]:
+    """Give an engine that works in this process."""
+    yield InProcess()
+
+
+def _called(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:
+    """Return what a call returns and what it has told.
+
+    BLAS is held to one thread as in a worker: sums of several threads differ in the last bit.
+    """
+    said: list[dict[str, Any]] = []
+    with threadpool_limits(limits=1):
+        return call.function(*call.arguments, *more, tell=said.append), said

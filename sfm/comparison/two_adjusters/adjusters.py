@@ -8,22 +8,27 @@ With all twelve parameters free, full_opencv is near to singular: a factor commo
 the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
 all. Where the image points cannot tell k1-k3 from k4-k6, the distortion is therefore held at the survey's
 result in both adjusters, and the comparison says so.
+
+Cameras that share single parameters, for adjusters that know no such sharing.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import numpy as np
+
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion
 from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
 from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
 from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
-from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
 from sfm.display import counted, program_name
 from sfm.distortion.models import Role
@@ -192,3 +197,29 @@ def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
         reject="none",
         max_iterations=MAX_ITERATIONS,
     )
+
+
+def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
+    """Return the cameras on their own, with what they share held at its value, and what that is, in words.
+
+    COLMAP shares all parameters of a camera among its photographs or none. What several cameras share in
+    part, such as one distortion for photographs that differ in c, can only be held at the survey's result.
+
+    Args:
+        cameras: interior orientations, some parameters of which may be shared.
+    """
+    groups = [[camera.group_of(s) for s in range(len(camera.names))] for camera in cameras]
+    members = Counter(group for own in groups for group in set(own) if group)
+    alone: list[Camera] = []
+    held: dict[str, tuple[str, ...]] = dict.fromkeys(members, ())
+    for camera, own in zip(cameras, groups, strict=True):
+        shared = np.array([members[group] > 1 for group in own]) & camera.free
+        for s in np.flatnonzero(shared):
+            held[own[s]] = tuple(dict.fromkeys((*held[own[s]], camera.names[s])))
+        alone.append(replace(camera, free=camera.free & ~shared, shared=()))
+    words = tuple(
+        f"{', '.join(names)} of {group}, shared by {counted(members[group], 'camera')}"
+        for group, names in held.items()
+        if names
+    )
+    return tuple(alone), words

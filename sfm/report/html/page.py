@@ -1,12 +1,21 @@
 """HTML pages, all made from one base template, with the style sheet and its Content-Security-Policy inside.
 
 Every text that comes from a file is escaped by the templates, and a name that they do not know is an error.
+
+The Content-Security-Policy of a page: what it may show and run is what it holds, and nothing else.
+
+Names, reasons and remarks in a page come from files of strangers. They are escaped; should that ever fail
+somewhere, a browser still refuses any script, style or address that was not written into the policy.
+
+Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import math
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -17,11 +26,12 @@ from markupsafe import Markup
 
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.display import program_name
-from sfm.report.html.content_policy import content_policy
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
 from sfm.report.viewer.embedded import Viewer
+
+NOTHING = "'none'"
 
 
 def render(
@@ -85,3 +95,31 @@ def _script() -> str:
 @cache
 def _style() -> str:
     return files("sfm.report.html").joinpath("templates/report.css").read_text(encoding="utf-8")
+
+
+def content_policy(
+    styles: Sequence[str], scripts: Sequence[str] = (), *, pictures_beside: bool = False
+) -> str:
+    """Return the policy of a page with these style sheets and scripts inside it, and pictures as data URLs.
+
+    Attributes `style` and `on...` are allowed nowhere: they would need 'unsafe-inline'.
+
+    Args:
+        styles: content of each style element, to the letter.
+        scripts: content of each script element that is run, to the letter.
+        pictures_beside: whether it shows pictures that lie beside it, which the policy calls 'self'.
+    """
+    allowed = {
+        "default-src": [NOTHING],
+        "img-src": ["data:", "'self'"] if pictures_beside else ["data:"],
+        "style-src": [_hash(text) for text in styles],
+        "script-src": [_hash(text) for text in scripts],
+        "base-uri": [NOTHING],
+        "form-action": [NOTHING],
+    }
+    return "; ".join(" ".join((name, *(sources or [NOTHING]))) for name, sources in allowed.items())
+
+
+def _hash(text: str) -> str:
+    """Return the source expression that allows one element by its content."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

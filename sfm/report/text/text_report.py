@@ -3,6 +3,8 @@
 Rank and datum, sigma0 and redundancy, tests, reliability, variance components, unknowns with their
 standard deviations, correlations, worst residuals. No dates and hosts, so that two reports can be compared.
 What it says stands in the template `report.txt`.
+
+Lines, headings and columns of the reports in plain text, as filters of templates.
 """
 
 from __future__ import annotations
@@ -13,11 +15,17 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sfm.adjustment.quality.statistics import STRONG
+from sfm.display import NO_BREAK, bound
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of
 from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
-from sfm.report.text import filters as lines
+from sfm.report.text import text_report as lines
+
+WIDTH = 100
+MAX_CHARACTERS = 40  # of a cell in columns
+NAME_WIDTH = 21  # of what a fact is about
+KEPT_BAR = "\x1f"  # stands for a bar in a name until the columns are set
 
 MAX_ROWS = 12  # of a list; the rest is in the tables of the result
 WORST = 5  # residuals and photographs
@@ -67,3 +75,60 @@ def _environment() -> Environment:
         "isnan": np.isnan,
     }
     return made
+
+
+def heading(title: str) -> str:
+    """Return a heading with a rule behind it."""
+    return f"{title} ".ljust(WIDTH, "-")
+
+
+def as_value(value: object) -> str:
+    """Return a value as it may stand in a template: in one line, no bar of its own taken for a column's."""
+    return " ".join(str(value).splitlines()).replace("|", KEPT_BAR)
+
+
+def with_bars(text: str) -> str:
+    """Return a finished text with the bars that stood in its values."""
+    return text.replace(KEPT_BAR, "|")
+
+
+def facts(text: str) -> str:
+    """Set lines `name | what is told of it`, each on as many lines as it needs, one below the other."""
+    told = (cells for cells in map(_cells, text.splitlines()) if any(cells))
+    lines = (f"  {name:<{NAME_WIDTH}} {' | '.join(words)}" for name, *words in told)
+    return "".join(f"{wrapped(line, behind=NAME_WIDTH + 3)}\n" for line in lines)
+
+
+def columns(text: str, left: int) -> str:
+    """Set lines of cells between bars in columns; the first `left` ones to the left, numbers to the right."""
+    rows = [_cells(line) for line in text.splitlines() if line.strip()]
+    widths = [min(max(len(row[c]) for row in rows), MAX_CHARACTERS) for c in range(len(rows[0]))]
+    lines = (
+        "  ".join(
+            f"{cell[:MAX_CHARACTERS]:<{width}}" if c < left else f"{cell:>{width}}"
+            for c, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )
+    return "".join(f"  {line}".rstrip() + "\n" for line in lines)
+
+
+def wrap(text: str) -> str:
+    """Break long lines between words; what follows stands two spaces behind the beginning of the first."""
+    lines = (line.rstrip() for line in text.splitlines())
+    return "".join(f"{wrapped(line, behind=len(line) - len(line.lstrip()) + 2)}\n" for line in lines if line)
+
+
+def wrapped(line: str, *, behind: int) -> str:
+    """Break a line between words, not before a unit; what follows stands behind so many spaces."""
+    lines, rest = [], bound(line.rstrip())
+    while len(rest) > WIDTH:
+        cut = rest.rfind(" ", behind + 1, WIDTH)
+        cut = WIDTH if cut < 0 else cut
+        lines.append(rest[:cut])
+        rest = " " * behind + rest[cut:].strip()
+    return "\n".join([*lines, rest]).replace(NO_BREAK, " ")
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split("|")]

@@ -1,4 +1,9 @@
-"""The key points of a model measured anew by least squares matching, and the model adjusted again."""
+"""The key points of a model measured anew by least squares matching, and the model adjusted again.
+
+The last adjustment of a refined model, where its targets bring control and scale bars.
+
+Which interior parameters of a model are estimated anew, and which are held.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +14,24 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.error_correlation import with_neighbours
+from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import ALIKE, WINDOWS_PX
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
-from sfm.survey.refining.final_adjustment import adjust_finally
-from sfm.survey.refining.free_parameters import free_cameras
+from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.refining.model_photographs import Photographs, outside_masks
 from sfm.survey.refining.oriented_windows import (
     Oriented,
@@ -46,6 +55,12 @@ from sfm.survey.refining.windows import (
     match_reduced,
     match_windows,
 )
+
+MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
+FOCAL_NAMES = ("f", "fx", "fy")  # each of which holds both, where one of them is a camera's only one
+FIRST_RADIAL = {"k": "k1"}  # another name of the only coefficient
+
+GROUPS = ("key points", "targets")
 
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
@@ -384,3 +399,108 @@ def _lengths(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArr
     rays = estimate.points[seen.point] - estimate.position[seen.image]
     depth = -np.einsum("ki,ki->k", rays, estimate.rotation[seen.image, :, 2])
     return depth, np.asarray(np.linalg.norm(rays, axis=1))
+
+
+def adjust_finally(
+    part: Network, start: Estimate, datum: Datum, *, matched: int, unit: str
+) -> tuple[Adjustment, tuple[Remark, ...]]:
+    """Return the last adjustment with its covariance, and what of control and bars was left out.
+
+    Where control or scale bars take part, key points and targets are weighted by their own variance
+    components, so that these keep the standard deviations that were stated for them. Control or a bar that
+    the key points and targets contradict is left out.
+
+    Args:
+        part: accepted image points, with control and scale bars.
+        start: its solution in a free datum, near that of the control.
+        datum: how position, attitude and scale are decided.
+        matched: points before the targets.
+        unit: object unit.
+    """
+    alpha = level_of_single(FALSE_ALARM, 2 * len(part.image_points))
+
+    def tested(network: Network, factor: float | FloatArray, *, reject: str) -> Adjustment:
+        return adjust(
+            network,
+            start,
+            datum=datum,
+            reject=reject,
+            alpha=alpha,
+            image_sigma_factor=factor,
+            max_iterations=MAX_ITERATIONS,
+        )
+
+    if not (len(part.scale_bars) or datum.kind == "control"):
+        return tested(part, 1.0, reject="tau"), ()
+    free = adjust(
+        without_given(part),
+        start,
+        reject="tau",
+        alpha=alpha,
+        covariance=False,
+        max_iterations=MANY_ITERATIONS,
+    )
+    given = judge_given(part, free, datum, unit=unit)
+    part, datum = given.network, given.datum
+    remarks = list(given.remarks)
+    if given.placing is not None and datum.kind == "control":
+        start = given.placing.apply_estimate(free.estimate)
+    checked = tested(part, 1.0, reject="tau")
+    good = replace(part, image_points=part.image_points.select(~checked.rejected))
+    group = np.asarray(good.image_points.point >= matched, dtype=np.int64)
+    _, factor, settled = estimate_components(
+        lambda factor: tested(good, factor, reject="none"), group, GROUPS
+    )
+    if not settled:
+        remarks.append(remark("weights_not_converged", groups=GROUPS))
+    weights = factor[np.asarray(part.image_points.point >= matched, dtype=np.int64)]
+    return tested(part, weights, reject="tau"), tuple(remarks)
+
+
+def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
+    """Return the cameras with what is to be estimated freed; see `_freed`.
+
+    Raises:
+        GeometryError: a name to hold that is no parameter of any camera.
+    """
+    known = dict.fromkeys(name for camera in estimate.cameras for name in camera.names)
+    for name in fixed:
+        if name not in (*known, *_other_names(tuple(known)), *FOCAL_NAMES):
+            raise GeometryError(
+                f"refine: parameter '{name}' is to be held, expected one of {', '.join(known)}"
+            )
+    photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
+    return tuple(
+        _freed(camera, int(count), fixed) for camera, count in zip(estimate.cameras, photographs, strict=True)
+    )
+
+
+def _other_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what parameters are called in models with more of them."""
+    return tuple(FIRST_RADIAL.get(name, name) for name in names)
+
+
+def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
+    """Free what the image points of a model determine, but for what is to be held.
+
+    Principal distances and principal point, and the distortion that the model has. COLMAP holds the principal
+    point unless it is told otherwise; held at a wrong place all photographs are turned to make up for it.
+
+    Args:
+        camera: of the model.
+        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not tell the principal point from a
+            rotation.
+        fixed: names of parameters to hold; f is fx and fy, too, and either of these the only f.
+    """
+    free = camera.free
+    if not free.any():
+        distortion = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING, Role.PRISM)
+        free = distortion & (camera.parameters != 0)
+        free |= camera.plays(Role.FOCAL)
+        if photographs >= MIN_PHOTOGRAPHS:
+            free |= camera.plays(Role.X0, Role.Y0)
+    held = np.isin(camera.names, fixed) | np.isin(_other_names(camera.names), fixed)
+    focal = camera.plays(Role.FOCAL)
+    if "f" in fixed or (focal.sum() == 1 and {"fx", "fy"} & set(fixed)):
+        held |= focal
+    return replace(camera, free=free & ~held)
