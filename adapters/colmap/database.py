@@ -5,10 +5,22 @@ photographs, so points are written as matches between all photographs they were 
 the connected parts of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
 Source: COLMAP 4.2 documentation, "Database Format".
+
+What stands in a COLMAP database, read as untrusted: cameras, photographs, keypoints and matches.
+
+The file is opened read-only and immutable, so that nothing is written to it or beside it, and only its own
+tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.
+
+Source: COLMAP 4.2 documentation, "Database Format"; sqlite.org/fileformat.html, sec. 1.3, for the header, and
+sqlite.org/security.html.
 """
 
 from __future__ import annotations
 
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -18,13 +30,21 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
-from adapters.colmap.database_rows import read_rows
+from adapters.colmap.model_files import MAX_ID, MODELS
 from adapters.colmap.reconstruction import HALF_PIXEL, as_opencv, camera_of, colmap_camera
 from sfm.camera import Camera
-from sfm.conventions import IntArray
-from sfm.errors import OutputError
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import OutputError, SurveyFileError
+from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
+from sfm.files.json_files import MAX_SIDE_PX
+from sfm.files.plain_text import MAX_NAME, as_plain, is_name
 from sfm.files.whole_files import refuse_full, whole_file
 from sfm.network import ImagePoints, Network, rows_of
+
+TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
+HEADER_BYTES = 100
+PAIRS = 2**31 - 1  # the number of a pair is PAIRS times that of its first photograph, plus that of its second
+MAX_STEPS, STEPS = 1000, 300_000  # of SQLite's machine in one query, told in so many at a time
 
 MAX_PLACES = 100_000_000  # photographs times points, of which a table is kept
 
@@ -147,3 +167,242 @@ def _tracks(edges: list[tuple[IntArray, IntArray]], image: IntArray) -> IntArray
     rank = np.empty(len(size), dtype=np.int64)
     rank[names[np.argsort(where)]] = np.arange(len(names))
     return np.where(good, rank[part], -1)
+
+
+@dataclass(frozen=True)
+class DatabaseCamera:
+    """A camera by the names of COLMAP's own."""
+
+    camera_id: int
+    model_name: str
+    width: int
+    height: int
+    params: FloatArray
+
+
+@dataclass(frozen=True)
+class DatabaseRows:
+    """Everything that is read of a database."""
+
+    cameras: tuple[DatabaseCamera, ...]  # by number
+    images: tuple[str, ...]  # names, by number, (m,)
+    camera: IntArray  # index of the camera of each, (m,)
+    keypoints: tuple[FloatArray, ...]  # of each photograph, COLMAP's pixel frame, px, (k_i, 2)
+    pairs: tuple[tuple[int, int, IntArray], ...]  # of two photographs the matching keypoints, (n, 2)
+
+
+def read_rows(path: Path) -> DatabaseRows:
+    """Read a database.
+
+    Raises:
+        SurveyFileError: not a whole COLMAP database, or a row of it is none that COLMAP writes.
+    """
+    with _opened(path) as database:
+        reader = _Reader(path, database)
+        cameras = reader.cameras()
+        numbers, images, owners = reader.images({camera.camera_id: k for k, camera in enumerate(cameras)})
+        index = {number: i for i, number in enumerate(numbers)}
+        keypoints = reader.keypoints(images, index)
+        pairs = reader.matches("two_view_geometries", index, keypoints)
+        if not any(len(found) for _, _, found in pairs):
+            pairs = reader.matches("matches", index, keypoints)
+    return DatabaseRows(cameras, images, owners, keypoints, pairs)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open what is a whole SQLite file with COLMAP's tables."""
+    size = _refuse_other_files(path)
+    try:
+        database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        try:
+            database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+            left = iter(range(MAX_STEPS))
+            database.set_progress_handler(lambda: next(left, None) is None, STEPS)
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, HEADER_BYTES))
+            database.execute("PRAGMA trusted_schema = OFF")
+            database.execute("PRAGMA ignore_check_constraints = ON")
+            _refuse_other_tables(path, database)
+            damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if damage != "ok":
+                raise SurveyFileError(f"{path}: the database is damaged, {_told(damage)}")
+            yield database
+        finally:
+            database.close()
+    except (sqlite3.Error, OverflowError) as error:
+        raise SurveyFileError(f"{path}: not a readable COLMAP database, {_told(error)}") from error
+
+
+def _refuse_other_files(path: Path) -> int:
+    """Refuse what is no whole SQLite file; return its size."""
+    try:
+        if not path.is_file():
+            raise SurveyFileError(f"{path}: there is no such file")
+        with path.open("rb") as file:
+            header = file.read(HEADER_BYTES)
+        size = path.stat().st_size
+        if size > MAX_TABLE_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
+        for beside in (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal")):
+            if beside.exists() and beside.stat().st_size:
+                raise SurveyFileError(
+                    f"{path}: changes of it still lie in {beside.name}; close the program that writes it"
+                )
+    except OSError as error:
+        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+    if header[:16] != b"SQLite format 3\0" or len(header) < HEADER_BYTES:
+        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (no SQLite file)")
+    page = int.from_bytes(header[16:18], "big")
+    whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if size < whole:
+        raise SurveyFileError(
+            f"{path}: the file is cut off, it has {size} of the {whole} bytes that its header says"
+        )
+    return size
+
+
+def _refuse_other_tables(path: Path, database: sqlite3.Connection) -> None:
+    """Refuse a file without COLMAP's tables, or with others in their place."""
+    kinds = dict(database.execute("SELECT name, type = 'table' AND rootpage > 0 FROM sqlite_master"))
+    for name in TABLES:
+        if name not in kinds:
+            raise SurveyFileError(
+                f"{path}: an SQLite file without the table {name}; a COLMAP database has {', '.join(TABLES)}"
+            )
+        columns = database.execute(f"PRAGMA table_xinfo({name})").fetchall()
+        if not kinds[name] or any(hidden for *_, hidden in columns):
+            raise SurveyFileError(f"{path}: {name} is computed, needed a table that holds it")
+
+
+class _Reader:
+    """Reads the tables of an open database; whatever is wrong is named with table and row."""
+
+    def __init__(self, path: Path, database: sqlite3.Connection) -> None:
+        self.path, self.database = path, database
+
+    def cameras(self) -> tuple[DatabaseCamera, ...]:
+        """Return the cameras by number.
+
+        Raises:
+            SurveyFileError: a size or parameters that no camera has.
+        """
+        found, names = [], tuple(MODELS)
+        for where, row in self._rows("cameras", "camera_id, model, width, height, params"):
+            number = self._whole(where, "camera_id", row[0], MAX_ID)
+            model = names[self._whole(where, "model", row[1], len(names) - 1)]
+            width, height = row[2], row[3]
+            if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE_PX for side in (width, height)):
+                raise SurveyFileError(
+                    f"{self.path}: camera {number} has photographs of {_shown(width)} x {_shown(height)} px, "
+                    f"needed 1 to {MAX_SIDE_PX} on each side"
+                )
+            params = self._array(where, row[4], "<f8", 1, MODELS[model]).ravel()
+            if not ((np.abs(params) <= MAX_NUMBER).all() and params[0] > 0):
+                raise self._error(where, "params are no numbers of a camera")
+            found.append(DatabaseCamera(number, model, width, height, params))
+        return tuple(found)
+
+    def images(self, camera: dict[int, int]) -> tuple[list[int], tuple[str, ...], IntArray]:
+        """Return numbers and names of the photographs, and the index of the camera of each.
+
+        Raises:
+            SurveyFileError: a photograph of an unknown camera, or a name that is not plain text.
+        """
+        numbers, names, owners = [], [], []
+        for where, (number, name, camera_id) in self._rows("images", "image_id, name, camera_id"):
+            numbers.append(self._whole(where, "image_id", number, PAIRS))
+            if not (isinstance(name, str) and is_name(name)):
+                raise self._error(
+                    where, f"name is '{_shown(name)}', needed plain text of 1 to {MAX_NAME} characters"
+                )
+            if camera_id not in camera:
+                raise self._error(where, f"camera_id is {_shown(camera_id)}, there is no such camera")
+            names.append(name)
+            owners.append(camera[camera_id])
+        return numbers, tuple(names), np.array(owners, dtype=np.int64)
+
+    def keypoints(self, images: tuple[str, ...], index: dict[int, int]) -> tuple[FloatArray, ...]:
+        """Return the keypoints of every photograph, none where it has no row.
+
+        Raises:
+            SurveyFileError: keypoints of an unknown photograph, too many, or not finite.
+        """
+        found: list[FloatArray] = [np.zeros((0, 2))] * len(images)
+        count = 0
+        for where, (number, rows, columns, data) in self._rows("keypoints", "image_id, rows, cols, data"):
+            if number not in index:
+                raise self._error(where, f"image_id is {_shown(number)}, there is no such photograph")
+            if columns not in (2, 4, 6):
+                raise self._error(where, f"cols is {_shown(columns)}, needed 2, 4 or 6")
+            xy = self._array(where, data, "<f4", rows, columns)[:, :2].astype(float)
+            count += len(xy)
+            if count > MAX_ROWS:
+                raise self._error(where, f"more than {MAX_ROWS} keypoints, no more are read")
+            if not (np.abs(xy) <= MAX_NUMBER).all():
+                raise SurveyFileError(
+                    f"{self.path}: a keypoint of {images[index[number]]} is no finite number of at most "
+                    f"{MAX_NUMBER:g}"
+                )
+            found[index[number]] = xy
+        return tuple(found)
+
+    def matches(
+        self, table: str, index: dict[int, int], keypoints: tuple[FloatArray, ...]
+    ) -> tuple[tuple[int, int, IntArray], ...]:
+        """Return the matches of every pair of photographs.
+
+        Raises:
+            SurveyFileError: a pair of unknown photographs, a keypoint that is not there, or too many.
+        """
+        found, count = [], 0
+        for where, (number, rows, columns, data) in self._rows(table, "pair_id, rows, cols, data"):
+            first, second = divmod(self._whole(where, "pair_id", number, PAIRS**2), PAIRS)
+            if first not in index or second not in index:
+                raise self._error(where, f"pair_id of photographs {first} and {second}, which are not there")
+            if rows == 0:
+                continue
+            a, b = index[first], index[second]
+            matches = self._array(where, data, "<u4", rows, 2 if columns == 2 else -1).astype(np.int64)
+            count += len(matches)
+            if count > MAX_ROWS:
+                raise self._error(where, f"more than {MAX_ROWS} matches, no more are read")
+            if (matches >= (len(keypoints[a]), len(keypoints[b]))).any():
+                raise SurveyFileError(f"{self.path}: a match names a keypoint that is not there ({where})")
+            found.append((a, b, matches))
+        return tuple(found)
+
+    def _rows(self, table: str, columns: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
+        """Yield where a row stands and what it holds, in the order of the first column."""
+        rows = self.database.execute(f"SELECT {columns} FROM {table} ORDER BY 1")
+        for count, row in enumerate(rows, 1):
+            where = f"{table}, {columns.split(',')[0]} {_shown(row[0])}"
+            if count > MAX_ROWS:
+                raise self._error(where, f"more than {MAX_ROWS} rows, no more are read")
+            yield where, row
+
+    def _error(self, where: str, message: str) -> SurveyFileError:
+        return SurveyFileError(f"{self.path}: {where}: {message}")
+
+    def _whole(self, where: str, column: str, value: object, most: int) -> int:
+        if not (isinstance(value, int) and 0 <= value <= most):
+            raise self._error(where, f"{column} is {_shown(value)}, needed a whole number from 0 to {most}")
+        return value
+
+    def _array(self, where: str, data: object, kind: str, rows: object, columns: int) -> AnyArray:
+        """Return the numbers of a blob, whose size must be that of so many rows and columns."""
+        held = len(data) if isinstance(data, bytes) else 0
+        due = rows * columns * np.dtype(kind).itemsize if isinstance(rows, int) and rows >= 0 else -1
+        if held != due:
+            raise self._error(
+                where, f"{held} bytes of numbers in {_shown(rows)} rows, which do not go together"
+            )
+        return np.frombuffer(data if isinstance(data, bytes) else b"", kind).reshape(-1, columns)
+
+
+def _shown(value: object) -> str:
+    """Return a value of a database as a message can show it."""
+    return as_plain(str(value)[:MAX_NAME]) if isinstance(value, str) else f"{value!r:.40}"
+
+
+def _told(error: object) -> str:
+    return as_plain(" ".join(str(error).split())[:200])

@@ -1,15 +1,20 @@
-"""The analysis of epochs as displacements.csv, series.csv, epochs.json and epochs.html."""
+"""The analysis of epochs as displacements.csv, series.csv, epochs.json and epochs.html.
+
+The scene of two epochs: the points of the first with their displacements to the second.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm.adjustment.quality.statistics import POWER
+from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.epochs.blocks import BlockMotion
@@ -23,9 +28,13 @@ from sfm.report.figures.plots import plot
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit
 from sfm.report.page_files import write_files
-from sfm.report.viewer.displaced_scene import scene_of_displacements
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
+from sfm.report.viewer.scene import ViewerScene
+from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.solution import Solution
+
+MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 
 NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
@@ -281,3 +290,37 @@ def _same(found: Displacements) -> bool:
 
 def _names(names: Iterable[str]) -> str:
     return listed(names, most=NAMED)
+
+
+def scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
+    """Return the scene of an epoch with the displacement of every point and what the test says of it.
+
+    Standard deviations and ellipsoids are those of the displacements.
+
+    Args:
+        found: displacements from this epoch to another one.
+        first: the epoch.
+    """
+    names = first.network.points
+    row = {name: j for j, name in enumerate(names)}
+    tested = np.array([row[name] for name in found.differences.points], dtype=np.int64)
+    covariance = np.full((len(names), 3, 3), np.nan)
+    covariance[tested] = point_blocks(found.covariance, 3)
+    scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
+    displacement = np.full((len(names), 3), np.nan)
+    displacement[tested] = found.displacement
+    state = [UNTESTED] * len(names)
+    for k, j in enumerate(tested.tolist()):
+        state[j] = MOVED if found.moved[k] else STABLE if found.stable[k] else ""
+    kept = [row[name] for name in scene.points]
+    return replace(
+        scene,
+        name=" to ".join(found.differences.names),
+        displacement=displacement[kept],
+        state=tuple(state[j] for j in kept),
+        notes=(
+            *scene.notes,
+            f"Displacements from {found.differences.names[0]} to {found.differences.names[1]}; standard "
+            "deviations and ellipsoids are those of the displacements.",
+        ),
+    )

@@ -16,7 +16,7 @@ from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import Findings, with_remark
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.protocol_files import write_protocol
 from sfm.report.tables.summary import write_summary

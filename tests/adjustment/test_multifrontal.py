@@ -17,7 +17,7 @@ from sfm.adjustment.engine.normals import HALVED, Equations
 from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
-from sfm.adjustment.engine.solvers.dissection import LEAF, dissect
+from sfm.adjustment.engine.solvers.fronts import LEAF, dissect
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.multifrontal_factor import MultifrontalFactor
 from sfm.adjustment.engine.solvers.pairs import pairs_of

@@ -16,7 +16,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.tables.summary import summary
 from sfm.report.text.text_report import WIDTH, text_report
 from sfm.result import SurveyResult

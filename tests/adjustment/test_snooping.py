@@ -8,9 +8,8 @@ from scipy.optimize import brentq
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
-from sfm.adjustment.quality.gross_errors.rays_of_points import _Rays
+from sfm.adjustment.quality.gross_errors.robust import _Rays, would_pass
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
-from sfm.adjustment.quality.gross_errors.robust import would_pass
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError

@@ -17,7 +17,7 @@ from sfm.network import ObjectPoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import Geometry, geometry_of, hull_area
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.phrases import MAX_BINS, points_by_rays
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary

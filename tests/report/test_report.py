@@ -34,8 +34,7 @@ from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axe
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import comparison_of, findings_of
 from sfm.report.findings.geometry import geometry_of
-from sfm.report.html.page import environment
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import environment, report_page
 from sfm.report.numbers import (
     alike,
     finer_unit,

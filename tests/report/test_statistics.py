@@ -45,7 +45,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given_residuals import bar_residuals, control_residuals, interior_residuals
 from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.numbers import signed
 from sfm.report.phrases import words_of_fixed, words_of_sigma0, words_of_test, words_of_weights
 from sfm.report.tables.csv_files import write_tables

@@ -10,7 +10,7 @@ import pytest
 
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.text.text_report import text_report
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.report.viewer.container import packed_scene
-from sfm.report.viewer.embedded import sources
+from sfm.report.viewer.embedded import packed_scene, sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.solution import Solution

@@ -17,7 +17,7 @@ from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given_residuals import exterior_residuals
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.output import write_result
 from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult

@@ -11,8 +11,7 @@ import pytest
 from sfm.conventions import image_from_pixel
 from sfm.errors import SurveyFileError
 from sfm.remarks.remark import kinds_of
-from sfm.survey.inputs.checks.outside import MARGIN_PX, MAX_OUTSIDE, outside_photograph
-from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.start import MARGIN_PX, MAX_OUTSIDE, measurements_from_observations, outside_photograph
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey
 from tests.synthetic import PIXEL_MM, SIZE_PX

@@ -18,7 +18,7 @@ from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.html.report_page import report_page
+from sfm.report.html.page import report_page
 from sfm.report.numbers import significant
 from sfm.report.phrases import words_of_calibration
 from sfm.report.text.text_report import text_report

@@ -18,8 +18,8 @@ from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.solution import Solution
-from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
 from sfm.survey.inputs.given import read_image_points
+from sfm.survey.inputs.start import merge_repeated
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

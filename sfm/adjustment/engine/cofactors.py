@@ -16,9 +16,8 @@ import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
-from sfm.adjustment.engine.normals import solve_lower, solve_transposed
+from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_points, times_reduced
 from sfm.adjustment.engine.null_space import leading
-from sfm.adjustment.engine.products import times_points, times_reduced
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
 from sfm.adjustment.result import Covariance

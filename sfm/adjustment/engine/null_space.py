@@ -20,8 +20,7 @@ import numpy as np
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.motions import Motions, carriers
-from sfm.adjustment.engine.normals import Equations, solve_transposed
-from sfm.adjustment.engine.products import times_reduced
+from sfm.adjustment.engine.normals import Equations, solve_transposed, times_reduced
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray, IntArray
 

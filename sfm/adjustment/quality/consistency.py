@@ -5,6 +5,15 @@ and yet larger than chance makes them together. All tests are against sigma0 a p
 orientations as adjusted, which makes them a little too cautious.
 
 Source: Bartlett (1937), Proc. R. Soc. A 160; Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.2.
+
+Rejected rays for which another ray of the same point could have been rejected just as well.
+
+Of three rays two always nearly meet: which one is wrong is told by what remains along the epipolar line, and
+data snooping blames the wrong one in a quarter of such points with an error of ten standard deviations. Both
+explanations are compared by what they leave; where they differ by less than chance, the point is doubtful.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (separability of alternative
+hypotheses).
 """
 
 from __future__ import annotations
@@ -13,13 +22,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.quality.gross_errors.doubtful_rays import DoubtfulPoint, doubtful_points
 from sfm.adjustment.quality.point_normals import PointNormals, point_normals
 from sfm.adjustment.quality.reliability import level_of_single
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
-from sfm.distributions import chi2_sf
+from sfm.distributions import chi2_isf, chi2_sf
+
+CHANCE = 1e-3  # of so much larger a misfit where the other explanation is the true one
+MOVED = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
 UNEVEN = 1.5  # largest component of a photograph over their median, below which a difference is of no use
@@ -86,3 +97,51 @@ def _uneven(photographs: VarianceComponents) -> Uneven | None:
         return None
     name = photographs.names[int(np.flatnonzero(known)[worst])]
     return Uneven(probability, name, float(sigma[worst]), median)
+
+
+@dataclass(frozen=True)
+class DoubtfulPoint:
+    """A point of which another ray may be the wrong one."""
+
+    point: str
+    rejected: str  # photograph of the ray that was rejected
+    instead: str  # photograph of the ray that may as well be wrong
+    misfit: float  # v'Pv that is left over sigma0^2
+    other: float  # the same with the other ray rejected in its place
+
+
+def doubtful_points(
+    adjustment: Adjustment, parts: PointNormals, rows_of: list[IntArray]
+) -> tuple[DoubtfulPoint, ...]:
+    """Return the points of which another ray could have been rejected, the most doubtful first.
+
+    Args:
+        adjustment: with rejected image points.
+        parts: its normal equations by image point.
+        rows_of: usable image points of each object point.
+    """
+    images, seen = adjustment.network.images, adjustment.network.image_points
+    limit = float(chi2_isf(CHANCE, 1))
+    found = []
+    for j in np.unique(seen.point[adjustment.rejected]).tolist():
+        rows = rows_of[j]
+        out, kept = rows[adjustment.rejected[rows]], rows[~adjustment.rejected[rows]]
+        if not len(out) or len(kept) < 2:
+            continue
+        left = parts.misfit(kept)
+        others = [
+            (parts.misfit(np.append(np.delete(kept, s), r)), int(r), int(kept[s]))
+            for r in out
+            for s in range(len(kept))
+        ]
+        other, r, instead = min(others)
+        if other - left < limit and _moved(parts, kept, np.append(kept[kept != instead], r)) > MOVED:
+            names = images[seen.image[r]], images[seen.image[instead]]
+            found.append(DoubtfulPoint(adjustment.network.points[j], *names, left, other))
+    return tuple(sorted(found, key=lambda one: one.other - one.misfit))
+
+
+def _moved(parts: PointNormals, kept: IntArray, other: IntArray) -> float:
+    """Return how far a point moves from one choice of its rays to another, in standard deviations."""
+    step = parts.step(other) - parts.step(kept)
+    return float(np.sqrt(step @ parts.N[kept].sum(axis=0) @ step))

@@ -8,6 +8,12 @@ Names, reasons and remarks in a page come from files of strangers. They are esca
 somewhere, a browser still refuses any script, style or address that was not written into the policy.
 
 Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
+
+report.html: one page, readable with no manual, with everything it shows inside it.
+
+In the order of a surveyor's questions: did it work, how good is it, what was rejected and why, does the
+other adjuster agree, where are my coordinates. What it says stands in `templates/report.html` and
+`templates/report/`.
 """
 
 from __future__ import annotations
@@ -16,7 +22,9 @@ import base64
 import hashlib
 import math
 from collections.abc import Sequence
+from datetime import datetime
 from functools import cache
+from importlib.metadata import version
 from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
@@ -26,6 +34,9 @@ from markupsafe import Markup
 
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.display import program_name
+from sfm.report.figures.overlays import Overlay
+from sfm.report.figures.plot_data import Plot
+from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
@@ -123,3 +134,35 @@ def content_policy(
 def _hash(text: str) -> str:
     """Return the source expression that allows one element by its content."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def report_page(
+    findings: Findings,
+    plots: Sequence[Plot],
+    overlays: Sequence[Overlay],
+    *,
+    has_model: bool = False,
+    viewer: Viewer | None = None,
+) -> str:
+    """Return the report as one HTML page.
+
+    Args:
+        findings: the result and what is said of it.
+        plots: the pictures of the adjustment.
+        overlays: the drawn photographs; their thumbnails are embedded, links lead to the overlays folder.
+        has_model: whether the folder holds the compared solution as a COLMAP model.
+        viewer: the scene to explore, whose pictures may lie beside the page; None leaves it out.
+    """
+    return render(
+        "report.html",
+        viewer=viewer,
+        pictures_beside=viewer is not None,
+        f=findings,
+        r=findings.result,
+        a=findings.result.adjustment,
+        pictures={plot.stem: plot for plot in plots},
+        overlays=overlays,
+        has_model=has_model,
+        written=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        version=version("kolinear"),
+    )

@@ -345,7 +345,7 @@ def read_image_points(path: Path) -> Observations:
     """Read image points: image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]], or with mm in place of px.
 
     Sigmas may be empty where none is known; cxy is the covariance of x and y, empty or 0 where there is none.
-    A point that is a duplicate in an image is left to `sfm.survey.inputs.checks.repeated_image_points`.
+    A point that is a duplicate in an image is left to `sfm.survey.inputs.start`.
 
     image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is
     taken as measured.

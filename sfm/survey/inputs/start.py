@@ -1,27 +1,41 @@
-"""The network that a survey starts from: given observations, control, scale bars, and start values."""
+"""The network that a survey starts from: given observations, control, scale bars, and start values.
+
+Image points outside their photograph: no photograph has them, so that a setting or a value is wrong.
+
+Single ones are gross errors and are left out by name. More of them refuse the survey, with what would bring
+them inside: x and y exchanged, another unit, or a larger photograph.
+
+Image points that stand more than once in a table: one point measured twice in one photograph.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm.camera import Camera
-from sfm.conventions import FloatArray, IntArray, pixel_from_image
+from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
+from sfm.display import listed
+from sfm.distributions import chi2_ppf
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
-from sfm.remarks.remark import remark
+from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
-from sfm.survey.inputs.checks.outside import refuse_outside
-from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
+
+ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
+
+MARGIN_PX = 1.0  # that programs which count pixels from 1 or from corners differ by
+MAX_OUTSIDE = 0.05  # of the image points: as many gross errors as measuring ever makes
 
 MIN_RAYS = 2  # photographs that a point with a name needs
 
@@ -215,3 +229,130 @@ def _in_pixels(
     covariance[:, range(2), range(2)] = s**2
     covariance[:, 0, 1] = covariance[:, 1, 0] = between
     return xy_px, covariance
+
+
+def outside_photograph(xy: FloatArray, size: FloatArray) -> BoolArray:
+    """Return whether image points are outside of their photographs, (k,).
+
+    Args:
+        xy: image points, px, (k, 2).
+        size: width and height of the photograph of each, px, (k, 2).
+    """
+    return np.asarray(((xy < -0.5 - MARGIN_PX) | (xy > size - 0.5 + MARGIN_PX)).any(axis=1))
+
+
+def refuse_outside(
+    given: Observations, xy: FloatArray, cameras: Sequence[Camera], camera: IntArray
+) -> BoolArray:
+    """Return which image points are outside of their photographs, (k,).
+
+    Args:
+        given: as they were given.
+        xy: in px, (k, 2).
+        cameras: of the survey.
+        camera: of each image point, (k,).
+
+    Raises:
+        SurveyFileError: so many are that a setting is wrong, or all are inside with x and y exchanged.
+    """
+    size = np.array([one.size_px for one in cameras], dtype=float)[camera]
+    outside = outside_photograph(xy, size)
+    count, allowed = int(outside.sum()), MAX_OUTSIDE * len(xy)
+    if not count:
+        return outside
+    reasons = [
+        words
+        for words, other, other_size in _alternatives(given, xy, size, cameras, camera)
+        if outside_photograph(other, other_size).sum() <= (allowed if count > allowed else 0)
+    ]
+    if count <= allowed and not (reasons and reasons[0] == EXCHANGED):
+        return outside
+    k = int(np.argmax(outside))
+    names = listed(dict.fromkeys(cameras[a].name for a in camera[outside].tolist()))
+    width, height = size[k].astype(int)
+    x, y = given.xy[k]
+    needed = np.ceil(xy[outside].max(axis=0)).astype(int)
+    larger = f"size_px must be {needed[0]} x {needed[1]} or more, or the unit is another"
+    raise SurveyFileError(
+        f"{given.table.place(k)}: image point {x:g}, {y:g} {given.unit} is outside its photograph of {width} "
+        f"x {height} px (camera {names}), as are {count} of {len(xy)}: {reasons[0] if reasons else larger}"
+    )
+
+
+EXCHANGED = "with x and y exchanged, or width and height in size_px, they are inside"
+
+
+def _alternatives(
+    given: Observations, xy: FloatArray, size: FloatArray, cameras: Sequence[Camera], camera: IntArray
+) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Yield what may be wrong, with the image points and photograph sizes as they would be, px."""
+    yield EXCHANGED, xy, size[:, ::-1]
+    if given.unit == "mm":
+        yield "read as px in place of mm they are inside", given.xy, size
+        return
+    read = xy.copy()
+    for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+        read[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
+    yield "read as mm in place of px they are inside", read, size
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Image points of which each stands once."""
+
+    image_points: ImagePoints
+    same: tuple[tuple[int, int], ...]  # (photograph, point) of identical ones, merged
+    averaged: tuple[tuple[int, int], ...]  # of those that differ by no more than chance, averaged
+    dropped: tuple[tuple[int, int], ...]  # of those that contradict one another, left out
+    dropped_rows: int  # image points that are left out
+
+    def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
+        """Return what was done with the image points that stand more than once."""
+        kinds = {
+            "image_points_identical": self.same,
+            "image_points_averaged": self.averaged,
+            "image_points_contradicting": self.dropped,
+        }
+        return tuple(
+            remark(kind, image_points=[f"{points[j]} in {images[i]}" for i, j in pairs])
+            for kind, pairs in kinds.items()
+            if pairs
+        )
+
+
+def merge_repeated(seen: ImagePoints) -> Merged:
+    """Return image points of which each stands once in its photograph, where it stood first.
+
+    Identical positions are one measurement that was written twice. Different ones are two measurements:
+    their weighted mean, if a chi-square test of their differences passes; else nobody knows which is right.
+    """
+    key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
+    _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    if (count == 1).all():
+        return Merged(seen, (), (), (), 0)
+    xy, covariance = seen.xy.copy(), seen.covariance.copy()
+    keep: BoolArray = np.zeros(len(seen), dtype=bool)
+    keep[first] = True
+    kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
+    dropped = 0
+    of_group = rows_of(group, len(count))
+    for g in np.flatnonzero(count > 1):
+        rows = of_group[g]
+        one = rows[0]
+        different = np.unique(seen.xy[rows], axis=0, return_index=True)[1]
+        kind = 0
+        if len(different) > 1:
+            P = np.linalg.inv(seen.covariance[rows[different]])
+            Q = np.linalg.inv(P.sum(axis=0))
+            mean = Q @ np.einsum("nab,nb->a", P, seen.xy[rows[different]])
+            d = seen.xy[rows[different]] - mean
+            chi2 = float(np.einsum("na,nab,nb->", d, P, d))
+            kind = 1 if chi2 <= chi2_ppf(1 - ALPHA, 2 * (len(different) - 1)) else 2
+            xy[one], covariance[one] = mean, Q
+        if kind == 2:
+            keep[one] = False
+            dropped += len(rows)
+        kinds[kind].append((int(seen.image[one]), int(seen.point[one])))
+    merged = ImagePoints(seen.image, seen.point, xy, covariance, seen.stated).select(keep)
+    same, averaged, contradicting = (tuple(pairs) for pairs in kinds)
+    return Merged(merged, same, averaged, contradicting, dropped)
