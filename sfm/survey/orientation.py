@@ -28,6 +28,7 @@ from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
+from sfm.survey.diagnosis.no_base import refuse_no_base
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
@@ -48,9 +49,12 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         measured: all image points that have a name.
 
     Raises:
-        GeometryError: no two photographs could be oriented, or what is connected could not be adjusted.
+        GeometryError: no two photographs could be oriented, or what is connected could not be adjusted; the
+            photographs have no base.
     """
     refuse_too_large(measured.network)
+    if survey.tie_points is not None:
+        refuse_no_base(measured.network, measured.cameras)
     network = replace(measured.network, scale_bars=ScaleBars())  # they are judged by the adjustment first
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None

@@ -154,6 +154,33 @@ def test_no_other_c_is_tried_for_mirrored_pictures() -> None:
     assert try_other_principal_distances(network, truth, few, _none) == (few, ())
 
 
+@pytest.mark.parametrize(
+    ("free", "times", "tried"), [(True, 4.0, True), (True, 2.0, False), (False, 4.0, False)]
+)
+def test_residuals_far_above_their_sigmas_are_tried_with_cameras_held(
+    free: bool, times: float, tried: bool
+) -> None:
+    """A network that runs into a false minimum while its camera is learnt: all is oriented, and wrong."""
+    network, truth = make_network(seed_of("false minimum"), images=IMAGES, points=POINTS, noise_px=0.1)
+    camera = replace(truth.cameras[0], free=truth.cameras[0].free & free)
+    start = empty_estimate(network, (camera,))
+    wrong = replace(orientation(network, replace(truth, cameras=(camera,))), rms_px=times * 0.1)
+    factors = []
+
+    def orient_from(values: Estimate) -> Orientation:
+        factors.append(values.cameras[0].value("c") / camera.value("c"))
+        assert not values.cameras[0].free.any()
+        if factors[-1] > 0.8:
+            return wrong
+        return replace(orientation(network, replace(truth, cameras=values.cameras)), rms_px=0.1)
+
+    found, remarks = try_other_principal_distances(network, start, wrong, orient_from)
+    assert remarks == () and found is not None
+    assert factors == (pytest.approx([1.0, 1.4, 0.7]) if tried else [])
+    assert found.rms_px == (0.1 if tried else wrong.rms_px)
+    assert (found.estimate.cameras[0].free == camera.free).all()
+
+
 def _none(_: Estimate) -> Orientation:
     raise AssertionError("tried")
 

@@ -1,4 +1,4 @@
-"""Photographs that could not be oriented: which are not connected, and whether c is what lost them."""
+"""Photographs that are not oriented or fit badly: which are not connected, and whether c is the reason."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.diagnosis.own_camera import LARGER_PART
 
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
+MISFIT = 3.0  # standard deviations of image points, of residuals that another minimum may explain
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,10 @@ def try_other_principal_distances(
     no principal distance turns over. It must orient most of them, and be likelier for all image points: more
     photographs at residuals many times as large are no better.
 
+    Tried with the cameras held, too, where c is adjusted and all is oriented with residuals far larger than
+    the image points have: a network that learns its camera while it grows may have run along the valley of c
+    and distance into a false minimum.
+
     Args:
         network: image points that have names.
         estimate: start values.
@@ -95,27 +100,21 @@ def try_other_principal_distances(
 
     Returns:
         The better orientation where the survey adjusts c; else that which was given. No remarks where no
-        other principal distance is better.
+        other principal distance orients more.
     """
     m = len(network.images)
-    now = 0 if found is None else int(found.estimate.oriented.sum())
     lost = m if found is None else _unexplained(network, found)
-    if lost < 2 or not len(network.image_points):  # one alone has a cause of its own
+    if not len(network.image_points):
         return found, ()
-    search = math.log(2 * len(network.image_points)) / 2 + math.log(len(C_FACTORS) / ALPHA)
-    likeliest = _log_likelihood(network, estimate, found) + search
-    best, least = None, now + int(LARGER_PART * lost)
-    for factor in C_FACTORS:
-        try:
-            other = orient(_with_c(estimate, factor))
-        except GeometryError:
-            continue
-        count = int(other.estimate.oriented.sum())
-        likelihood = _log_likelihood(network, estimate, other)
-        if count > least and likelihood > likeliest:
-            best, likeliest = other, likelihood
-            if count == m:
-                break
+    free = all(camera.free[0] for camera in estimate.cameras)
+    if lost < 2:  # one alone has a cause of its own
+        misfit = found is not None and free and found.rms_px > MISFIT * _stated_px(network)
+        held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
+        best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))
+        return (found if best is None else _restored(best, estimate)), ()
+    others = [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
+    least = _oriented(found) + int(LARGER_PART * lost) + 1
+    best = _likeliest(network, estimate, found, others, orient, least=least)
     if best is None:
         return found, ()
     remarks = tuple(
@@ -124,18 +123,67 @@ def try_other_principal_distances(
             camera=given.name,
             given=(given.c_px * float(np.mean(given.pixel_mm)), "mm"),
             better=(better.c_px * float(np.mean(given.pixel_mm)), "mm"),
-            oriented=int(best.estimate.oriented.sum()),
+            oriented=_oriented(best),
             total=m,
-            before=now,
+            before=_oriented(found),
         )
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
-    if not all(camera.free[0] for camera in estimate.cameras):
-        return found, remarks
-    restored = tuple(
-        replace(new, free=old.free) for new, old in zip(best.estimate.cameras, estimate.cameras, strict=True)
+    return (_restored(best, estimate) if free else found), remarks
+
+
+def _likeliest(
+    network: Network,
+    estimate: Estimate,
+    found: Orientation | None,
+    starts: list[Estimate],
+    orient: Callable[[Estimate], Orientation],
+    *,
+    least: int,
+) -> Orientation | None:
+    """Return the likeliest orientation from other start values, None if that found is likelier.
+
+    Args:
+        network: image points that have names.
+        estimate: start values of that found.
+        found: an orientation; None if there was none.
+        starts: the other start values.
+        orient: returns the orientation from start values.
+        least: photographs that it must orient; once all are with residuals as they should be, no more is
+            tried.
+    """
+    search = math.log(2 * len(network.image_points)) / 2 + math.log(len(C_FACTORS) / ALPHA)
+    likeliest = _log_likelihood(network, estimate, found) + search
+    best = None
+    for start in starts:
+        try:
+            other = orient(start)
+        except GeometryError:
+            continue
+        likelihood = _log_likelihood(network, estimate, other)
+        if _oriented(other) >= least and likelihood > likeliest:
+            best, likeliest = other, likelihood
+            if _oriented(best) == len(network.images) and best.rms_px <= MISFIT * _stated_px(network):
+                break
+    return best
+
+
+def _oriented(found: Orientation | None) -> int:
+    """Return how many photographs are oriented."""
+    return 0 if found is None else int(found.estimate.oriented.sum())
+
+
+def _stated_px(network: Network) -> float:
+    """Return the median standard deviation of the image coordinates, as weighted, px."""
+    return float(np.sqrt(np.median(np.diagonal(network.image_points.covariance, axis1=1, axis2=2))))
+
+
+def _restored(found: Orientation, estimate: Estimate) -> Orientation:
+    """Return an orientation with the parameters free that the start values have free."""
+    cameras = tuple(
+        replace(new, free=old.free) for new, old in zip(found.estimate.cameras, estimate.cameras, strict=True)
     )
-    return replace(best, estimate=replace(best.estimate, cameras=restored)), remarks
+    return replace(found, estimate=replace(found.estimate, cameras=cameras))
 
 
 def _unexplained(network: Network, found: Orientation) -> int:
@@ -156,15 +204,14 @@ def _log_likelihood(network: Network, estimate: Estimate, found: Orientation | N
     return fitting * (-math.log(2 * math.pi * sigma**2) - 1) + (count - fitting) * outlier
 
 
-def _with_c(estimate: Estimate, factor: float) -> Estimate:
-    """Return start values with another principal distance, which is free."""
+def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
+    """Return start values with another principal distance, which is free, or with all of the cameras held."""
     cameras = []
     for camera in estimate.cameras:
-        p, free = camera.parameters.copy(), camera.free.copy()
-        focal = camera.parts[0]
+        p, focal = camera.parameters.copy(), camera.parts[0]
         p[focal] *= factor
-        free[focal] = True
-        cameras.append(replace(camera.with_parameters(p), free=free))
+        adjusted = camera.free | focal if free else np.zeros_like(camera.free)
+        cameras.append(replace(camera.with_parameters(p), free=adjusted))
     return replace(estimate, cameras=tuple(cameras))
 
 
