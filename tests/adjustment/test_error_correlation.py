@@ -9,7 +9,10 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation
+from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
+from sfm.adjustment.hypotheses.score import Reduced, reduce_adjustment
+from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
@@ -147,3 +150,50 @@ def test_surveys_of_texture_have_common_errors_in_their_covariance(scene: tuple[
     alone, common = textured.error_correlation.sigmas_px(textured.sigma0_px)
     assert alone == pytest.approx(SIGMA_PX * np.sqrt(0.7), rel=0.2)
     assert f"{significant(common)} px in common" in words_of_neighbours(textured)
+
+
+@pytest.mark.parametrize("length_px", [150.0, 300.0])
+def test_common_errors_are_no_cause(scene: tuple[Network, Estimate], length_px: float) -> None:
+    """Taken as independent, they look like a held parameter that is wrong, or like another camera."""
+    network, truth = scene
+    a = adjusted(network, truth, in_common(network, 0.95, length_px, seed_of("no cause 3")))
+    assert judge_alternatives(a).causes
+    assert judge_alternatives(with_neighbours(a)).causes == ()
+
+
+def test_points_that_moved_are_named_beside_common_errors(scene: tuple[Network, Estimate]) -> None:
+    network, truth = scene
+    seen, some = network.image_points, (5, 10, 20, 30, 40, 50, 80, 120, 200, 300)
+    errors = in_common(network, 0.6, 300.0, seed_of("a cause"))
+    errors[(seen.image >= 4) & np.isin(seen.point, some)] += (4.5 * SIGMA_PX, 0.0)
+    a = adjusted(network, truth, errors)
+    (cause,) = judge_alternatives(with_neighbours(a)).causes
+    assert cause.kind == "points_moved"
+    assert set(cause.names("points")) <= {network.points[j] for j in some}
+    assert judge_alternatives(a).causes[0].kind == "held_parameter"  # errors taken as independent
+
+
+def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
+    scene: tuple[Network, Estimate],
+) -> None:
+    """The mean of gains by chance, of a held parameter over the whole format, is what it says."""
+    network, truth = scene
+    correlation = ErrorCorrelation(alone=0.4, common=0.6, length_px=300.0)
+    rng, gains, effect = seed_of("design effect"), [], 0.0
+    for _ in range(60):
+        a = adjusted(network, truth, in_common(network, 0.6, 300.0, rng))
+        columns = columns_of(a)
+        a = replace(a, sigma0=1.0, error_correlation=correlation)
+        reduced = reduce_adjustment(a, columns)
+        D = reduced.whiten(columns.freedoms[:, :, [3]])  # K1
+        gains.append(_gain(reduced, D))
+        effect = reduced.design_effect(D)
+    assert effect > 5
+    assert np.mean(gains) == pytest.approx(effect, rel=4 * np.sqrt(2 / len(gains)))
+    alone = replace(reduced, correlation=None)
+    assert alone.design_effect(D) == 1.0
+
+
+def _gain(reduced: Reduced, D: FloatArray) -> float:
+    H, g, _ = reduced.project(D)
+    return float(g[0] ** 2 / H[0, 0])

@@ -371,6 +371,7 @@ def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
         SimpleNamespace(
             kind=kind,
             evidence=20.0,
+            design_effect=1.0,
             gain=SimpleNamespace(value=0.0),
             family=SimpleNamespace(cause=lambda one, k=k: (one.kind, k)),
         )

@@ -130,6 +130,7 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
     blind = SimpleNamespace(
         whiten=reduced.whiten,
         shifts=reduced.shifts,
+        design_effect=reduced.design_effect,
         project=lambda D: (1e-12 * H, np.zeros(1), reduced.project(D)[2]),
     )
     rows = count_alternatives(a)

@@ -42,6 +42,7 @@ from sfm.adjustment.hypotheses.score import (
     gains_of,
     least_share,
     log_f_sf,
+    log_likelihood_gain,
     log_probability,
     points_by_cameras,
 )
@@ -75,7 +76,7 @@ def alternatives_of(
     """
     if a.datum == "control":
         found = [*_by_photographs(a, reduced, columns), *_shapes_of_control(reduced, columns)]
-        return tuple(sorted(found, key=lambda one: -one.evidence))
+        return _by_evidence(a, reduced, columns, found)
     found = [
         *interiors(a, reduced, HELD),
         *interiors(a, reduced, GIVEN),
@@ -84,7 +85,22 @@ def alternatives_of(
         *_moved_points(reduced),
         *_moved_bodies(a, reduced, columns, bodies),
     ]
-    return tuple(sorted(found, key=lambda one: -one.evidence))
+    return _by_evidence(a, reduced, columns, found)
+
+
+def _by_evidence(
+    a: Adjustment, reduced: Reduced, columns: Columns, found: Sequence[Alternative]
+) -> tuple[Alternative, ...]:
+    """Return alternatives, the best evidence first, gains divided by what correlated errors make of them."""
+
+    def tested(one: Alternative) -> Alternative:
+        grows = log_likelihood_gain(one.gain.value, reduced.redundancy) - one.price
+        if reduced.correlation is None or not grows > np.log(1 / ALPHA):
+            return one  # not named anyhow
+        effect = reduced.design_effect(reduced.whiten(one.columns(a, columns)))
+        return one.with_design_effect(effect, reduced.redundancy)
+
+    return tuple(sorted(map(tested, found), key=lambda one: -one.evidence))
 
 
 def count_alternatives(a: Adjustment, bodies: int = 0) -> int:

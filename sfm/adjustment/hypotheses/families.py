@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +23,13 @@ from sfm.adjustment.hypotheses.columns import (
     object_fields,
     shared_columns,
 )
-from sfm.adjustment.hypotheses.score import Gain, Spread
+from sfm.adjustment.hypotheses.score import (
+    Gain,
+    Spread,
+    log_likelihood_gain,
+    log_probability,
+    squares_gained,
+)
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.remarks.remark import Quantity
@@ -51,6 +57,7 @@ class Alternative:
     points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
     parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
     among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
+    design_effect: float = 1.0  # by which errors that neighbours have in common multiply its gain by chance
 
     @property
     def photographs(self) -> IntArray:
@@ -68,6 +75,22 @@ class Alternative:
     def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
         return self.family.columns(self, a, columns)
+
+    def with_design_effect(self, effect: float, redundancy: int) -> Alternative:
+        """Return it tested with its gain divided by a design effect, of an adjustment of some redundancy."""
+        gain = self.gain.value / effect
+        return replace(
+            self,
+            design_effect=effect,
+            log_p=max(self.log_p, log_probability(gain, self.gain.rank, redundancy)),
+            evidence=min(self.evidence, log_likelihood_gain(gain, redundancy) - self.price),
+        )
+
+    def deflated(self, gain: float, redundancy: int) -> float:
+        """Return a gain of ln likelihood by it with that of v'Pv divided by its design effect."""
+        if self.design_effect == 1:
+            return gain
+        return log_likelihood_gain(squares_gained(gain, redundancy) / self.design_effect, redundancy)
 
 
 @dataclass(frozen=True)

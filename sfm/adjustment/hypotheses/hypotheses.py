@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import (
     ALPHA,
@@ -68,7 +69,8 @@ class Cause:
     @property
     def evidence(self) -> float:
         """Gain of ln likelihood, freedoms and search paid for."""
-        return self.refit.gain - self.alternative.price
+        redundancy = self.refit.adjustment.redundancy
+        return self.alternative.deflated(self.refit.gain, redundancy) - self.alternative.price
 
 
 @dataclass(frozen=True)
@@ -235,7 +237,7 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
             once.setdefault(one.family.cause(one), one)
     if once:  # what one parameter of all photographs explains needs no other cause, however these differ
         for one in every:
-            gained = log_likelihood_gain(one.gain.value, reduced.redundancy)
+            gained = log_likelihood_gain(one.gain.value / one.design_effect, reduced.redundancy)
             if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
                 once.setdefault(one.family.cause(one), one)
     of_kind: Counter[object] = Counter()
@@ -249,7 +251,15 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
         for one in reported("alternatives adjusted", to_try, len(to_try))
     ]
     holding = [
-        ((_beyond_spread(one, found.gain, reduced) if causes else found.gain) - one.price, one, found)
+        (
+            min(
+                one.deflated(found.gain, reduced.redundancy),
+                _beyond_spread(one, found.gain, reduced) if causes else np.inf,
+            )
+            - one.price,
+            one,
+            found,
+        )
         for one, found in tried
         if found is not None
     ]
@@ -291,7 +301,8 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) ->
         replace(found.alternative, gain=replace(found.alternative.gain, beta=together.beta)),
         together.adjustment,
     )
-    if alone is not None and -alone.gain - causes[0].alternative.price < np.log(1 / ALPHA):
+    first = causes[0].alternative
+    if alone is not None and first.deflated(-alone.gain, plain.redundancy) - first.price < np.log(1 / ALPHA):
         shift, rms = shifts_of(plain, plain, alone.adjustment, found.alternative, alone.beta)
         return (replace(found, refit=replace(alone, shift=shift, rms=rms)),)
     before = (
@@ -331,12 +342,13 @@ def free_network(final: Adjustment) -> Adjustment | None:
     """Return the adjustment of the image points alone, gross errors rejected; None if it is no solution."""
     if not final.converged or not final.sigma0 > 0 or final.redundancy < 2:
         return None
-    network = final.network
+    network, correlation = final.network, final.error_correlation
     alone = not (len(network.scale_bars) or len(network.exterior))
     tested = final.rejected.any() and not final.reweighted and not final.undetermined
     if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
         return final
-    return adjust_image_points(network, final.estimate, final.rejected, final.image_sigma_factor)
+    free = adjust_image_points(network, final.estimate, final.rejected, final.image_sigma_factor)
+    return free if free is None or correlation is None else with_error_correlation(free, correlation)
 
 
 def adjust_image_points(

@@ -102,6 +102,7 @@ def _stepped(
         except GeometryError:
             found = None
         if found is not None and found.converged:
+            found = replace(found, error_correlation=plain.error_correlation)  # as far as is known
             if log_likelihood(found) > log_likelihood(start) - SETTLED:
                 return found, beta + step
             best = best or (found, beta + step)

@@ -5,10 +5,13 @@
 A are the columns of the adjustment (photographs, free interior parameters, object points), B those of an
 alternative, v the residuals of the accepted image points. Object points are eliminated first, then
 photographs and cameras, whose seven motions are fixed by inner constraints. Where the alternative is none,
-(gain / q) / ((v'Pv - gain) / (r - q)) is F distributed.
+(gain / q) / ((v'Pv - gain) / (r - q)) is F distributed. Where neighbouring image points have errors
+in common, the variance of g is D'RD in place of H = D'D, with D what the unknowns leave of B. Gains are then
+divided by the design effect, the mean of the eigenvalues of H^-1 D'RD.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 4.2; Rao (1948), Proc.
-Camb. Phil. Soc. 44, for the score test; Foerstner and Wrobel (2016), sec. 4.6.4.
+Camb. Phil. Soc. 44, for the score test; Rao and Scott (1984), Annals of Statistics 12, for the design effect;
+Foerstner and Wrobel (2016), sec. 4.6.4.
 """
 
 from __future__ import annotations
@@ -19,8 +22,9 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
+from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.hypotheses.columns import Columns, shared_columns
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
 from sfm.network import rows_of
@@ -52,6 +56,8 @@ class Reduced:
     t: FloatArray  # right side of photographs and cameras, reduced by the points, (a,)
     photographs: int
     redundancy: int
+    xy: FloatArray  # measured position of each, px, (k, 2)
+    correlation: ErrorCorrelation | None  # of the errors of neighbours
 
     @property
     def count(self) -> int:
@@ -92,6 +98,19 @@ class Reduced:
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
         return self._eliminated(D)[:3]
+
+    def design_effect(self, D: FloatArray) -> float:
+        """Return by how much errors that neighbours have in common multiply the gain of columns by chance.
+
+        It is that of whitened columns (k, 2, q), the mean over their determined directions, and 1 at least.
+        """
+        if self.correlation is None:
+            return 1.0
+        H, _, squares, left, _ = self._eliminated(D)
+        inverse = determined_inverse(H, squares)
+        added = correlated_sum(self.image, self.xy, left, self.correlation)
+        rank = max(float(np.trace(inverse @ H)), 1.0)
+        return max(1.0 + float(np.trace(inverse @ added)) / rank, 1.0)
 
     def shifts(self, D: FloatArray) -> FloatArray:
         """Return by how much object points shift where whitened columns (k, 2, q) are in the image points.
@@ -190,6 +209,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
+        *(seen.xy[used], a.error_correlation),
     )
 
 

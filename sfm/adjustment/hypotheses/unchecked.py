@@ -131,7 +131,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, rows)
-    least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
+    least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # noncentrality that is found
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
