@@ -29,6 +29,7 @@ from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
 from sfm.survey.diagnosis.no_base import refuse_no_base
+from sfm.survey.diagnosis.second_motion import find_second_motion
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
@@ -87,7 +88,11 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     elif held:
         wrong_c = tuple(replace(one, kind="c_looks_wrong_of_pair") for one in wrong_c)
     found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
-    if not survey.tie_points and not wrong_c:
+    if survey.tie_points:
+        found = replace(
+            found, remarks=(*found.remarks, *find_second_motion(network, found, _orient_strongest))
+        )
+    elif not wrong_c:
         found = tell_second_objects(found, find_second_objects(network, found, _orient))
     return tell_lost_photographs(network, found)
 

@@ -146,6 +146,7 @@ LIMITS: dict[
     "principal_point_far": ("share", 0.1, None),
     "pixels_distorted": ("share", 0.01, 0.05),
     "windows_disagree": ("share", 0.3, 0.6),
+    "second_motion": ("share", 0.01, 0.05),
     "key_points_not_measured": ("missing", 0.5, None),
     "targets_blurred": ("blur", 2.5, None),
 }

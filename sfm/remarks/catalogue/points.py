@@ -144,6 +144,15 @@ ROWS = (
         "Print the targets larger, go nearer or focus better.",
     ),
     Kind(
+        "second_motion",
+        # of rendered scenes none without a motion; a twentieth may be the object, hidden by what moves
+        Grade("share", warning=0.01, error=0.05),
+        "{points:tie point}, {share:%} of all, in {photographs} {points:fits|fit} one another and not the "
+        "others: the photographs show two things that moved against each other.",
+        "people, vehicles or leaves that moved together, a pattern that repeats, or a reflection",
+        "See which points are in the result; those of what moved may be. Photograph the object without it.",
+    ),
+    Kind(
         "windows_disagree",
         # 0.04 to 0.09 on stone and rendered surfaces; of windows at random within 3 px of where they are
         # looked for 0.33 agree by chance (ten photographs of a telephone)
