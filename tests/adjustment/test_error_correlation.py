@@ -10,8 +10,9 @@ from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
 from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.families import MOVED
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
-from sfm.adjustment.hypotheses.score import Reduced, reduce_adjustment
+from sfm.adjustment.hypotheses.score import Reduced, gain_of, reduce_adjustment
 from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
@@ -192,6 +193,25 @@ def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
     assert np.mean(gains) == pytest.approx(effect, rel=4 * np.sqrt(2 / len(gains)))
     alone = replace(reduced, correlation=None)
     assert alone.design_effect(D) == 1.0
+
+
+def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Estimate]) -> None:
+    """The gain of a set of points, each of which may move by itself, spreads as the design effect says."""
+    network, truth = scene
+    near = np.argsort(np.linalg.norm(truth.points - truth.points[7], axis=1))[:10]
+    after = (network.image_points.image >= 4)[:, None, None]
+    correlation = ErrorCorrelation(alone=0.05, common=0.95, length_px=300.0)
+    rng, gains = seed_of("neighbours"), []
+    for _ in range(60):
+        a = adjusted(network, truth, in_common(network, 0.95, 300.0, rng))
+        columns = columns_of(a)
+        reduced = reduce_adjustment(replace(a, sigma0=1.0, error_correlation=correlation), columns)
+        field = MOVED.field(a.estimate.points, near)[network.image_points.point]
+        D = reduced.whiten(np.where(after, columns.point @ field, 0.0))
+        gains.append(gain_of(*reduced.project(D)).value)
+    effect = reduced.design_effect(D)
+    assert effect > 1.4 * np.mean(gains) / D.shape[2]  # the mean alone says less
+    assert np.var(gains) / (2 * np.mean(gains)) == pytest.approx(effect, rel=0.5)
 
 
 def _gain(reduced: Reduced, D: FloatArray) -> float:

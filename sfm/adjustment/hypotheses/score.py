@@ -7,7 +7,8 @@ alternative, v the residuals of the accepted image points. Object points are eli
 photographs and cameras, whose seven motions are fixed by inner constraints. Where the alternative is none,
 (gain / q) / ((v'Pv - gain) / (r - q)) is F distributed. Where neighbouring image points have errors
 in common, the variance of g is D'RD in place of H = D'D, with D what the unknowns leave of B. Gains are then
-divided by the design effect, the mean of the eigenvalues of H^-1 D'RD.
+divided by the design effect, the sum of squares of the eigenvalues of H^-1 D'RD over their sum: many points
+with one error in common show it many times.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 4.2; Rao (1948), Proc.
 Camb. Phil. Soc. 44, for the score test; Rao and Scott (1984), Annals of Statistics 12, for the design effect;
@@ -102,15 +103,15 @@ class Reduced:
     def design_effect(self, D: FloatArray) -> float:
         """Return by how much errors that neighbours have in common multiply the gain of columns by chance.
 
-        It is that of whitened columns (k, 2, q), the mean over their determined directions, and 1 at least.
+        It is that of whitened columns (k, 2, q), in the directions that these determine, and 1 at least.
         """
         if self.correlation is None:
             return 1.0
         H, _, squares, left, _ = self._eliminated(D)
-        inverse = determined_inverse(H, squares)
-        added = correlated_sum(self.image, self.xy, left, self.correlation)
-        rank = max(float(np.trace(inverse @ H)), 1.0)
-        return max(1.0 + float(np.trace(inverse @ added)) / rank, 1.0)
+        variance = H + correlated_sum(self.image, self.xy, left, self.correlation)
+        effects = determined_inverse(H, squares) @ variance
+        first = float(np.trace(effects))
+        return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
 
     def shifts(self, D: FloatArray) -> FloatArray:
         """Return by how much object points shift where whitened columns (k, 2, q) are in the image points.
