@@ -217,3 +217,19 @@ def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Esti
 def _gain(reduced: Reduced, D: FloatArray) -> float:
     H, g, _ = reduced.project(D)
     return float(g[0] ** 2 / H[0, 0])
+
+
+def test_given_coordinates_are_judged_with_common_errors(scene: tuple[Network, Estimate]) -> None:
+    """True ones are confirmed by texture; taken as independent its errors contradict them."""
+    network, truth = scene
+    seen, some = network.image_points, np.arange(0, len(network.points), 5)
+    moved = seen.xy + in_common(network, 0.95, 600.0, seed_of("given 0"))
+    network = replace(network, image_points=replace(seen, xy=moved))
+    network = network.with_control([network.points[j] for j in some], truth.points[some], 1e-5)
+    survey = survey_of(network, truth)
+    matched = Correspondences(network, truth, np.full(len(network.points), 3))
+    of_targets, *_ = solve_survey(survey, matched).given_tests
+    textured, *_ = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).given_tests
+    assert of_targets.what == textured.what == "control"
+    assert of_targets.probability < 0.01 and textured.probability > 0.1
+    assert textured.statistic == pytest.approx(textured.dof, rel=0.15)

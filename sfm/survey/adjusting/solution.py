@@ -9,7 +9,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
-from sfm.adjustment.quality.error_correlation import with_neighbours
+from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -296,6 +296,9 @@ def _judged(
     report_step("testing the given values")
     # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
     adjustment = None if free is None or free.settled.held else free.settled.adjustment
+    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
+    if adjustment is not None and task.survey.tie_points is not None and given_any:
+        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
     plate = plate_control(task.survey.targets)
     given = judge_given(
         network,
