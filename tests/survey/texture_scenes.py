@@ -290,7 +290,7 @@ def _warped(texture: FloatArray, H: FloatArray, size: tuple[int, int]) -> tuple[
         rows = (step / 2 < scale) | (level == 3)
         rows &= (step / 2 >= scale / 2) | (level == 0)
         seen = cv2.remap(
-            smooth, ((u - 0.5) / scale).astype(np.float32), ((v - 0.5) / scale).astype(np.float32),
+            smooth, (u / scale - 0.5).astype(np.float32), (v / scale - 0.5).astype(np.float32),
             cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
         value = np.where(rows, seen, value)
