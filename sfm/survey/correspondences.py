@@ -31,7 +31,7 @@ from sfm.survey.diagnosis.own_camera import treat_lost
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs
-from sfm.survey.measuring.tie_points import MIN_RAYS
+from sfm.survey.measuring.tie_points import needed_rays
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
@@ -62,7 +62,7 @@ def find_correspondences(
         return Correspondences(
             network,
             start.estimate if surface is None else surface.estimate,
-            measured.min_rays if surface is None else np.full(len(network.points), MIN_RAYS),
+            measured.min_rays if surface is None else needed_rays(network),
             point_failures=start.point_failures,
             given=start.kind == "given",
             remarks=() if surface is None else surface.remarks,

@@ -94,7 +94,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         )
     elif not wrong_c:
         found = tell_second_objects(found, find_second_objects(network, found, _orient))
-    return tell_lost_photographs(network, found)
+    return tell_lost_photographs(network, found, named=survey.tie_points is None)
 
 
 def _orient(

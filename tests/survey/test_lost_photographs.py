@@ -11,7 +11,7 @@ import sfm
 from sfm.camera import camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate
+from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
@@ -62,6 +62,31 @@ def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -
     assert lost.names("photographs") == ("image 7", "image 8", "image 9", "image 10")
     assert lost.names("shared") == ("21", "22") and lost.names("points") and lost.names("others")
     assert found.failures[0] == ("image 7", remark("photograph_not_connected", shared=2, needed=4))
+
+
+def test_points_of_one_oriented_photograph_connect_nothing() -> None:
+    """They have no coordinates, unless these were given."""
+    network, truth = split_network()
+    seen = network.image_points
+    kept = seen.select((seen.point < 10) | (seen.point >= 20) | (seen.image == 5))
+    others = np.repeat([6, 7, 8, 9], 10)
+    k = len(kept) + len(others)
+    shown = ImagePoints(
+        np.concatenate([kept.image, others]),
+        np.concatenate([kept.point, np.tile(np.arange(10, 20), 4)]),
+        np.zeros((k, 2)),
+        np.tile(np.eye(2), (k, 1, 1)),
+    )
+    network, oriented = replace(network, image_points=shown), np.arange(IMAGES) < 6
+    estimate = partly(truth, oriented)
+    points = estimate.points.copy()
+    points[10:20] = np.nan
+    (group,) = lost_groups(network, replace(estimate, points=points))
+    assert not group.connected and group.shared.tolist() == [20, 21]
+    (group,) = lost_groups(network, estimate)
+    assert group.connected
+    told = tell_lost_photographs(network, orientation(network, replace(estimate, points=points)), named=False)
+    assert not told.remarks[0].names("shared") and not told.remarks[0].names("others")
 
 
 @pytest.mark.parametrize("shown", [0, 3, 4])

@@ -6,11 +6,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.camera import tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.network import Estimate, ImagePoints, rows_of
 
 NEIGHBOURS = 6  # object points whose plane a place is put on
 NEAREST, FARTHEST = 0.5, 2.0  # of a plane, in the depths of the nearest and the farthest object point
+TOLERANCE_FACTOR = 6.0  # of the spread of points about the planes of their neighbours
 FLATTEST = 1e-6  # part of the squares of neighbours' tangents that is added where they are in a row
 
 
@@ -42,11 +43,7 @@ def planes_at(
         return points, normal
     known, inverse, uv = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2], uv[rows]
     near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
-    away = known[near] - uv[:, None]
-    A = np.concatenate([away, np.ones((*near.shape, 1))], axis=2)
-    N = np.einsum("kij,kil->kjl", A, A)
-    N += FLATTEST * np.einsum("kij,kij->k", away, away)[:, None, None] * np.diag([1.0, 1.0, 0.0])
-    plane = np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse[near])[:, :, None])[:, :, 0]
+    plane = _planes(known[near] - uv[:, None], inverse[near])[0]
     value = plane[:, 2].copy()  # inverse of the depth at the place
     plane[:, 2] -= np.sum(plane[:, :2] * uv, axis=1)
     inside = (value > inverse.min() / FARTHEST) & (value < inverse.max() / NEAREST)
@@ -55,3 +52,63 @@ def planes_at(
     across = -(plane * [1.0, 1.0, -1.0]) @ R.T
     normal[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
     return points, normal
+
+
+def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful: BoolArray) -> BoolArray:
+    """Return which object points lie on the surface of their neighbours in all their photographs, (n,).
+
+    An error along the epipolar line moves a point of two rays towards its photographs or away, and nothing
+    else. A point is taken for wrong that is farther from the plane through its neighbours than
+    TOLERANCE_FACTOR times what is usual in the photograph. Of neighbours the farthest leaves first, as it
+    bends the planes of the others.
+
+    Args:
+        seen: image points of n object points.
+        camera: index of the camera of each photograph, (m,).
+        estimate: orientation and object points.
+        doubtful: the points that may be wrong, (n,); the others are taken for right.
+    """
+    good = np.asarray(estimate.determined | ~doubtful)
+    for i, rows in enumerate(rows_of(seen.image, len(estimate.position))):
+        point = np.unique(seen.point[rows])
+        UVW = (estimate.points[point] - estimate.position[i]) @ estimate.rotation[i]
+        before = np.isfinite(UVW).all(axis=1) & (UVW[:, 2] < 0)
+        good[point[~before & doubtful[point]]] = False
+        while True:
+            on = np.flatnonzero(before & good[point])
+            if not doubtful[point[on]].any():
+                break
+            if len(on) <= NEIGHBOURS:  # no surface
+                good[point[on[doubtful[point[on]]]]] = False
+                break
+            uv, inverse = -UVW[on, :2] / UVW[on, 2:], -1 / UVW[on, 2]
+            near = cKDTree(uv).query(uv, k=NEIGHBOURS + 1)[1]
+            near = _others(near)
+            plane, N = _planes(uv[near] - uv[:, None], inverse[near])
+            off = np.abs(inverse - plane[:, 2]) / np.sqrt(1 + np.linalg.inv(N)[:, 2, 2])
+            out = doubtful[point[on]] & (off > TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off))
+            if not out.any():
+                break
+            worst = out & (off >= np.where(out[near], off[near], 0.0).max(axis=1))
+            good[point[on[worst]]] = False
+    return good
+
+
+def _others(near: IntArray) -> IntArray:
+    """Return the neighbours of each point without itself, of (k, NEIGHBOURS + 1) with it, in any place."""
+    own = near == np.arange(len(near))[:, None]
+    own[~own.any(axis=1), -1] = True  # several in one place
+    return np.asarray(near[~own].reshape(len(near), -1))
+
+
+def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a, b, c of the planes 1 / t = a u + b v + c about k places, and their normal matrices.
+
+    Args:
+        away: tangents of the neighbours less those of the place, (k, NEIGHBOURS, 2).
+        inverse: of the depths of these, (k, NEIGHBOURS).
+    """
+    A = np.concatenate([away, np.ones((*away.shape[:2], 1))], axis=2)
+    N = np.einsum("kij,kil->kjl", A, A)
+    N += FLATTEST * np.einsum("kij,kij->k", away, away)[:, None, None] * np.diag([1.0, 1.0, 0.0])
+    return np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse)[:, :, None])[:, :, 0], N

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
 from sfm.matching.grey_photographs import GreyPhotographs
@@ -67,6 +67,7 @@ def find_tie_points(
     *,
     window_px: int = WINDOW_PX,
     min_rays: int = 3,
+    min_image_points: int = 0,
     min_correlation: float = 0.7,
     seed: int = 0,
     threads: int = 1,
@@ -80,6 +81,7 @@ def find_tie_points(
         natural: what `natural_points` has found in each of them.
         window_px: odd side of the window of least squares matching.
         min_rays: fewest photographs of a point.
+        min_image_points: of a photograph, below which its points of two rays are taken, too.
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
         threads: pairs of photographs worked on at a time.
@@ -92,17 +94,32 @@ def find_tie_points(
     Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
     (1985) for the measurement.
     """
+    m, fewest = len(photographs), min_rays if min_image_points == 0 else min(2, min_rays)
+    tracks = link_features(
+        natural, min_rays=fewest, seed=seed, threads=threads, known=known, neighbours=neighbours
+    )
+    kept = _needed(tracks.image, tracks.point, m, min_rays, min_image_points)
+    _, point = np.unique(tracks.point[kept], return_inverse=True)
     return measure_tracks(
         photographs,
         natural,
-        link_features(
-            natural, min_rays=min_rays, seed=seed, threads=threads, known=known, neighbours=neighbours
-        ),
+        Tracks(tracks.image[kept], tracks.feature[kept], point.ravel()),
         window_px=window_px,
         min_rays=min_rays,
+        min_image_points=min_image_points,
         min_correlation=min_correlation,
         threads=threads,
     )
+
+
+def _needed(image: IntArray, point: IntArray, m: int, min_rays: int, min_image_points: int) -> BoolArray:
+    """Return which image points are of points with enough rays, or with two that a photograph needs, (k,)."""
+    n = int(point.max(initial=-1)) + 1
+    rays = np.bincount(point, minlength=n)
+    enough = rays >= min_rays
+    scarce = np.bincount(image[enough[point]], minlength=m) < min_image_points
+    enough |= (rays >= 2) & (np.bincount(point[scarce[image]], minlength=n) > 0)
+    return np.asarray(enough[point])
 
 
 def link_features(
@@ -208,6 +225,7 @@ def measure_tracks(
     *,
     window_px: int = WINDOW_PX,
     min_rays: int = 3,
+    min_image_points: int = 0,
     min_correlation: float = 0.7,
     threads: int = 1,
 ) -> TiePoints:
@@ -223,6 +241,7 @@ def measure_tracks(
         tracks: which features belong to one point.
         window_px: odd side of the window of least squares matching.
         min_rays: fewest photographs of a point.
+        min_image_points: see `find_tie_points`.
         min_correlation: smallest coefficient r of a match.
         threads: pairs of photographs worked on at a time.
     """
@@ -278,7 +297,9 @@ def measure_tracks(
             total = np.bincount(tracks.point[good], at_reference[good, a, b], minlength=n)
             covariance[reference, a, b] = total / np.maximum(matched, 1)
     measured[reference] = place
-    keep = np.isfinite(measured).all(axis=1) & (matched + 1 >= min_rays)[tracks.point]
+    keep = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    needed = _needed(tracks.image[keep], tracks.point[keep], len(photographs), min_rays, min_image_points)
+    keep = keep[needed]
     _, point = np.unique(tracks.point[keep], return_inverse=True)
     kept = np.unique(tracks.point[keep])
     return TiePoints(

@@ -208,7 +208,7 @@ ROWS = (
     Kind(
         "photograph_not_connected",
         "warning",
-        "It has {shared:point} in common with the oriented photographs; {needed} are needed.",
+        "It shows {shared:point} that the oriented photographs determine; {needed} are needed.",
         "too few common points",
         "Add a photograph that shows points of both.",
     ),

@@ -27,11 +27,11 @@ class Lost:
     """Photographs without orientation that belong together."""
 
     images: IntArray  # indices of the photographs
-    shared: IntArray  # points that they have in common with oriented photographs
+    shared: IntArray  # points of theirs that oriented photographs determine
     connected: bool  # whether one of them shows enough of these to be oriented
 
 
-def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
+def tell_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
     """Return the orientation with what is missing between the groups of photographs that are not connected.
 
     A photograph with fewer points than any orientation needs is no group: its own reason says so.
@@ -39,6 +39,7 @@ def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
     Args:
         network: image points that have names.
         found: its orientation.
+        named: whether a person knows the points by these names.
     """
     groups = [
         one
@@ -54,7 +55,7 @@ def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
             reasons[network.images[i]] = remark("photograph_not_connected", shared=count, needed=MIN_POINTS)
     groups.sort(key=lambda one: -len(one.images))
-    remarks = (_not_connected(network, oriented, group) for group in groups)
+    remarks = (_not_connected(network, oriented, group, named=named) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)
     return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
 
@@ -63,8 +64,8 @@ def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
     """Return the photographs without orientation in groups that could be oriented among themselves."""
     oriented, seen = estimate.oriented, network.image_points
     lost = np.flatnonzero(~oriented)
-    in_network = np.zeros(len(network.points), dtype=bool)
-    in_network[seen.point[oriented[seen.image]]] = True
+    rays = np.bincount(seen.point[oriented[seen.image]], minlength=len(network.points))
+    in_network = (rays >= 2) | ((rays == 1) & estimate.determined)  # one ray and no coordinates: no place
     label = np.arange(len(network.images))  # the group of each photograph
     for first, second, common in network.common_points(~oriented[seen.image]):
         linked = label[first[common >= MIN_POINTS]], label[second[common >= MIN_POINTS]]
@@ -215,17 +216,17 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
     return replace(estimate, cameras=tuple(cameras))
 
 
-def _not_connected(network: Network, oriented: BoolArray, group: Lost) -> Remark:
+def _not_connected(network: Network, oriented: BoolArray, group: Lost, *, named: bool) -> Remark:
     """Return the remark on photographs that are not connected, with points to connect them."""
-    theirs = _often_seen(network, group.images)
+    theirs = _often_seen(network, group.images) if named else []
     return remark(
         "not_connected",
         photographs=[network.images[i] for i in group.images],
         oriented=int(oriented.sum()),
-        shared=[network.points[j] for j in group.shared] or None,
+        shared=[network.points[j] for j in group.shared if named] or None,
         needed=MIN_POINTS,
         points=theirs if len(theirs) >= MIN_POINTS else None,
-        others=_often_seen(network, np.flatnonzero(oriented)) or None,
+        others=(_often_seen(network, np.flatnonzero(oriented)) or None) if named else None,
     )
 
 

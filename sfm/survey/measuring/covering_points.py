@@ -22,8 +22,9 @@ from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import Covered, Windows
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.matching.lsm.warp import linear_part
+from sfm.matching.radiometry import Grey
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
@@ -35,6 +36,7 @@ LATER_SHIFT_PX = 3.0  # and from where its first rays put it
 MIN_COSINE = 0.35  # between a ray and the normal of the plane: below it windows are squeezed to a third
 SCALES = (0.4, 2.5)  # of a window in another photograph relative to the reference
 BORDER_PX = 4  # between a window and the border of a photograph
+RETURN_FACTOR = 3.0  # of the usual distance, in sigmas, at which a match comes back that is matched back
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -105,7 +107,7 @@ def find_covering_points(
         side_px: of the squares that the windows are in the middle of; no two of them share pixels.
         references: photographs that points are taken from; all, those with the most tie points first, if not
             given.
-        min_rays: fewest photographs of a point.
+        min_rays: fewest photographs of a point where so many see the surface; where two do, it has two.
         min_correlation: smallest coefficient r of a match.
         threads: photographs worked on at a time.
 
@@ -118,32 +120,32 @@ def find_covering_points(
     covered = Covered([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
-    in_order = np.asarray(order).tolist()
-    for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
-        if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
-            continue
+
+    def cover(i: int, rays: int, *, more: bool) -> None:
+        """Take points from a photograph that so many see, or more."""
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
         places = _Places(xy, normal, points).select(known)
-        visible = _visible(estimate, camera, i, places, covered, margin, side_px)
-        several = visible.sum(axis=0) >= min_rays
-        if not several.any():
-            continue
-        rays = _followed(
-            grey,
-            estimate,
-            camera,
-            i,
-            places.select(several),
-            visible[:, several],
-            windows,
-            min_correlation,
-            threads,
+        visible, free = _visible(estimate, camera, i, places, covered, margin, side_px)
+        of = free.sum(axis=0) >= rays
+        if not more:
+            of &= visible.sum(axis=0) == rays
+        if not of.any():
+            return
+        measured = _followed(
+            *(grey, estimate, camera, i, places.select(of), free[:, of], windows, min_correlation, threads),
+            both_ways=not more,
         )
-        new, used = _agreeing(rays.image_points, estimate, camera, min_rays)
+        new, used = _agreeing(measured.image_points, estimate, camera, rays)
         found.append(new)
-        covered.cover(new.image_points.image, new.image_points.xy, side_px * rays.scale[used])
+        covered.cover(new.image_points.image, new.image_points.xy, side_px * measured.scale[used])
+
+    in_order = [i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(own[i]) >= NEIGHBOURS]
+    for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
+        cover(i, min_rays, more=True)
+    for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
+        cover(i, 2, more=False)
     return _joined(found)
 
 
@@ -155,12 +157,13 @@ def _visible(
     covered: Covered,
     margin: int,
     side_px: int,
-) -> BoolArray:
-    """Return which photographs look at the planes and have them inside and not covered, (m, k).
+) -> tuple[BoolArray, BoolArray]:
+    """Return which photographs look at the planes and have them inside, and not covered, both (m, k).
 
     The reference is among them.
     """
     visible = np.zeros((len(covered.shapes), len(places)), dtype=bool)
+    free = visible.copy()
     for j in np.flatnonzero(estimate.oriented).tolist():
         at = pictures_of(estimate, camera, np.full(len(places.xy), j), places.points)
         size = np.array(covered.shapes[j][::-1])
@@ -169,9 +172,10 @@ def _visible(
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
         rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
-        visible[j, rows] = covered.is_free(j, at[rows], side_px)
-    visible[i] = True
-    return visible
+        visible[j, rows] = True
+        free[j, rows] = covered.is_free(j, at[rows], side_px)
+    visible[i] = free[i] = True
+    return visible, free
 
 
 def _followed(
@@ -184,10 +188,13 @@ def _followed(
     windows: Windows,
     min_correlation: float,
     threads: int,
+    *,
+    both_ways: bool,
 ) -> _Rays:
     """Measure the places of a photograph in the others, in those with the most similar direction first.
 
-    Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`.
+    Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`. Where
+    no third ray checks a match, it is matched back, too.
     """
     k = len(places.xy)
     ray = estimate.position[:, None] - places.points[None]
@@ -224,6 +231,9 @@ def _followed(
             blur=True,
         )
         good = match.good
+        if both_ways:
+            at = places.xy[rows[fits]]
+            good &= _returning(template, photographs[j], at, match, window_px, min_correlation)
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
         seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
@@ -251,6 +261,28 @@ def _followed(
     seen = _concatenated(parts)
     some = some[seen.point]
     return _Rays(seen.select(some), np.concatenate(scales)[some])
+
+
+def _returning(
+    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, window_px: int, min_correlation: float
+) -> BoolArray:
+    """Return which matches come back to where they are from, as the others do, when matched back, (k,)."""
+    rows = np.flatnonzero(match.good)
+    back = match_lsm(
+        other,
+        template,
+        match.xy[rows],
+        xy[rows],
+        window_px=window_px,
+        start=np.asarray(np.linalg.inv(linear_part(match.warp[rows]))),
+        min_correlation=min_correlation,
+        blur=True,
+    )
+    off = back.xy - xy[rows]
+    square = np.einsum("ka,kab,kb->k", off, np.linalg.inv(back.covariance), off)
+    good = np.zeros(len(xy), dtype=bool)
+    good[rows] = square <= RETURN_FACTOR**2 * np.median(square[back.good]) if back.good.any() else False
+    return good
 
 
 def _agreeing(

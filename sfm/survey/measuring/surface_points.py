@@ -18,10 +18,11 @@ from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import Windows, first_alike
 from sfm.matching.lsm.projected_points import pictures_of
+from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import PhotographFiles
@@ -34,7 +35,7 @@ from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
-from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
+from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 
 # Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
 # several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine
@@ -105,6 +106,7 @@ def cover_photographs(
         min_rays=MIN_RAYS,
         threads=jobs,
     )
+    found = without_far_points(found, estimate, network.camera)
     if len(found.image_points) < fits.sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
@@ -180,7 +182,24 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
         return np.asarray(known)
     fits = known & (off <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off[known]))
     rays = np.bincount(seen.point[fits], minlength=len(network.points))
-    return np.asarray(fits & (rays >= MIN_RAYS)[seen.point])
+    needed = needed_rays(network)
+    enough = (rays >= needed) & on_surface(seen.select(fits), network.camera, estimate, needed < MIN_RAYS)
+    return np.asarray(fits & enough[seen.point])
+
+
+def without_far_points(found: CoveringPoints, estimate: Estimate, camera: IntArray) -> CoveringPoints:
+    """Return the points without those of two rays that are off the surface of their neighbours."""
+    seen, n = found.image_points, len(found.points)
+    two = np.bincount(seen.point, minlength=n) < MIN_RAYS
+    good = on_surface(seen, camera, replace(estimate, points=found.points), two)
+    kept = good[seen.point]
+    number = np.cumsum(good) - 1
+    return CoveringPoints(
+        replace(seen.select(kept), point=number[seen.point[kept]]),
+        found.points[good],
+        found.residuals[kept],
+        found.matched,
+    )
 
 
 def _side(estimate: Estimate, window_px: int, most: int) -> int:

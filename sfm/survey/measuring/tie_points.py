@@ -34,7 +34,9 @@ MIN_TIE_POINTS = 15
 # Image points of a photograph below which it is searched for more features: three photographs of a portal,
 # taken while walking towards it, have 36 in common of 2,000 features each, and 249 of 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
-MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
+# Photographs that must agree on a point: of two rays an error along the epipolar line is not found. Points of
+# two are taken where a photograph, or a part of it, has no others.
+MIN_RAYS = 3
 
 
 def tie_photographs(
@@ -58,7 +60,7 @@ def tie_photographs(
         progress: told of every photograph.
 
     Raises:
-        GeometryError: fewer than two readable photographs, or no point that three of them have in common.
+        GeometryError: fewer than two readable photographs, or no point that two of them have in common.
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
@@ -86,18 +88,19 @@ def tie_photographs(
     )
     matches: Matches = {}
 
-    def tie() -> TiePoints:
+    def tie(min_image_points: int) -> TiePoints:
         return find_tie_points(
             pictures,
             natural,
             window_px=settings.window_px,
-            min_rays=MIN_RAYS,
+            min_rays=min(MIN_RAYS, len(read)),
+            min_image_points=min_image_points,
             threads=jobs,
             known=matches,
             neighbours=neighbours,
         )
 
-    tied = tie()
+    tied = tie(0)
     scarce = np.flatnonzero(np.bincount(tied.image, minlength=len(read)) < SCARCE_TIE_POINTS).tolist()
     if scarce and "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
@@ -105,10 +108,11 @@ def tie_photographs(
             natural[a] = natural_points_of(photographs.paths[read[a]], more, store)[0]
         for pair in [pair for pair in matches if not set(pair).isdisjoint(scarce)]:
             del matches[pair]
-        tied = tie()
+    if scarce:
+        tied = tie(SCARCE_TIE_POINTS)
     if not len(tied):
         raise GeometryError(
-            f"no texture that {MIN_RAYS} photographs have in common; more overlap or "
+            "no texture that two photographs have in common; more overlap or "
             "smaller steps between the photographs are needed"
         )
     # Control and scale bars name points of the result, which lie elsewhere: see `surface_points`
@@ -121,7 +125,7 @@ def tie_photographs(
         network,
         cameras,
         photographs.names,
-        np.full(len(points), MIN_RAYS),
+        needed_rays(network),
         failed,
         tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
         photographs,
@@ -141,6 +145,11 @@ def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remar
             "pairs_matched", pairs=pairs, possible=possible, by_position=by_position, in_sequence=in_sequence
         ),
     )
+
+
+def needed_rays(network: Network) -> IntArray:
+    """Return how many photographs each point needs: those that it has, up to MIN_RAYS, (n,)."""
+    return np.minimum(network.rays(), MIN_RAYS)
 
 
 def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tuple[PhotographTargets, ...]:
