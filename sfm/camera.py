@@ -26,6 +26,7 @@ STEP_TOLERANCE = (
 # Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
 # apart from true ones. A parameter that the network knows worse is better held.
 KNOWN_WITHOUT = 0.01
+DIAGONAL_PLACES = 26  # from the corner to the middle of a wide-angle photograph, of which one has a ray
 
 
 @dataclass(frozen=True)
@@ -420,12 +421,18 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> Flo
 
 
 def corner_shift(camera: Camera, s: int, sigma: float) -> float:
-    """Return by how much a change of a parameter moves the corner, over the half diagonal."""
+    """Return by how much a change of a parameter moves the corner, over the half diagonal.
+
+    The corner of a wide-angle photograph may be farther off the axis than any ray: the farthest place on the
+    diagonal that has one stands for it.
+    """
     if not np.isfinite(sigma):
         return np.inf
-    corner = np.zeros((1, 2))
+    inwards = np.linspace(0.0, 0.5, DIAGONAL_PLACES) if camera.wide_angle else np.zeros(1)
+    places = inwards[:, None] * (np.array(camera.size_px) - 1)
     p = camera.parameters.copy()
     p[s] += sigma
-    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, corner)) - corner
-    reach = 2 * float(np.hypot(*moved[0])) / float(np.hypot(*camera.size_px))
-    return reach if np.isfinite(reach) else np.inf
+    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, places)) - places
+    reach = 2 * np.hypot(*moved.T) / float(np.hypot(*camera.size_px))
+    known = np.isfinite(reach)
+    return float(reach[known.argmax()]) if known.any() else np.inf

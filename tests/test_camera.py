@@ -11,6 +11,7 @@ from numba import njit
 from sfm.camera import (
     Camera,
     camera_from_values,
+    corner_shift,
     pixel_from_tangents,
     pixel_jacobian,
     project,
@@ -171,3 +172,16 @@ def test_unknown_names_are_refused(
 def test_a_camera_needs_all_parameters_of_its_model() -> None:
     with pytest.raises(SurveyFileError, match="3 parameters, model brown has 10"):
         Camera("A", "brown", SIZE_PX, np.array(PIXEL_MM), np.zeros(3))
+
+
+def test_the_corner_of_a_fisheye_that_no_ray_reaches_is_taken_farther_in() -> None:
+    """Of 290 px focal length, 800 by 600 px: the corner is 99 degrees off the axis; 90 are at 0.91 of it."""
+    p = np.array([290.0, 290.0, 399.5, 299.5, 0.0, 0.0, 0.0, 0.0])
+    camera = Camera("lens", "opencv_fisheye", (800, 600), np.ones(2), p)
+    half = np.hypot(800, 600) / 2
+    assert corner_shift(camera, 2, 5.0) == pytest.approx(5.0 / half)
+    angle = 299.5 / 290.0 * half / 300 * 0.9  # of places, each 0.04 of the diagonal, the first inside
+    assert corner_shift(camera, 4, 1e-3) == pytest.approx(1e-3 * angle**3 * 290 / half, rel=0.15)
+    assert corner_shift(camera, 4, np.inf) == np.inf
+    narrow = camera.with_parameters(np.array([600.0, 600.0, *p[2:]]))
+    assert corner_shift(narrow, 0, 6.0) == pytest.approx(0.01 * 399.5 / half, rel=1e-6)

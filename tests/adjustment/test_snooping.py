@@ -1,6 +1,7 @@
 """Data snooping of many image points a round rejects what it rejects one by one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,6 +128,21 @@ def test_a_rejected_image_point_comes_back_where_it_would_pass_in_the_adjustment
     for share in (0.98, 1.0):
         found = adjust(moved(share * limit), truth, rejected=alone, alpha=alpha, covariance=False)
         assert found.rejected[ray] == (share == 1.0)
+
+
+@pytest.mark.parametrize("offset, passes", [([0.9, -0.45], False), ([450.0, 900.0], True)])
+def test_a_ray_that_alone_places_its_point_is_tested_across_the_other(offset, passes):
+    """Without it the point has no place along the other ray: its cofactor there is 1e16, and singular."""
+    singular = 2.0**53 * np.array([[1.0, 2.0], [2.0, 4.0]])
+    observations = SimpleNamespace(whitening=np.tile([10.0, 0.0, 10.0], (3, 1)), xy=np.full((3, 2), 9.0))
+    back = would_pass(
+        *(observations, np.array([[0.0, 0.0]] * 2 + [offset]), np.stack([np.eye(2)] * 2 + [singular])),
+        np.array([True, True, False]),
+        vPv=900.0,
+        redundancy=1000.0,
+        alpha=0.001,
+    )
+    assert back.tolist() == [False, False, passes]
 
 
 def test_many_at_once_are_the_same_as_one_by_one():

@@ -148,7 +148,10 @@ def would_pass(
         ~used & np.isfinite(residuals).all(axis=1) & np.isfinite(complement).all(axis=(1, 2))
     )
     F = whitening_matrix(observations.whitening[rows])
-    cofactor = np.asarray(np.linalg.inv(complement[rows]), dtype=float)
+    # No eigenvalue of I + H is below 1, but rounding leaves nothing of one beside that of a ray without which
+    # its point has no place along the other.
+    values, vectors = np.linalg.eigh(complement[rows])
+    cofactor = np.asarray(vectors / np.maximum(values, 1.0)[:, None] @ vectors.transpose(0, 2, 1))
     predicted = np.einsum("kab,kb->ka", F, residuals[rows])
     inside = np.einsum("kab,kb->ka", cofactor, predicted)
     v = np.linalg.solve(F, inside[:, :, None])[:, :, 0]
