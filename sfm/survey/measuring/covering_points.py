@@ -233,7 +233,7 @@ def _followed(
         good = match.good
         if both_ways:
             at = places.xy[rows[fits]]
-            good &= _returning(template, photographs[j], at, match, window_px, min_correlation)
+            good &= _returning(template, photographs[j], at, match, windows, min_correlation)
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
         seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
@@ -264,7 +264,7 @@ def _followed(
 
 
 def _returning(
-    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, window_px: int, min_correlation: float
+    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows, min_correlation: float
 ) -> BoolArray:
     """Return which matches come back to where they are from, as the others do, when matched back, (k,)."""
     rows = np.flatnonzero(match.good)
@@ -273,7 +273,8 @@ def _returning(
         template,
         match.xy[rows],
         xy[rows],
-        window_px=window_px,
+        model=windows.model,
+        window_px=windows.side_px,
         start=np.asarray(np.linalg.inv(linear_part(match.warp[rows]))),
         min_correlation=min_correlation,
         blur=True,
