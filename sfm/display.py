@@ -1,4 +1,4 @@
-"""What is shown of much: small tables for the prompt and for notebooks, lists cut short for messages."""
+"""Short views of long data: small tables for the prompt and for notebooks, lists cut short for messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an adjustment is given from Python, checked as files are: shapes, indices, numbers, covariances.
+"""Checks of the input of an adjustment from Python, as of files: shapes, indices, numbers, covariances.
 
 The first thing that is wrong is named, with what was expected.
 """

@@ -59,7 +59,7 @@ class StageTime:
 
 @dataclass(frozen=True)
 class PhotographTargets:
-    """What was measured and what was rejected in one photograph, for its overlay."""
+    """Measured targets and rejected candidates of one photograph, for its overlay."""
 
     image: str  # name of the photograph
     path: Path  # its file
@@ -164,7 +164,7 @@ class SurveyResult:
 
     @property
     def network(self) -> Network:
-        """What was adjusted, rejected image points included."""
+        """The adjusted network, rejected image points included."""
         return self.adjustment.network
 
     @property
@@ -174,7 +174,7 @@ class SurveyResult:
 
     @cached_property
     def seen_targets(self) -> SeenTargets:
-        """What was measured and rejected in the photographs of the result."""
+        """Targets measured and candidates rejected in the photographs of the result."""
         index = {name: i for i, name in enumerate(self.network.images)}
         own = [one for one in self.photographs if one.image in index]
         own.sort(key=lambda one: index[one.image])
@@ -283,7 +283,7 @@ class SurveyResult:
 
     @property
     def length_unit(self) -> str:
-        """What lengths are measured in: the object unit, or network units where the scale is undefined."""
+        """Unit of lengths: the object unit, or network units where the scale is undefined."""
         return self.unit if self.has_scale else NO_SCALE
 
 

@@ -33,7 +33,7 @@ MEASURED = "measured"
 
 @dataclass(frozen=True)
 class SeenTargets:
-    """What was measured, and what was rejected, in the photographs of a result."""
+    """Targets measured and candidates rejected in the photographs of a result."""
 
     image: IntArray  # index of the photograph in the network of the result, (k,)
     xy: FloatArray  # centres, px, (k, 2)

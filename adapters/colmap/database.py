@@ -6,7 +6,7 @@ the connected parts of the graph of matches. Keypoints are single precision: 1e-
 
 Source: COLMAP 4.2 documentation, "Database Format".
 
-What stands in a COLMAP database, read as untrusted: cameras, photographs, keypoints and matches.
+Content of a COLMAP database, read as untrusted: cameras, photographs, keypoints and matches.
 
 The file is opened read-only and immutable, so that nothing is written to it or beside it, and only its own
 tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.

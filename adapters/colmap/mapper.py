@@ -1,7 +1,7 @@
 """COLMAP's own pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
 
-What people would use instead: no targets, no scale, no covariance. Its photographs and points are compared
-with the survey's by sfm.comparison.baseline.
+The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
+are compared with the survey's by sfm.comparison.baseline.
 
 Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
 """

@@ -26,7 +26,7 @@ class NamedCamera(Content):
 
 
 class Names(Content):
-    """What stands in kolinear.json."""
+    """Content of kolinear.json."""
 
     cameras: tuple[NamedCamera, ...] = ()  # in the order of their numbers
     images: dict[str, Name] = Field(default_factory=dict)  # names by COLMAP's number of the photograph

@@ -1,6 +1,6 @@
 """Our networks as COLMAP's scenes and back.
 
-What differs is turned here and nowhere else:
+Differences are converted here and nowhere else:
 
     pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0

@@ -28,7 +28,7 @@ def _no_image_points() -> ImagePoints:
 
 @dataclass(frozen=True)
 class Content:
-    """What was measured and solved, what took no part, and what the reader should know of it."""
+    """A solution, the observations that took no part, and notes for the reader."""
 
     result: Solution
     rejected: ImagePoints = field(default_factory=_no_image_points)  # measured, but left out as gross errors

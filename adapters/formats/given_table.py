@@ -1,4 +1,4 @@
-"""What a survey was given with a standard deviation, read from given.csv of its result.
+"""Given values of a survey with standard deviations, read from given.csv of its result.
 
     kind,name,coordinate,unit,given,difference,sigma,r,w
 
@@ -27,7 +27,7 @@ HEADER = ("kind", "name", "coordinate", "unit", "given", "difference", "sigma", 
 
 
 class _Summary(Content):
-    """What is read of summary.json."""
+    """The part of summary.json that is read."""
 
     sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
     sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
@@ -35,7 +35,7 @@ class _Summary(Content):
 
 @dataclass(frozen=True)
 class GivenValues:
-    """What a survey was given with a standard deviation, and what took part."""
+    """Given values of a survey with standard deviations, and those that took part."""
 
     bars: ScaleBars
     control: ObjectPoints

@@ -56,7 +56,7 @@ Writer = Callable[[Path, Network, Estimate], None]
 
 @dataclass(frozen=True)
 class FileFormat:
-    """What is known of a format, and who reads and writes it."""
+    """A file format: its properties, its reader and its writer."""
 
     name: str  # as --from and --to say it
     models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras

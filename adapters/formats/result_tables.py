@@ -345,7 +345,7 @@ def _with_shared(result: Solution) -> tuple[Camera, ...]:
 
 
 class _Statistics(Json):
-    """What the summary says of the unit of weight."""
+    """Unit of weight as the summary states it."""
 
     sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
     sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
@@ -368,7 +368,7 @@ class _DatumEntry(Json):
 
 
 class _Summary(Json):
-    """What is read of summary.json."""
+    """The part of summary.json that is read."""
 
     survey: Text | None = None
     length_unit: Text | None = None

@@ -1,4 +1,4 @@
-"""What was measured and rejected in the photographs, read from targets.csv of a result.
+"""Targets measured and candidates rejected in the photographs, read from targets.csv of a result.
 
     image,x_px,y_px,a_px,b_px,angle_deg,reason
 

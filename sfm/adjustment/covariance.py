@@ -52,7 +52,7 @@ class Marginal:
 
     @cached_property
     def correlated(self) -> CorrelatedPart | None:
-        """What the correlation of the errors adds; None where they are independent."""
+        """Part of the covariance due to correlated errors; None where they are independent."""
         correlation = self.adjustment.error_correlation
         return None if correlation is None else correlated_part(self.influence, correlation)
 

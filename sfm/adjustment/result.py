@@ -1,4 +1,4 @@
-"""What an adjustment returns: the solution, its statistics and its covariance."""
+"""Result of an adjustment: the solution, its statistics and its covariance."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ LOGS = "logs"  # folder of the logs of surveys that have no result
 
 @dataclass(frozen=True)
 class SurveyJob:
-    """What a worker must know to run a survey."""
+    """Input of a worker that runs a survey."""
 
     file: Path  # the survey file
     out: Path  # folder of the batch
@@ -53,7 +53,7 @@ class SurveyJob:
 
 @dataclass(frozen=True)
 class Comparers:
-    """What surveys are compared with: functions of a module, so that they travel to workers."""
+    """Programs that surveys are compared with: functions of a module, so that they travel to workers."""
 
     others_of: Callable[[Survey], OtherPrograms]  # those that a survey asks for
     writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # writes its model
@@ -61,7 +61,7 @@ class Comparers:
 
 @dataclass(frozen=True)
 class PhotographNote:
-    """What came of a photograph, for the log."""
+    """Outcome of a photograph, for the log."""
 
     image: str
     targets: int = 0

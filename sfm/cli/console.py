@@ -85,7 +85,7 @@ def tell_remarks(console: Console, lines: Iterable[Line]) -> None:
 def _failures(findings: Findings) -> list[str]:
     """Return why photographs are not in the result and what helps: once for those alike.
 
-    What a remark explains is left out.
+    Remarks explained by another one are left out.
     """
     said = {
         (image, kind)

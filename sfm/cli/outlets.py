@@ -1,4 +1,4 @@
-"""What is printed: characters that a code page lacks, disks that are full and readers that end early."""
+"""Printing where a code page lacks characters, a disk is full or a reader ends early."""
 
 from __future__ import annotations
 

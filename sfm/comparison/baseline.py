@@ -25,7 +25,7 @@ MIN_RAYS = 2
 
 
 class Baseline(Protocol):
-    """What another pipeline made of the photographs of a survey."""
+    """Result of another pipeline for the photographs of a survey."""
 
     @property
     def name(self) -> str:

@@ -57,7 +57,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 
 @dataclass(frozen=True)
 class Row:
-    """What of the second result may be another."""
+    """Attributes of the second result that may differ."""
 
     scale: bool = False
     mirror: bool = False
@@ -86,7 +86,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Cause:
-    """What explains the differences of two results."""
+    """Explanation of the differences of two results."""
 
     row: Row
     other_object: bool = False  # nothing does: the points have nothing to do with one another

@@ -6,8 +6,8 @@ are taken as stable,
     S = I - G (G_F' G_F)^-1 G_F',  d_S = S d,  Q_S = S (Q_a + Q_b) S',
 
 G being the translations, small rotations and, where the scale is not defined by both, the scale of the whole.
-What the datum of either solution holds or leaves undefined drops out. Under no change Omega = d' Q_S^+ d over
-F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F where the variances are
+Whatever the datum of either solution fixes or leaves undefined drops out. Under no change
+Omega = d' Q_S^+ d over F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F where the variances are
 estimated. The point whose removal from F lowers Omega most is taken to have moved, until the rest agrees.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Pelzer (1971), Zur
@@ -169,7 +169,7 @@ def motions(xyz: FloatArray) -> FloatArray:
 def bending(xyz: FloatArray) -> FloatArray:
     """Return how coordinates change with a bending of the whole, of the second degree, (3 n, k).
 
-    What a camera that is described wrongly does to all points together: a dome, a saddle, an affinity; the
+    Effects of a wrong camera model on all points together: a dome, a saddle, an affinity; the
     polynomials are of the axes along which the object extends.
 
     Args:

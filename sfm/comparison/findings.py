@@ -1,4 +1,4 @@
-"""What a comparison of two results finds: remarks, and the verdict on it."""
+"""Remarks on a comparison of two results, and the verdict on it."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ SAME_PLACE = 0.5  # of the points that must coincide for two results to be in on
 
 @dataclass(frozen=True)
 class Pairing:
-    """What two results have in common, by index, and how each pair was recognised."""
+    """Common points and photographs of two results, by index, and how each pair was recognised."""
 
     points: IntArray  # of a and of b, (n, 2)
     images: IntArray  # of a and of b, (m, 2)

@@ -24,7 +24,7 @@ FREE_DATUMS = ("free", "")  # in which the covariance of single points says abou
 
 @dataclass(frozen=True)
 class PointTest:
-    """What the tests of the points say."""
+    """Results of the tests of the points."""
 
     sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
     untested: Remark | None  # why there is no test

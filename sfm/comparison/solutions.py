@@ -49,7 +49,7 @@ class Comparison:
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """What differs by more than two solutions of the same optimum may, in words; empty if they agree."""
+        """Differences larger than those of two solutions of one optimum, in words; empty if there are none."""
         return tuple(
             f"{what} differs by {value:.2g} of its standard deviation, {SAME_SIGMAS:g} is allowed"
             for what, value in self.sigmas

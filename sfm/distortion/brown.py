@@ -6,7 +6,7 @@ plane, as DBAT has it (Boerlin and Grussenmeyer, 2013, Photogrammetric Record 28
 difference between the ray and the corrected point: affinity and distortion that shrink that plane shrink v'Pv
 too, which biases them and all that is correlated with them (`tests/adjustment/test_plane_of_residuals.py`).
 
-Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.models`.
+Signs as PhotoModeler and DBAT. Its outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

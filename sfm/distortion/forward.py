@@ -1,6 +1,6 @@
 """Distortion of the ideal point in mm, with affinity and shear of the ideal or of the distorted point.
 
-Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.models`.
+Signs as PhotoModeler and DBAT. Its outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

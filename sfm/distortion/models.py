@@ -104,7 +104,7 @@ class Model:
 
     @property
     def variant(self) -> tuple[float, float]:
-        """What tells the models of one function apart, frame[4] and frame[5] of compiled code."""
+        """Values that distinguish the models of one function, frame[4] and frame[5] of compiled code."""
         if self.in_mm:
             return float(self.corrects and not self.corrected_plane), float(self.distorted_affinity)
         focal = len(self.names_of(Role.FOCAL))

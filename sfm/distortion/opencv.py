@@ -1,6 +1,6 @@
 """The models of computer vision, in units of the focal lengths: OpenCV's, as COLMAP has them.
 
-They distort the ideal point. What a model fills is said in `sfm.distortion.models`.
+They distort the ideal point. Its outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The ideal point (a, b) = (x/z, y/z), y down, goes to s(r2) (a, b) with r2 = a^2 + b^2, and to pixels by one
 focal length or two, as frame[4] says. All of them are smooth on the axis: s is a function of r2.
 
-What a model fills is said in `sfm.distortion.models`.
+Its outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

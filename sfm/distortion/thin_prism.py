@@ -2,7 +2,7 @@
 
 The ideal point (a, b) goes to e = s(r2) (a, b), as in `radial`, and from there to the distorted point.
 
-What a model fills is said in `sfm.distortion.models`.
+Its outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ MANY = 10**6  # redundancy above which Fisher's F is chi-square
 
 @dataclass(frozen=True)
 class Displacements:
-    """What moved between two epochs."""
+    """Displacements between two epochs."""
 
     differences: Differences
     congruency: Congruency  # the search for the stable points, and the datum of those

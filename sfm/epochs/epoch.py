@@ -17,7 +17,7 @@ SAME = 1e-9  # relative difference of two given values that are the same one
 
 @dataclass(frozen=True)
 class Common:
-    """What correlates an epoch with those it was adjusted together with: C_12 = U_1 diag(signs) U_2'."""
+    """Correlation of an epoch with those that it was adjusted together with: C_12 = U_1 diag(signs) U_2'."""
 
     given: tuple[str, ...]  # values that were given to several, g of them
     columns: FloatArray  # U, those of the given values first, object unit, (3 k, q)

@@ -1,4 +1,4 @@
-"""What epochs show: remarks on every pair of them, and the verdict on all."""
+"""Remarks on every pair of epochs, and the verdict on all."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ MOVED = "points that moved"
 
 @dataclass(frozen=True)
 class EpochPair:
-    """What moved between two epochs, by points and by groups."""
+    """Displacements between two epochs, by points and by groups."""
 
     displacements: Displacements
     groups: tuple[BlockMotion, ...]  # those asked for

@@ -1,6 +1,6 @@
 """CSV tables with named columns, read as untrusted.
 
-What they may hold is bounded before memory is taken for it, and every refusal names the line and the column.
+Their size is bounded before memory is allocated, and every refusal names the line and the column.
 
 Source: RFC 4180.
 """

@@ -38,7 +38,7 @@ Pixel = Annotated[FiniteFloat, Field(gt=0, le=MAX_PIXEL_MM, strict=True)]
 
 
 class Content(BaseModel):
-    """What is read of a file; anything else in it is passed over."""
+    """The part of a file that is read; the rest is ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

@@ -1,6 +1,6 @@
 """Files and folders that appear whole or not at all, and never by way of a link that somebody has laid there.
 
-What is new is made under names that nobody can know before, and moved to its place by one rename, which
+New files are made under unpredictable names and moved to their place by one rename, which
 follows no link. What is there already is replaced only where it is known as the program's own.
 """
 

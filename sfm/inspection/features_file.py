@@ -140,7 +140,7 @@ class MeasureSettings(Section):
 
 
 class FeaturesFile(Section):
-    """What a features file says; the tables and meshes that it names are not read yet."""
+    """Content of a features file; the tables and meshes that it names are not read yet."""
 
     measure: MeasureSettings = MeasureSettings()
     groups: Annotated[

@@ -97,7 +97,7 @@ class Measurement:
 
     @property
     def unit(self) -> str:
-        """What lengths are in."""
+        """The unit of lengths."""
         return self.points.unit or "object units"
 
     def group_of(self, point: int) -> str:
@@ -160,7 +160,7 @@ def measure_result(
 
 
 class _Work:
-    """What is known while a result is measured."""
+    """State of a measurement in progress."""
 
     def __init__(
         self,

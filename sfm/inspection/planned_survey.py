@@ -79,7 +79,7 @@ class PlannedSurvey:
 
 @dataclass(frozen=True)
 class Achieved:
-    """What a simulated survey achieved against what its plan predicted."""
+    """Precision that a simulated survey achieved, against the prediction of its plan."""
 
     points: int  # planned points that were measured
     planned: int

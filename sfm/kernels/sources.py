@@ -1,6 +1,6 @@
 """The sources that a module depends on: its own and those of every module of the package that it imports.
 
-What is kept on disk because it was expensive, compiled kernels and what was measured in photographs, is kept
+Expensive results on disk, compiled kernels and measurements of photographs, are kept
 for these sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled
 into it.
 """

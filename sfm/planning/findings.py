@@ -1,4 +1,4 @@
-"""What a plan comes to: remarks, and the verdict on it."""
+"""Remarks on a plan, and the verdict on it."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ SHAPES = {
 
 @dataclass(frozen=True)
 class PlannedObject:
-    """What is to be measured."""
+    """The object to be measured."""
 
     names: tuple[str, ...]  # of the points, n of them
     xyz: FloatArray  # object unit, (n, 3)

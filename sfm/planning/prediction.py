@@ -1,4 +1,4 @@
-"""What a planned network will give: covariance of its points, redundancy, and the rule people know.
+"""Prediction of a planned network: covariance of its points, redundancy, and the rule people know.
 
     sigma = q S sigma_image / sqrt(k)
 
@@ -44,7 +44,7 @@ class ScaleBarPlan:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What photographs of an object from some stations will give."""
+    """Prediction for photographs of an object from some stations."""
 
     planned: PlannedObject
     camera: Camera

@@ -1,4 +1,4 @@
-"""What a network must give: a standard deviation of points or lengths, or a displacement that is found.
+"""Requirements on a network: a standard deviation of points or lengths, or a displacement that is found.
 
 A displacement between two such surveys is found, in its worst direction, if it is as long as the
 noncentrality of the test of three coordinates over the standard deviation of the difference.

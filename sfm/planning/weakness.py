@@ -62,7 +62,7 @@ class Calibratability:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What the network lacks for it, in words."""
+        """The reason in the network, in words."""
         words = []
         if self.rolled < 0.2:
             words.append(f"{self.rolled:.0%} of the photographs are rolled by 90 deg, better half of them")

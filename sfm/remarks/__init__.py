@@ -1,1 +1,1 @@
-"""What the program says of a result: remarks, the catalogue of their kinds, the verdict."""
+"""Statements on a result: remarks, the catalogue of their kinds, the verdict."""

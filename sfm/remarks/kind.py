@@ -9,7 +9,7 @@ Sentence, cause and remedy are texts with fields in braces, one for each part of
     {p:<}                   "p = 0.012", "p < 0.001"
     {of:@}                  nouns by their keys    {given:@bar}          of others "bar 1 - 2"
 
-What stands in [[ ]] appears only if the remark has all parts in it.
+Text in [[ ]] appears only if the remark has all parts in it.
 """
 
 from __future__ import annotations

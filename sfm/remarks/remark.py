@@ -68,7 +68,7 @@ class Remark:
 
     @property
     def remedy(self) -> str:
-        """What to do, by the catalogue."""
+        """The remedy, by the catalogue."""
         return self._write(self.row.remedy)
 
     def _write(self, text: str) -> str:

@@ -29,7 +29,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a person reads first."""
+    """The lines that a person reads first."""
 
     level: Level
     headline: str
@@ -37,7 +37,7 @@ class Verdict:
 
     @property
     def lines(self) -> tuple[Line, ...]:
-        """What is printed of the remarks: of many of one kind the first ones, and how many more there are."""
+        """The remarks as printed: the first ones of each kind, and how many more there are."""
         return lines_of(self.remarks)
 
     def as_dict(self) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class Faces:
 
 @dataclass(frozen=True)
 class Marks:
-    """What is painted on the faces, later marks over earlier ones."""
+    """Marks painted on the faces, later ones over earlier ones."""
 
     face: IntArray  # (k,)
     kind: IntArray  # DISC, ARC or RECTANGLE, (k,)
@@ -87,7 +87,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Optics:
-    """What lens and sensor do to the light."""
+    """Effects of lens and sensor on the light."""
 
     blur_px: float = 0.7  # standard deviation of the point spread, px
     vignetting: float = 0.0  # part of the light that is lost in the corners

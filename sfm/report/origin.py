@@ -15,7 +15,7 @@ from sfm.report.log import LOG, read_log
 
 @dataclass(frozen=True)
 class Origin:
-    """What a result was computed from."""
+    """Origin of a result: the files that it was computed from."""
 
     file: Path  # the survey file
     images: Path  # folder of the photographs
@@ -39,7 +39,7 @@ def read_origin(out: Path) -> Origin | None:
 
 
 class _Summary(Content):
-    """What is read of summary.json."""
+    """The part of summary.json that is read."""
 
     survey: Name
 

@@ -1,4 +1,4 @@
-"""What nobody has foreseen, and memory that is not enough: told in one line, with what was at work.
+"""Unforeseen errors and lack of memory, reported in one line with the step that failed.
 
 A fault is an error of the program, not of what it was given. Its traceback is kept in a
 file for whoever mends it.

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Progress(Protocol):
-    """What a run calls while it works; implementations draw it, count it or ignore it."""
+    """Interface that a run reports its progress to; implementations draw it, count it or ignore it."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """A stage of that name begins; `total` steps will be announced, None if nobody knows."""

@@ -23,7 +23,7 @@ Mapper = Callable[[Path, tuple[tuple[str, ...], ...]], Baseline]
 
 @dataclass(frozen=True)
 class OtherPrograms:
-    """What a survey is compared with; functions, so that the survey knows none of their libraries."""
+    """Programs to compare a survey with; functions, so that the survey imports none of their libraries."""
 
     adjuster: Adjuster | None = None
     mapper: Mapper | None = None

@@ -1,4 +1,4 @@
-"""What the correlation of neighbouring image points adds to the covariance of the unknowns.
+"""Covariance of the unknowns due to the correlation of neighbouring image points.
 
 Least squares with weights of independent errors stays unbiased where the errors of a photograph are
 correlated, but is less precise than its cofactors say. With the influence Z of the errors e on the unknowns,
@@ -105,7 +105,7 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
 
 @dataclass(frozen=True)
 class CorrelatedPart:
-    """What the correlation of the errors adds to cofactors, in the datum of the influence."""
+    """Cofactors due to the correlation of the errors, in the datum of the influence."""
 
     influence: Influence
     correlation: ErrorCorrelation

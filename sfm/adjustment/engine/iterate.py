@@ -66,7 +66,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Problem:
-    """What stays the same over all steps and rounds of an adjustment."""
+    """Constants of all steps and rounds of an adjustment."""
 
     layout: Unknowns  # order of the unknowns
     weighted: Weighted  # observed unknowns

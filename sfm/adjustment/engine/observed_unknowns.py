@@ -44,7 +44,7 @@ class Weighted:
 
 @dataclass(frozen=True)
 class WeightedTerms:
-    """What the observed unknowns add to the normal equations N dx = -g, and to v'Pv."""
+    """Contribution of the observed unknowns to the normal equations N dx = -g, and to v'Pv."""
 
     exterior: FloatArray  # N of X0, w of each observed photograph, (e, 6, 6)
     exterior_g: FloatArray  # (e, 6)

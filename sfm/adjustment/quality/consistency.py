@@ -48,7 +48,7 @@ class Uneven:
 
 @dataclass(frozen=True)
 class Consistency:
-    """What the tests inside a result have found."""
+    """Results of the tests inside a result."""
 
     large: tuple[str, ...]  # points whose residuals are together larger than chance
     uneven: Uneven | None  # None where the photographs are alike

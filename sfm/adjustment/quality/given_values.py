@@ -300,7 +300,7 @@ class GivenModel:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is wrong of given values, if anything is."""
+    """Given values found wrong, if any."""
 
     statistic: float  # chi-square of all differences
     dof: int  # its degrees of freedom

@@ -164,7 +164,7 @@ def _dask_cluster() -> ModuleType | None:
 class InProcess:
     """Runs one piece of work after the other in this process, see sfm.runtime.executor.Engine.
 
-    What a call tells is passed on when it has returned.
+    Messages of a call are passed on when it has returned.
     """
 
     workers = 1

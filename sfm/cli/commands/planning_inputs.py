@@ -1,4 +1,4 @@
-"""What the commands of planning are given: object, camera, stations, and lists of numbers in one option.
+"""Input of the commands of planning: object, camera, stations, and lists of numbers in one option.
 
 Cameras by their sensor, for plans made before one is bought or calibrated; the lens comes on top.
 

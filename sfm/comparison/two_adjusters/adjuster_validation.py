@@ -44,7 +44,7 @@ WARM_UP_IMAGE_POINTS = 3000  # which are smaller than this
 
 
 class ValidationAdjustment(BackendAdjustment, Protocol):
-    """What the other adjuster must return, and why it stopped."""
+    """Result that the other adjuster must return, and why it stopped."""
 
     @property
     def message(self) -> str:
@@ -68,7 +68,7 @@ class ValidationBackend(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
 
     def adjust(self, network: Network, start: Estimate, *, control: bool) -> ValidationAdjustment:
         """Adjust with unit weights, control points held or the datum free."""

@@ -75,7 +75,7 @@ class AdjusterComparison:
 
     @property
     def gap(self) -> float:
-        """What v'Pv of the two differs by, in variances of an image coordinate."""
+        """Difference of v'Pv of the two, in variances of an image coordinate."""
         a, b = self.comparison.cost
         sigma = max(self.adjustment.sigma0 * self.adjustment.sigma_px, ROUNDING_PX)
         return 2 * abs(b - a) / sigma**2
@@ -89,7 +89,7 @@ class AdjusterComparison:
 
 
 class BackendAdjustment(Protocol):
-    """What another adjuster must return."""
+    """Result that another adjuster must return."""
 
     @property
     def estimate(self) -> Estimate:

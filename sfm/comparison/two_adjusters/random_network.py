@@ -40,7 +40,7 @@ START_FOCAL = 0.02  # relative error of free focal lengths at the start
 
 @dataclass(frozen=True)
 class Plan:
-    """What was drawn for one network."""
+    """Random choices of one network."""
 
     arrangement: str  # ring | hemisphere | strip | close pairs
     images: int  # photographs

@@ -396,7 +396,7 @@ def _sigma_of_distances(
 
 @dataclass(frozen=True)
 class Parameters:
-    """What the values of a shape are."""
+    """Names and kinds of the values of a shape."""
 
     names: tuple[str, ...]  # of each parameter: centre, direction, radius ...
     axes: tuple[str, ...]  # X, Y or Z of a vector, empty of a single number

@@ -35,7 +35,7 @@ BLUR_NOISE = (9.0 / 16.0, 1.0 / 16.0, 1.0 / 4.0, -1.0 / 2.0)
 
 
 class Workspace(NamedTuple):
-    """What all patches have in common, and the arrays in which one after another is worked on."""
+    """Settings of all patches, and the arrays in which each is worked on in turn."""
 
     half: int  # half the side of the window, px
     kind: int  # kernel of resampling

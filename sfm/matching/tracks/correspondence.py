@@ -123,7 +123,7 @@ def match_targets(
 
 @dataclass
 class _Search:
-    """What the rounds of the search share; `used` and `tracks` grow from round to round."""
+    """State shared by the rounds of the search; `used` and `tracks` grow from round to round."""
 
     scene: Scene
     photograph: IntArray  # of each target, (N,)

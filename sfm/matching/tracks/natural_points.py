@@ -1,4 +1,4 @@
-"""What is found of natural texture in one photograph alone, before any other is looked at."""
+"""Natural points of one photograph, found before any other photograph is read."""
 
 from __future__ import annotations
 

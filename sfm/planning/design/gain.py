@@ -1,4 +1,4 @@
-"""What a photograph adds to the points that it shows, the orientations of all photographs held.
+"""Gain of one more photograph for the points that it shows, the orientations of all photographs held.
 
 Each image point adds A'PA to the 3 x 3 normal matrix of its point, so that the gain of every candidate
 follows from updates of rank 2, without any system of equations: limiting error propagation.

@@ -1,1 +1,1 @@
-"""What a photograph of a plan shows: format, incidence, hidden points, depth of field, size of targets."""
+"""Visibility in a photograph of a plan: format, incidence, hidden points, depth of field, size of targets."""

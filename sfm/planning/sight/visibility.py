@@ -47,7 +47,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Seeing:
-    """What decides whether a point is seen, and how precisely."""
+    """Limits that decide whether a point is seen, and how precisely."""
 
     max_incidence_deg: float = MAX_INCIDENCE_DEG
     diameter: float | None = None  # of a target, object unit; None = any size is measured with `sigma_px`
@@ -70,7 +70,7 @@ class Seeing:
 
 @dataclass(frozen=True)
 class Sight:
-    """What m photographs show of n points."""
+    """Visibility of n points in m photographs."""
 
     why: AnyArray  # a Why of each, (m, n)
     xy: FloatArray  # where, px; NaN behind the camera, (m, n, 2)

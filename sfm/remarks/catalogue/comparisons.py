@@ -1,4 +1,4 @@
-"""What a comparison of two results or of two epochs finds."""
+"""Remarks on a comparison of two results or of two epochs."""
 
 from __future__ import annotations
 

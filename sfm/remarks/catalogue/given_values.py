@@ -1,4 +1,4 @@
-"""What is found of scale bars, control and observed orientation, and of the scale that they give."""
+"""Remarks on scale bars, control and observed orientation, and on the scale that they give."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an alternative hypothesis says if it wins over the assumptions of a survey."""
+"""Remarks on alternative hypotheses that win over the assumptions of a survey."""
 
 from __future__ import annotations
 

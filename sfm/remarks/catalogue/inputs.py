@@ -1,4 +1,4 @@
-"""What is wrong with the input of a survey and does not stop it."""
+"""Remarks on errors of the input that do not stop a survey."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What measuring a result finds: shapes, tolerances, and acceptance tests against calibrated lengths."""
+"""Remarks on measuring a result: shapes, tolerances, and acceptance tests against calibrated lengths."""
 
 from __future__ import annotations
 

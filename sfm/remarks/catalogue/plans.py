@@ -1,4 +1,4 @@
-"""What a planned network gives, and what limits it."""
+"""Remarks on a planned network, and on its limits."""
 
 from __future__ import annotations
 

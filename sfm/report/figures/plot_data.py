@@ -1,4 +1,4 @@
-"""What the plots of a report show: little of a result, without what finds or draws it."""
+"""Data for the plots of a report, apart from the code that finds or draws them."""
 
 from __future__ import annotations
 

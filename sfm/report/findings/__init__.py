@@ -1,4 +1,4 @@
-"""What is found in a result: every number of the reports, computed once.
+"""Findings of a result: every number of the reports, computed once.
 
 `findings_of` in `findings` is where to begin: it returns what all renderers print. The other modules each
 answer one question: how good the observations are (`checks`, `statistics`), how the network lies

@@ -43,7 +43,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a bundle report says besides the unknowns and their standard deviations."""
+    """Statistics of a bundle report besides the unknowns and their standard deviations."""
 
     global_tests: tuple[GlobalTest, ...]  # of all observations, or of each kind where there are several
     w: CoordinateTest  # Baarda's test of every image coordinate

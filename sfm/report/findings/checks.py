@@ -1,6 +1,6 @@
 """How well the observations agree with one another: residuals in standard deviations, checks at control.
 
-What a verdict rests on. Standard deviations are those stated before the adjustment; sigma0 tells by how
+The basis of a verdict. Standard deviations are those stated before the adjustment; sigma0 tells by how
 much they were wrong, and must not hide it.
 """
 

@@ -5,7 +5,7 @@ Whatever prints a result takes its numbers from here.
 
 The solution row by row: every object point and every photograph with precision, rays and residuals.
 
-What was rejected, and why: image points by the tests, candidates of the photographs by their looks.
+Rejections and their reasons: image points by the tests, candidates of the photographs by their looks.
 
 The comparison with the other adjuster: why they do not agree, and the precision of the points by both.
 """
@@ -234,7 +234,7 @@ class RejectedPoint:
 
 @dataclass(frozen=True)
 class Candidates:
-    """What was seen in a photograph, or in all of them."""
+    """Counts of candidates in a photograph, or in all of them."""
 
     image: str
     measured: int  # targets
@@ -292,7 +292,7 @@ class PointSigma:
 
 @dataclass(frozen=True)
 class ComparisonFindings:
-    """What the comparison with the other adjuster says."""
+    """Findings of the comparison with the other adjuster."""
 
     both: AdjusterComparison
     reasons: tuple[str, ...]  # why they do not agree, in words; empty if they do

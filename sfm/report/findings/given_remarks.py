@@ -1,7 +1,7 @@
 """Remarks on given values after the adjustment: residuals, checks, and whether the scale can be.
 
-What was given is judged by the image points alone before it takes part; these are the tests of what took
-part, and of what only checks the result. Given interior orientation is not tested here: whether it is wrong
+Given values are judged by the image points alone before they take part; these are the tests of those that
+took part, and of those that only check the result. Given interior orientation is not tested here: whether it is wrong
 is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object points.
 """
 

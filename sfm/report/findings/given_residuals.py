@@ -93,7 +93,7 @@ class GivenResiduals:
 
 @dataclass(frozen=True)
 class Given:
-    """What was given beside the photographs and took part; None of what was not."""
+    """Given values that took part beside the photographs; None for kinds without any."""
 
     control: GivenResiduals | None
     bars: GivenResiduals | None

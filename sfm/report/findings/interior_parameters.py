@@ -24,12 +24,12 @@ class InteriorParameter:
 
     @property
     def name(self) -> str:
-        """What the parameter is called."""
+        """Name of the parameter."""
         return self.parameter.name
 
     @property
     def unit(self) -> str:
-        """What it is measured in."""
+        """Unit of the parameter."""
         return self.parameter.unit
 
     @property

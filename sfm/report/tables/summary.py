@@ -1,6 +1,6 @@
 """summary.json: the figures of a result for programs.
 
-What summary.json says of the other adjuster and of the other pipeline.
+The parts of summary.json on the other adjuster and the other pipeline.
 """
 
 from __future__ import annotations

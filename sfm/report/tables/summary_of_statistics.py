@@ -1,4 +1,4 @@
-"""What summary.json says of the statistics of a result, and of what its observations contradict."""
+"""The parts of summary.json on the statistics of a result, and on contradictions of its observations."""
 
 from __future__ import annotations
 

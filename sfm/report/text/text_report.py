@@ -2,7 +2,7 @@
 
 Rank and datum, sigma0 and redundancy, tests, reliability, variance components, unknowns with their
 standard deviations, correlations, worst residuals. No dates and hosts, so that two reports can be compared.
-What it says stands in the template `report.txt`.
+Its text is in the template `report.txt`.
 
 Lines, headings and columns of the reports in plain text, as filters of templates.
 """

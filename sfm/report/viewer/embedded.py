@@ -40,7 +40,7 @@ NO_PICTURE = "no photograph was read for this page"
 
 @dataclass(frozen=True)
 class Viewer:
-    """What the template `viewer.html` asks for."""
+    """Values for the template `viewer.html`."""
 
     script: Markup  # to the letter, since the policy allows it by its hash
     style: Markup

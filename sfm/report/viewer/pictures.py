@@ -74,7 +74,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class _Cut:
-    """What is cut out of one photograph."""
+    """Pictures cut out of one photograph."""
 
     thumbnail: bytes
     view: bytes

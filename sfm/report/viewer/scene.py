@@ -38,7 +38,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Marks:
-    """What was seen in photographs and is not in the result."""
+    """Candidates seen in photographs that are not in the result."""
 
     photo: IntArray  # index of the photograph, in rising order, (c,)
     xy: FloatArray  # px, (c, 2)

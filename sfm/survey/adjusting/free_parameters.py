@@ -42,7 +42,7 @@ Chosen = list[set[str] | None]  # free parameters of each camera; None where the
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """What is adjusted of the cameras of a survey."""
+    """Free parameters of the cameras of a survey."""
 
     cameras: tuple[CameraSettings, ...]  # all of which say what is free, and of which c is observed
     estimate: Estimate  # with the same freed in its cameras; observed ones keep their values

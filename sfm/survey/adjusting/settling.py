@@ -38,7 +38,7 @@ CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it c
 
 @dataclass(frozen=True)
 class Task:
-    """What is adjusted and how."""
+    """An adjustment to be made, and its settings."""
 
     survey: Survey
     datum: Datum
@@ -67,7 +67,7 @@ class Settled:
 
     @property
     def part(self) -> Network:
-        """What was adjusted."""
+        """The network that was adjusted."""
         return self.adjustment.network
 
     @property

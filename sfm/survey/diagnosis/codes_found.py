@@ -1,4 +1,4 @@
-"""What is told where too few codes were read: what was found, and which other settings read more."""
+"""Remarks where too few codes were read: candidates found, and settings that read more."""
 
 from __future__ import annotations
 

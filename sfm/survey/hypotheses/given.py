@@ -1,6 +1,6 @@
 """Scale bars, control and observed projection centres, judged by the image points before they are used.
 
-What contradicts is left out where the others identify it, and named; where they do not, nothing that it
+A contradicting value is left out and named where the others identify it; where they do not, nothing that it
 touches is believed. The rest takes part in the adjustment.
 """
 
@@ -36,7 +36,7 @@ MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of mo
 
 @dataclass(frozen=True)
 class JudgedGiven:
-    """What may take part in the adjustment, and what was found of the rest."""
+    """Given values that may take part in the adjustment, and findings on the rest."""
 
     network: Network
     datum: Datum

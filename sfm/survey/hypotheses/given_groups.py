@@ -37,7 +37,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Task:
-    """What is judged, and how."""
+    """The values to be judged, and the test."""
 
     network: Network  # with all that was given
     places: Places
@@ -77,7 +77,7 @@ class Group:
 
     @property
     def found(self) -> Judgement:
-        """What is wrong of them."""
+        """The group of values found wrong."""
         return self.placed.judgement
 
     @property

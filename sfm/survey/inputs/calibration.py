@@ -60,7 +60,7 @@ class _Camera(Content):
 
 
 class _Summary(Content):
-    """What is read of summary.json."""
+    """The part of summary.json that is read."""
 
     cameras: Annotated[tuple[_Camera, ...], Field(min_length=1)]
 

@@ -1,4 +1,4 @@
-"""What was measured in the photographs of a survey: targets, natural texture, or given image points."""
+"""Measurements of the photographs of a survey: targets, natural texture, or given image points."""
 
 from __future__ import annotations
 

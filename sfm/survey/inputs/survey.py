@@ -79,7 +79,7 @@ class CameraSetup(CameraSettings):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Survey:
-    """What is to be measured and adjusted, and everything that is known beforehand.
+    """A survey: photographs to be measured and adjusted, and all values known beforehand.
 
     Photographs, or observations in place of them. Settings may be given as dictionaries in the words of the
     survey file: `targets={"codes": "ring14"}`.

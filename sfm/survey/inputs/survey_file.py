@@ -34,7 +34,7 @@ from sfm.targets.codes.families import is_table
 
 
 class SurveyFile(Section):
-    """What a survey file says; the tables that it names are not read yet."""
+    """Content of a survey file; the tables that it names are not read yet."""
 
     head: Head = Field(alias="survey")
     cameras: Annotated[
@@ -71,7 +71,7 @@ class SurveyFile(Section):
 
     @property
     def source(self) -> str:
-        """What messages call the survey."""
+        """Name of the survey in messages."""
         return str(self._path)
 
     @property

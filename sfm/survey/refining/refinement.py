@@ -136,7 +136,7 @@ class Refinement:
 
     @property
     def remarks(self) -> tuple[Remark, ...]:
-        """What to know before the model is used."""
+        """Remarks to read before the model is used."""
         own, remarks = self.adjustment, []
         if not own.converged:
             remarks.append(remark("not_converged", iterations=own.iterations))

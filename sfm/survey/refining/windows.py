@@ -42,7 +42,7 @@ class Size(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What is a match no more."""
+    """Limits beyond which a place is no match."""
 
     shift_px: float  # farther from the key point
     correlation: float  # below it a window is not alike

@@ -135,8 +135,8 @@ def _some_of(fits: EllipseFits, some: IntArray) -> EllipseFits:
 def sizes_apart(radius: FloatArray) -> list[IntArray]:
     """Return targets in classes of size, between which no others lie: letters and targets of one sheet.
 
-    What blur, sharpening and compression do to an outline depends on its size, and targets of one make differ
-    by perspective in all steps. Classes that are no population by themselves join the nearest one.
+    The effect of blur, sharpening and compression on an outline depends on its size, and targets of one make
+    differ by perspective in all steps. Classes that are no population by themselves join the nearest one.
 
     Args:
         radius: of the targets, px, shape (k,).

@@ -1,4 +1,4 @@
-"""What the normal equations may take of the memory of this computer, its container, or the process."""
+"""Memory that the normal equations may use, of this computer, its container, or the process."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from sfm.kernels.options import kernel
 
 
 class Eliminated(NamedTuple):
-    """What eliminating the own photographs of a front leaves of the factor."""
+    """Part of the factor left by eliminating the photographs of a front."""
 
     L: FloatArray  # of the own unknowns, lower triangle, (j, j)
     K: FloatArray  # rows of the other unknowns of the front, (r, j)

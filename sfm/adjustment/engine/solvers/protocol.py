@@ -1,4 +1,4 @@
-"""What a solver of the reduced normal equations does, whichever way the matrix is stored.
+"""Interface of the solvers of the reduced normal equations, whichever way the matrix is stored.
 
 The reduced normal matrix S of orientations and kept points is factored once for each step; its factor
 solves for the step and, at the optimum, gives the elements of S^-1 that covariances are made of.

@@ -87,7 +87,7 @@ def find_optimum(
 
 @dataclass
 class Run:
-    """What stays the same over the rounds of one adjustment, and the steps taken so far."""
+    """Constants of the rounds of one adjustment, and the steps taken so far."""
 
     problem: Problem
     method: str

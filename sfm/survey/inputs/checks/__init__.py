@@ -1,1 +1,1 @@
-"""What is wrong with the input: contradictions, repetitions and missing settings."""
+"""Checks of the input: contradictions, repetitions and missing settings."""

@@ -38,7 +38,7 @@ CALIBRATION_KEYS = {"calibration", "calibration_use"}
 
 
 class SurveySettings(Protocol):
-    """What a survey file and a survey with its tables have in common."""
+    """The common part of a survey file and a survey with its tables."""
 
     @property
     def name(self) -> str:
@@ -46,7 +46,7 @@ class SurveySettings(Protocol):
 
     @property
     def source(self) -> str:
-        """What messages call the survey."""
+        """Name of the survey in messages."""
 
     @property
     def folder(self) -> Path:
@@ -66,7 +66,7 @@ class SurveySettings(Protocol):
 
     @property
     def targets(self) -> TargetSettings:
-        """What targets look like."""
+        """Settings of the targets."""
 
     @property
     def codes(self) -> str:
@@ -78,7 +78,7 @@ class SurveySettings(Protocol):
 
     @property
     def datum(self) -> DatumSettings:
-        """What position, attitude and scale rest on."""
+        """Definition of position, attitude and scale."""
 
     @property
     def compare(self) -> CompareSettings:

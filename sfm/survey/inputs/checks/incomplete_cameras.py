@@ -1,4 +1,4 @@
-"""What neither survey nor photographs say of the cameras, all at once; pixels that are no squares."""
+"""Camera values that neither survey nor photographs state, listed together; pixels that are no squares."""
 
 from __future__ import annotations
 

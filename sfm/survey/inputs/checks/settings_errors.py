@@ -1,4 +1,4 @@
-"""What is wrong in a survey file, in one line: file, line, key, what was found and what was needed."""
+"""Errors in a survey file, in one line each: file, line, key, what was found and what was needed."""
 
 from __future__ import annotations
 
