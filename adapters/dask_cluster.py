@@ -40,7 +40,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
 from sfm.files.scratch import scratch_folder
-from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
+from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
 from sfm.runtime.folder_settings import closed_current_folder
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
@@ -68,7 +68,7 @@ NO_DIARY = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 60,
 }
-# Pages for a browser, which would tell anybody on this computer what is computed.
+# Pages for a browser, which would send anybody on this computer what is computed.
 NO_PAGES: dict[str, list[str]] = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -255,7 +255,7 @@ class DaskEngine:
             running[work.key] = futures
             futures[0].add_done_callback(lambda _, key=work.key: events.put(("done", key)))
 
-        self.client.subscribe_topic(run, lambda event: events.put(("told", event[1])))
+        self.client.subscribe_topic(run, lambda event: events.put(("sent", event[1])))
         someone = time.monotonic()
         try:
             while True:
@@ -268,8 +268,8 @@ class DaskEngine:
                 except queue.Empty:
                     someone = self._look(someone)
                     continue
-                if kind == "told":
-                    yield Told(what["key"], what["message"])
+                if kind == "sent":
+                    yield Sent(what["key"], what["message"])
                 else:
                     yield _event(what, running.pop(what)[0])
         finally:
@@ -316,13 +316,13 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
     """Run a call in a worker, its libraries held to one thread each."""
     worker = get_worker()
 
-    def tell(message: dict[str, Any]) -> None:
+    def send(message: dict[str, Any]) -> None:
         worker.log_event(topic, {"key": work, "message": message})
 
     more = () if parts is None else (parts,)
     try:
         with _HELD:
-            return call.function(*call.arguments, *more, tell=tell)
+            return call.function(*call.arguments, *more, send=send)
     finally:
         if parts is not None:
             gc.collect()  # figures are full of cycles, and Python is in no hurry: 1 MiB a survey

@@ -55,7 +55,7 @@ def run_survey(
         compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
         jobs: photographs measured at a time; as many as there are cores if not given.
         store: folder that keeps what was measured, so that a photograph is not measured twice.
-        progress: whether to draw a bar on a terminal, or what is told of stages and photographs.
+        progress: whether to draw a bar on a terminal, or what receives stages and photographs.
 
     Raises:
         KolinearError: the survey cannot be run; the message says what to do.
@@ -75,20 +75,20 @@ def run_survey(
     )
     with ExitStack() as stack:
         stack.enter_context(one_blas_thread())
-        told: Progress = SILENT
+        watching: Progress = SILENT
         if progress is True:
             from sfm.runtime.progress_bar import drawn_progress
 
-            told = stack.enter_context(drawn_progress())
+            watching = stack.enter_context(drawn_progress())
         elif progress is not False:
-            told = progress
+            watching = progress
         return run_stages(
             survey,
             images_dir=None if images is None else Path(images),
             jobs=jobs or cores(),
             others=others,
             store=None if store is None else MeasuredStore(Path(store)),
-            progress=told,
+            progress=watching,
         )
 
 
@@ -321,11 +321,11 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
     return others
 
 
-def sensor_widths(tell: Callable[[Remark], None]) -> Callable[[str, str], float | None]:
+def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float | None]:
     """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
 
     Args:
-        tell: is told of a camera that could not be looked up, as without pycolmap.
+        note: is watching of a camera that could not be looked up, as without pycolmap.
     """
     from adapters.colmap.sensor_widths import sensor_width_mm
 
@@ -333,7 +333,7 @@ def sensor_widths(tell: Callable[[Remark], None]) -> Callable[[str, str], float 
         try:
             return sensor_width_mm(make, model)
         except BackendError as error:
-            tell(remark("sensor_not_looked_up", camera=f"{make} {model}", reason=str(error)))
+            note(remark("sensor_not_looked_up", camera=f"{make} {model}", reason=str(error)))
             return None
 
     return width

@@ -1,4 +1,4 @@
-"""A network turned inside out in depth, which parallel rays cannot tell from itself.
+"""A network turned inside out in depth, which parallel rays cannot distinguish from itself.
 
 Source: Szeliski and Kang (1997), IEEE PAMI 19(5), for the reversal of depth.
 """

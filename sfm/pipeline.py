@@ -3,7 +3,7 @@
     given data, photographs -> targets -> orientation -> correspondences -> adjustment -> comparison -> result
 
 Every stage is one call, for coded targets, for natural texture and for given image points alike; what it
-does, and from which book, is told where it is written.
+does, and from which book, stands where it is written.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def run_survey(
         jobs: threads; photographs measured at a time.
         others: the programs to compare with.
         store: of what was measured, so that a photograph is not measured twice.
-        progress: told of stages and photographs.
+        progress: receives stages and photographs.
 
     Raises:
         KolinearError: the survey cannot be run; the message says what to do.

@@ -143,7 +143,7 @@ def main(progress: Progress = SILENT) -> None:
     """Compile all parts, as many at a time as there are cores.
 
     Args:
-        progress: told of every part that is done.
+        progress: receives every part that is done.
 
     Raises:
         KolinearError: a process was ended from outside.

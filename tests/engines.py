@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from sfm.batch.job import Comparers, SurveyRow
 from sfm.cli.commands.batching import InProcess
 from sfm.result import SurveyResult
-from sfm.runtime.executor import Tell
+from sfm.runtime.executor import Send
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import OtherPrograms
 
@@ -42,7 +42,7 @@ class Notes:
     def planned(self, names: Sequence[str]) -> None:
         self.names = names
 
-    def told(self, name: str, message: dict[str, Any]) -> None:
+    def received(self, name: str, message: dict[str, Any]) -> None:
         self.messages.append((name, message))
 
     def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
@@ -59,11 +59,11 @@ def no_others(survey: Survey) -> OtherPrograms:
     return OtherPrograms()
 
 
-def raise_unforeseen(*parts: object, tell: Tell) -> NoReturn:
+def raise_unforeseen(*parts: object, send: Send) -> NoReturn:
     raise ZeroDivisionError("nobody thought of it")
 
 
-def return_nothing(parts: object, *, tell: Tell) -> None:
+def return_nothing(parts: object, *, send: Send) -> None:
     return None
 
 

@@ -14,7 +14,7 @@ from sfm.cli.commands.batching import in_process_engine
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.kernels import warmed
 from sfm.remarks.remark import Remark
-from sfm.runtime.executor import Call, Done, Event, Lost, Tell, Told, Work
+from sfm.runtime.executor import Call, Done, Event, Lost, Send, Sent, Work
 from tests.surveys import write_observed_survey
 
 INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*'"
@@ -124,13 +124,13 @@ def test_a_camera_that_was_not_looked_up_is_told() -> None:
     assert one.names("reason") == (INSTALL_PYCOLMAP,)
 
 
-def double(value: int, *, tell: Tell) -> int:
-    tell({"photograph": str(value)})
+def double(value: int, *, send: Send) -> int:
+    send({"photograph": str(value)})
     return 2 * value
 
 
-def add(first: int, parts: list[int], *, tell: Tell) -> int:
-    tell({"stage": "sum"})
+def add(first: int, parts: list[int], *, send: Send) -> int:
+    send({"stage": "sum"})
     if first < 0:
         raise ZeroDivisionError("nobody thought of it")
     if not parts:
@@ -144,7 +144,7 @@ def test_the_engine_tells_in_order_and_one_fault_is_alone() -> None:
         with in_process_engine() as engine:
             return list(engine.run([work, Work("after", work.parts, Call(add, (0,)))], at_a_time=3))
 
-    told = [Told("w1", {"photograph": "2"}), Told("w1", {"photograph": "3"}), Told("w1", {"stage": "sum"})]
+    told = [Sent("w1", {"photograph": "2"}), Sent("w1", {"photograph": "3"}), Sent("w1", {"stage": "sum"})]
     assert events(1, 2, 3)[:4] == [*told, Done("w1", 11)]
     found = events(-1, 2)
     assert Lost("w-1", "it failed: ZeroDivisionError: nobody thought of it") in found

@@ -243,7 +243,7 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
     return config
 
 
-def told(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
     """What COLMAP says of an error, without the places in its own source and its own words for them.
 
     It repeats what files hold, whatever that is and however long.

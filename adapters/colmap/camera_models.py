@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from adapters.colmap.adjuster import load_pycolmap, quiet, told
+from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
@@ -86,7 +86,7 @@ def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
             reason = error.strerror or error
             raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason}") from error
         except (RuntimeError, ValueError) as error:
-            raise OutputError(f"{folder}: the COLMAP model cannot be written: {told(error)}") from error
+            raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason_of(error)}") from error
 
 
 def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
@@ -149,7 +149,7 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
         except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
             raise SurveyFileError(
                 f"{folder}: each file of the COLMAP model is in order, but they do not fit together "
-                f"({told(error)})"
+                f"({reason_of(error)})"
             ) from error
     for number, name in names_with_blanks(folder).items() if text else ():
         scene.image(number).name = name

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from adapters.colmap.adjuster import load_pycolmap, quiet, told
+from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import MAX_ID, MODELS
 from adapters.colmap.reconstruction import HALF_PIXEL, as_opencv, camera_of, colmap_camera
 from sfm.camera import Camera
@@ -76,7 +76,7 @@ def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) ->
             database.close()
         except (RuntimeError, ValueError) as error:
             refuse_full(part.parent)
-            raise OutputError(f"{path}: the database cannot be written: {told(error)}") from error
+            raise OutputError(f"{path}: the database cannot be written: {reason_of(error)}") from error
 
 
 def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:

@@ -1,7 +1,7 @@
 """The formats of other programs by name: which file is which, what each can hold, who reads and writes it.
 
 To add a format: write its module beside this one, with a reader, a writer or both, and give it a row in
-FORMATS; where its files can be told from others by their looks, say so in `format_of`.
+FORMATS; where its files can be distinguished from others by their looks, say so in `format_of`.
 
 Source: the module of each format names its own.
 """
@@ -369,7 +369,7 @@ def _write(form: FileFormat, path: Path, content: Content) -> None:
         form.write(path, content.result.network, content.result.estimate)
 
 
-def told_losses(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:
+def losses_in_words(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:
     """Return what there is of a survey and a format does not hold, a line for each kind.
 
     Args:

@@ -23,8 +23,8 @@ from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
-from sfm.runtime.executor import Tell
-from sfm.runtime.faults import is_fault, told_of_error
+from sfm.runtime.executor import Send
+from sfm.runtime.faults import error_in_words, is_fault
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
@@ -111,17 +111,17 @@ def lock_of(out: Path, folder: str) -> Path:
 
 
 def measure_one(
-    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, tell: Tell
+    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, send: Send
 ) -> MeasuredPhotograph:
     """Measure one photograph; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
     store = MeasuredStore.of_user()
     try:
-        with when_compiling(lambda: tell({"compiling": True})):
+        with when_compiling(lambda: send({"compiling": True})):
             note = _measure(survey, image, path, store)
     except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
-        note = PhotographNote(image, failed=as_plain(told_of_error(error)))
-    tell({"photograph": image})
+        note = PhotographNote(image, failed=as_plain(error_in_words(error)))
+    send({"photograph": image})
     return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
 
 
@@ -136,7 +136,7 @@ def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -
 
 
 def reconstruct(
-    job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, tell: Tell
+    job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, send: Send
 ) -> SurveyRow:
     """Run a survey whose photographs are measured, and write its result.
 
@@ -144,7 +144,7 @@ def reconstruct(
         job: the survey.
         comparers: what to compare it with.
         photographs: what came of its photographs.
-        tell: is told the stages.
+        send: receives the stages.
 
     Returns:
         Its row, with a reason if there is no result.
@@ -156,7 +156,7 @@ def reconstruct(
     _refuse_ended(job)
     name = job.folder
     live = job.out / LOGS / f"{job.folder}.jsonl"
-    with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
+    with SurveyLog(live, watch=_Sending(send)) as log, when_compiling(lambda: send({"compiling": True})):
         log.start(name, job.file, inputs=job.inputs)
         for photograph in photographs:
             log.note("photograph", **asdict(photograph.note))
@@ -183,7 +183,7 @@ def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
     Raises:
         OutputError: the log cannot be written.
     """
-    reason, fault = as_plain(told_of_error(error)), is_fault(error)
+    reason, fault = as_plain(error_in_words(error)), is_fault(error)
     trace = {"trace": traceback.format_exception(error)} if fault else {}
     log.note("failed", survey=row.survey, file=as_plain(row.file), reason=reason, **trace)
     if fault:
@@ -288,16 +288,16 @@ def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
 
 
 @dataclass(frozen=True)
-class _Telling:
+class _Sending:
     """Progress that tells whoever watches the batch which stage begins."""
 
-    tell: Tell
+    send: Send
 
     def stage(self, name: str, total: int | None = None) -> None:
-        self.tell({"stage": name})
+        self.send({"stage": name})
 
     def advance(self, step: str = "") -> None:
-        """Photographs are told where they are measured."""
+        """Photographs are reported where they are measured."""
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
         """A batch shows the stages only."""

@@ -18,7 +18,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import judge
 from sfm.report.html.page import render
 
-PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
+PAGES = ("batch.json", "batch.csv", "index.html")  # the first states whose they are
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:

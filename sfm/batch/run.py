@@ -1,4 +1,4 @@
-"""Many surveys in one go: run by an engine in other processes, continued after any end, told in tables.
+"""Many surveys in one go: run by an engine in other processes, continued after any end, reported in tables.
 
 A survey's folder appears whole or not at all and carries the fingerprint of what it was computed from. So
 what is finished can be read from the folders alone, whatever ended the run before.
@@ -40,7 +40,7 @@ from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
 from sfm.report.viewer.pictures import BUDGET_MB
-from sfm.runtime.executor import Call, Done, Engine, Lost, Told, Work
+from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
@@ -56,7 +56,7 @@ class Watch(Protocol):
     def planned(self, names: Sequence[str]) -> None:
         """These surveys are part of the batch, by the names of their folders."""
 
-    def told(self, name: str, message: dict[str, Any]) -> None:
+    def received(self, name: str, message: dict[str, Any]) -> None:
         """A survey has {"photographs": count}, begins {"stage": name}, has measured {"photograph": name}.
 
         Kernels that it needs may be {"compiling": True} first, in its worker.
@@ -96,7 +96,7 @@ def run_batch(
         out: folder of the batch; every survey gets a folder in it.
         engine: runs the work; it is entered here, since what workers leave can be cleared when they are gone.
         comparers: what the surveys are compared with.
-        watch: is told what happens.
+        watch: receives the events.
         resume: keep what an earlier run finished from the same inputs; else everything is run, and only
             what was measured in photographs is taken from an earlier run.
         allow_outside: whether survey files may name files outside their folders.
@@ -198,7 +198,7 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     """Return how many workers can be busy at a time, at least 1: the photographs and the surveys without."""
     calls = 0
     for file in files:
-        with suppress(Exception):  # what is wrong is told by the run
+        with suppress(Exception):  # what is wrong is reported by the run
             survey = read_survey_file(file, allow_outside=allow_outside)
             calls += len(find_photographs(survey)) if survey.observations is None else 1
     return max(1, calls)
@@ -227,7 +227,7 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     plans = []
     for (file, survey), name in zip(read, names, strict=True):
         reserved = name.casefold() in (LOGS, MANIFEST, *PAGES)
-        if often[name.casefold()] > 1 or reserved:  # told apart by what stays the same from run to run
+        if often[name.casefold()] > 1 or reserved:  # distinguished by what stays the same from run to run
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
         plans.append(_Plan(file, name, survey))
     return tuple(plans)
@@ -287,23 +287,23 @@ def _run(
                 finish(plan.folder, earlier, kept=True)
                 continue
             work = works[plan.folder]
-            watch.told(plan.folder, {"photographs": len(work.parts)})
+            watch.received(plan.folder, {"photographs": len(work.parts)})
             yield work
 
     suspects: list[Lost] = []
     for event in engine.run(begin(), at_a_time=engine.workers + 1):
-        if isinstance(event, Told):
-            watch.told(event.key, event.message)
+        if isinstance(event, Sent):
+            watch.received(event.key, event.message)
         elif isinstance(event, Done):
             finish(event.key, event.value)
         else:
-            watch.told(event.key, {"stage": "waiting for a second try, alone"})
+            watch.received(event.key, {"stage": "waiting for a second try, alone"})
             suspects.append(event)
     by_name = {plan.folder: plan for plan in plans}
     for suspect in suspects:
         for event in engine.run([works[suspect.key]], at_a_time=1):
-            if isinstance(event, Told):
-                watch.told(event.key, event.message)
+            if isinstance(event, Sent):
+                watch.received(event.key, event.message)
             elif isinstance(event, Done):
                 finish(event.key, event.value)
             else:

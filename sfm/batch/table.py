@@ -67,7 +67,7 @@ class BatchTable:
         """Begin: so many surveys are to be run."""
         self._left, self._begun = len(names), time.monotonic()
 
-    def told(self, name: str, message: dict[str, Any]) -> None:
+    def received(self, name: str, message: dict[str, Any]) -> None:
         """Note what a survey is at."""
         line = self._lines.setdefault(name, _Line())
         if "photographs" in message:
@@ -95,7 +95,9 @@ class BatchTable:
         self._kept += kept
         self._recent = [*self._recent, row][-RECENT:]
         if (not self._console.is_terminal or self._verbose) and not kept:
-            self._console.print(Text(f"{name}: {told_of(row)}", style=COLOURS[row.verdict]), soft_wrap=True)
+            self._console.print(
+                Text(f"{name}: {outcome_of(row)}", style=COLOURS[row.verdict]), soft_wrap=True
+            )
 
     def remark(self, text: str) -> None:
         """Print a remark above the table."""
@@ -110,7 +112,7 @@ class BatchTable:
         for row in self._recent:
             style = COLOURS[row.verdict]
             table.add_row(
-                Text(row.folder, style=style), Text(told_of(row), style=style), "", f"{row.seconds:.1f}"
+                Text(row.folder, style=style), Text(outcome_of(row), style=style), "", f"{row.seconds:.1f}"
             )
         for name, line in list(self._lines.items()):
             count = f"{line.photographs} of {line.total}" if line.total else ""
@@ -130,7 +132,7 @@ class BatchTable:
         return text
 
 
-def told_of(row: SurveyRow) -> str:
+def outcome_of(row: SurveyRow) -> str:
     """Return how a survey ended, in a few words."""
     if row.status != "done":
         return f"{row.status}: {row.reason}"
@@ -146,7 +148,7 @@ def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None
     console.print(Text(", ".join(parts), "bold"))
     for row in rows:
         if not row.succeeded:
-            told = told_of(row) if row.status != "done" else f"{told_of(row)}: see its report"
+            told = outcome_of(row) if row.status != "done" else f"{outcome_of(row)}: see its report"
             where = "" if row.reason.startswith(row.file) else f" ({row.file})"  # not twice
             console.print(Text(f"  {row.survey}{where}: {told}", style="red"), soft_wrap=True)
     console.print(Text(f"Index: {page}", style="bold"), soft_wrap=True)

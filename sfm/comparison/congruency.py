@@ -7,8 +7,9 @@ are taken as stable,
 
 G being the translations, small rotations and, where the scale is not defined by both, the scale of the whole.
 Whatever the datum of either solution fixes or leaves undefined drops out. Under no change
-Omega = d' Q_S^+ d over F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F where the variances are
-estimated. The point whose removal from F lowers Omega most is taken to have moved, until the rest agrees.
+Omega = d' Q_S^+ d over F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F
+where the variances are estimated. The point whose removal from F lowers Omega most is taken to have moved,
+until the rest agrees.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Pelzer (1971), Zur
 Analyse geodaetischer Deformationsmessungen; Baarda (1973), S-transformations and criterion matrices.

@@ -214,7 +214,7 @@ def _points_by_image_points(
 
 
 def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Similarity | None:
-    """Return a_from_b by what is paired so far, or as they are if they coincide; None where nothing tells."""
+    """Return a_from_b by what is paired so far, or as they are if they coincide; None where neither holds."""
     for pairs, ours, theirs in (
         (points, a.estimate.points, b.estimate.points),
         (images, a.estimate.position, b.estimate.position),

@@ -49,7 +49,7 @@ class Comparison:
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """Differences larger than those of two solutions of one optimum, in words; empty if there are none."""
+        """Differences larger than those of two solutions of one optimum, in words; empty without."""
         return tuple(
             f"{what} differs by {value:.2g} of its standard deviation, {SAME_SIGMAS:g} is allowed"
             for what, value in self.sigmas

@@ -1,4 +1,4 @@
-"""Motion and strain of groups of points: a block that tilted is told from one that changed its shape.
+"""Motion and strain of groups of points: a block that tilted is separated from one that changed its shape.
 
 The displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c,
 small rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the

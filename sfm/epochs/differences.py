@@ -131,7 +131,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
 
 
 def _of_own_photographs(result: Solution, prefix: str) -> Solution:
-    """Return a result whose photographs are told from those of another epoch, which may bear their names."""
+    """Return a result whose photographs have other names than those of another epoch."""
     names = tuple(f"{prefix}/{name}" for name in result.network.images)
     return replace(result, network=replace(result.network, images=names))
 

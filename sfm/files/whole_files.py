@@ -50,7 +50,7 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
         OutputError: the folder cannot be written; nothing is left of it then.
     """
     refuse_foreign_folder(out)
-    with _new_folder(out, what) as part, _told_of(out, part.path, what):
+    with _new_folder(out, what) as part, _naming_disk_errors(out, part.path, what):
         part.path.chmod(0o755)  # it was made for the user alone
         yield part.path
         if replaceable:
@@ -80,7 +80,7 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
     """
     if not replaces:
         refuse_existing(path)
-    with _new_folder(path, what) as part, _told_of(path, part.path / path.name, what):
+    with _new_folder(path, what) as part, _naming_disk_errors(path, part.path / path.name, what):
         yield part.path / path.name
         _sync(part.path / path.name)
         if not replaces:
@@ -104,7 +104,7 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
     Raises:
         OutputError: they cannot be written, or files of these names are there that Kolinear has not written.
     """
-    with _new_folder(folder / MANIFEST, what) as part, _told_of(folder, part.path, what):
+    with _new_folder(folder / MANIFEST, what) as part, _naming_disk_errors(folder, part.path, what):
         yield part.path
         names = names_below(part.path)
         refuse_foreign_files(folder, names)
@@ -170,7 +170,7 @@ def remove_leftovers(out: Path) -> None:
 def refuse_full(folder: Path) -> None:
     """Raise the OSError that a megabyte more in a folder meets, if any: full disk, limit of size or quota.
 
-    Libraries tell that they could not write, but not why.
+    Libraries report that they could not write, but not why.
     """
     with tempfile.TemporaryFile(dir=folder) as file:
         file.write(bytes(ROOM_BYTES))
@@ -211,7 +211,7 @@ def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
 
 
 @contextmanager
-def _told_of(out: Path, part: Path, what: str) -> Iterator[None]:
+def _naming_disk_errors(out: Path, part: Path, what: str) -> Iterator[None]:
     """Let errors speak of `out`, not of a part of it that nobody will find."""
     try:
         yield

@@ -19,24 +19,24 @@ COMPILING = (
 
 
 @contextmanager
-def when_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` when the first kernel of this program is compiled, in any thread of this process."""
-    with install_listener("numba:compile", _First(tell)):
+def when_compiling(send: Callable[[], None]) -> Iterator[None]:
+    """Call `send` when the first kernel of this program is compiled, in any thread of this process."""
+    with install_listener("numba:compile", _First(send)):
         yield
 
 
 class _First(Listener):
     """Hears of every kernel, tells of the first."""
 
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self._tell: Callable[[], None] | None = tell
+    def __init__(self, send: Callable[[], None]) -> None:
+        self._send: Callable[[], None] | None = send
 
     def on_start(self, event: Event) -> None:
         """A function is compiled; those of numba and other libraries do not count."""
         module = event.data["dispatcher"].py_func.__module__ or ""  # none for what numba itself writes
-        if self._tell is not None and module.startswith("sfm."):
-            tell, self._tell = self._tell, None
-            tell()
+        if self._send is not None and module.startswith("sfm."):
+            send, self._send = self._send, None
+            send()
 
     def on_end(self, event: Event) -> None:
         """Nothing is told of the end."""

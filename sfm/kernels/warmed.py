@@ -24,7 +24,7 @@ def is_warm() -> bool:
 
 
 def set_warm() -> None:
-    """Remember that it has, and forget earlier ones; a folder that cannot be written is told each time."""
+    """Remember that it has, and forget earlier ones; report a folder that cannot be written."""
     folder = _folder()
     with suppress(OSError):
         if folder == KEPT:

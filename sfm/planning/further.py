@@ -29,7 +29,7 @@ from sfm.runtime.progress import report_step
 
 DISTANCES = (0.8, 1.2)  # of those that the survey was photographed from
 ROOM = 0.25  # by which the box around its stations may be left, of its size
-WEAKEST = 10  # points that are told of
+WEAKEST = 10  # points that are listed
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
     sigma = q S sigma_image / sqrt(k)
 
-with the mean scale number S, k photographs from each station, and q that tells how strong the network is.
+with the mean scale number S, k photographs from each station, and q that states how strong the network is.
 
 Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
 Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.

@@ -190,8 +190,8 @@ def rolled_share(rotation: FloatArray) -> float:
 def _contribution(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
     """Return what the uncertainty of the interior orientation does to the angles between rays, RMS, px.
 
-    A principal point that is off by little and a camera that is turned by as much cannot be told apart, and
-    need not be: a rotation of the camera is taken off.
+    A principal point that is off by little and a camera that is turned by as much cannot be distinguished,
+    and need not be: a rotation of the camera is taken off.
     """
     some = xy[:: 1 + len(xy) // MAX_PLACES]
     Q = projection_covariance(camera, covariance, some, some)

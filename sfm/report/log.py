@@ -46,7 +46,7 @@ class SurveyLog:
         Args:
             path: its file, if it is to have one; an earlier log there is replaced or appended to.
             append: whether it is appended to.
-            watch: is told the same.
+            watch: receives the same.
 
         Raises:
             OutputError: the file cannot be written, or is something else than a log.
@@ -108,7 +108,7 @@ class SurveyLog:
                 raise OutputError(f"{self._path}: the log cannot be written: {error.strerror}") from error
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Write down the stage that ends with this one; a second call for a stage tells its total."""
+        """Write down the stage that ends with this one; a second call for a stage gives its total."""
         self._watch.stage(name, total)
         if name == self._stage:
             return

@@ -82,7 +82,7 @@ def write_result(
         finish: is given the folder when all else is in it, and may add log.jsonl.
         jobs: photographs drawn at the same time.
         budget_mb: what the pictures inside report.html may take, 10^6 bytes.
-        progress: is told of every photograph.
+        progress: called for every photograph.
         plot_process: draws the plots meanwhile; without it they are drawn here.
 
     Returns:

@@ -19,7 +19,7 @@ from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
 NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that 95 % of its errors are within
-MAX_BINS = 12  # numbers of rays that are told one by one
+MAX_BINS = 12  # numbers of rays that are listed one by one
 
 
 def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:

@@ -44,7 +44,7 @@ SHOTS = (
         "coded",
     ),
 )
-NAMED = 12  # weak points that are told
+NAMED = 12  # weak points that are listed
 
 
 def write_plan(plan: Plan, out: Path) -> Path:

@@ -1,7 +1,7 @@
 """Engine: what a batch needs of whoever spreads its work over processes and computers.
 
 A piece of work has parts, which run side by side anywhere, and a whole, which is called with what the parts
-returned. Functions are called with a further keyword `tell`, by which they report while they work.
+returned. Functions are called with a further keyword `send`, with which they report while they work.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-Tell = Callable[[dict[str, Any]], None]  # takes plain values only: text, numbers, lists
+Send = Callable[[dict[str, Any]], None]  # takes plain values only: text, numbers, lists
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Told:
+class Sent:
     """A function at work said something."""
 
     key: str
@@ -54,7 +54,7 @@ class Lost:
     reason: str  # one line
 
 
-Event = Told | Done | Lost
+Event = Sent | Done | Lost
 
 
 class Engine(Protocol):

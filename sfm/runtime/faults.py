@@ -42,7 +42,7 @@ def is_fault(error: Exception) -> bool:
     return not (isinstance(error, KolinearError | OSError) or _is_out_of_memory(error))
 
 
-def told_of_error(error: Exception) -> str:
+def error_in_words(error: Exception) -> str:
     """Return an error in one line; of a fault where it is, of missing memory what was too large."""
     if isinstance(error, KolinearError | OSError):
         return str(error)
@@ -60,7 +60,7 @@ def told_of_error(error: Exception) -> str:
 
 def ending_of(error: Exception) -> tuple[str, int]:
     """Return the line that a program ends with, and its exit code; the traceback of a fault is kept."""
-    told = told_of_error(error)
+    told = error_in_words(error)
     if not is_fault(error):
         return told, BAD_INPUT
     path = keep_traceback(error)

@@ -1,4 +1,4 @@
-"""Progress: how a long run tells whoever watches which stage it is in and how far it got.
+"""Progress: how a long run reports its stage and its share done.
 
 Functions deep in a stage that know what they do, and of how many parts how many are done, call `report_step`.
 Whoever watches the stage is found by the context that `StageClock` sets, so that no call in between passes it

@@ -42,7 +42,7 @@ class Drawn:
         self._task: TaskID | None = None
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a line for the stage; a second call for the same stage tells its total."""
+        """Begin a line for the stage; a second call for the same stage gives its total."""
         if self._task is not None:
             task = self._bar.tasks[-1]
             if task.description == name:

@@ -1,6 +1,6 @@
 """The result of a survey, put together from what its stages returned.
 
-The settings that a survey was run with, as its report tells them.
+The settings that a survey was run with, as its report lists them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
-        settings=told_settings(survey),
+        settings=settings_by_table(survey),
         given_tests=solution.given_tests,
         other_solutions=solution.others,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
@@ -102,7 +102,7 @@ def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
     )
 
 
-def told_settings(survey: Survey) -> tuple[tuple[str, str], ...]:
+def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
     """Return (table of the survey file, its keys and values) of all that was stated or has a default.
 
     Args:

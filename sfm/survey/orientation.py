@@ -1,4 +1,4 @@
-"""The orientation of a survey, and what is told where there is none."""
+"""The orientation of a survey, and the remarks where there is none."""
 
 from __future__ import annotations
 

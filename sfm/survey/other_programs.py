@@ -48,7 +48,7 @@ def compare_solution(
     """Compare a solution with those of other programs.
 
     The survey stands without them: one that refuses is a warning in the result and does not lose it. A
-    library that is not installed is told without a warning's weight, since it says nothing of the survey.
+    library that is not installed is reported without a warning's weight, since it says nothing of the survey.
 
     Args:
         solution: of the survey.

@@ -271,12 +271,12 @@ def test_a_worker_whose_run_is_over_writes_nothing(
         locked(out / LOCK),
         pytest.raises(OutputError, match="the run that asked for survey third is over"),
     ):
-        reconstruct(job, ALONE, [], tell=lambda _: None)
+        reconstruct(job, ALONE, [], send=lambda _: None)
     assert not (out / "logs").exists()
     owners = iter([job.owner, None])  # it ends while the survey is computed
     monkeypatch.setattr("sfm.batch.job.owner_of", lambda _: next(owners))
     with pytest.raises(OutputError, match="the run that asked for survey third is over"):
-        reconstruct(job, ALONE, [], tell=lambda _: None)
+        reconstruct(job, ALONE, [], send=lambda _: None)
     assert {path.name for path in out.iterdir()} == {"logs"}
 
 

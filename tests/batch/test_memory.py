@@ -15,7 +15,7 @@ import pytest
 
 from adapters.dask_cluster import DaskEngine, local_engine
 from sfm.batch.job import SurveyJob, reconstruct
-from sfm.runtime.executor import Call, Done, Tell, Work
+from sfm.runtime.executor import Call, Done, Send, Work
 from sfm.runtime.progress import SILENT, StageClock
 from tests.engines import ALONE
 from tests.surveys import write_observed_survey
@@ -38,12 +38,12 @@ def test_surveys_leave_nothing_behind(tmp_path: Path, plots: None) -> None:
     for k in range(3):
         file = write_observed_survey(tmp_path / f"s{k}", f"s{k}")
         job = SurveyJob(file, tmp_path / "out", f"s{k}", "inputs", allow_outside=False, owner=None)
-        assert reconstruct(job, ALONE, [], tell=lambda _: None).status == "done"
+        assert reconstruct(job, ALONE, [], send=lambda _: None).status == "done"
         held.append(_own_objects())
     assert held[2] - held[1] == Counter()
 
 
-def _wander(parts: list[object], *, tell: Tell) -> int:
+def _wander(parts: list[object], *, send: Send) -> int:
     """Work for a quarter of a second at ever new depths; return the blocks of memory that Python holds."""
 
     def deeper(left: int) -> None:
@@ -60,7 +60,7 @@ def _wander(parts: list[object], *, tell: Tell) -> int:
     return sys.getallocatedblocks()
 
 
-def _nothing(parts: list[object], *, tell: Tell) -> None:
+def _nothing(parts: list[object], *, send: Send) -> None:
     """Return at once."""
 
 

@@ -30,18 +30,18 @@ def test_stage_photographs_and_time_left_are_seen(clock: list[float]) -> None:
     table = BatchTable(Console(file=io.StringIO(), force_terminal=True))
     table.planned(["a", "b"])
     assert "0 of 2 surveys" in seen(table) and "left" not in seen(table)
-    table.told("a", {"photographs": 4})
+    table.received("a", {"photographs": 4})
     clock[0] += 5  # no worker has time for it, and its own has not begun
     line = next(line for line in seen(table).splitlines() if line.startswith("a "))
     assert line.split() == ["a", "waiting", "0", "of", "4"]
     clock[0] -= 5
-    table.told("a", {"photograph": "1.jpg"})
+    table.received("a", {"photograph": "1.jpg"})
     assert "targets" in seen(table)
-    table.told("a", {"photograph": "2.jpg"})
+    table.received("a", {"photograph": "2.jpg"})
     clock[0] += 10
     # Half of its photographs are a quarter of one survey of two: an eighth of the batch took 10 s.
     assert "about 1 min 10 s left" in seen(table)
-    table.told("a", {"stage": "adjustment"})
+    table.received("a", {"stage": "adjustment"})
     line = next(line for line in seen(table).splitlines() if line.startswith("a "))
     assert line.split() == ["a", "adjustment", "2", "of", "4", "10"]
     table.finished("a", SurveyRow("plate", "a.toml", "a", "done", "good", 0.05, 0.04, 4, 4, 9), kept=False)
@@ -56,5 +56,5 @@ def test_compiling_is_told_once(clock: list[float]) -> None:
     table = BatchTable(Console(file=file, width=200))
     table.planned(["a", "b"])
     for name in ("a", "b"):
-        table.told(name, {"compiling": True})
+        table.received(name, {"compiling": True})
     assert file.getvalue().count("kernels are compiled first") == 1

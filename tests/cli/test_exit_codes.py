@@ -18,7 +18,7 @@ from sfm.cli.app import app
 from sfm.cli.commands import starting
 from sfm.errors import KolinearError
 from sfm.report.log import read_log
-from sfm.runtime.faults import is_fault, told_of_error, working_on
+from sfm.runtime.faults import error_in_words, is_fault, working_on
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -148,7 +148,7 @@ def test_memory_that_opencv_does_not_get_is_no_fault() -> None:
     refused.code = -4
     with pytest.raises(cv2.error) as caught, working_on("photograph a"):
         raise refused
-    assert told_of_error(caught.value).startswith("not enough memory for photograph a (OpenCV")
+    assert error_in_words(caught.value).startswith("not enough memory for photograph a (OpenCV")
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_memory_that_opencv_does_not_get_is_no_fault() -> None:
     ],
 )
 def test_libraries_and_threads_without_memory_are_no_fault(refused: Exception) -> None:
-    assert told_of_error(refused) == f"not enough memory ({refused})" and not is_fault(refused)
+    assert error_in_words(refused) == f"not enough memory ({refused})" and not is_fault(refused)
     with pytest.raises(RuntimeError) as caught:
         try:
             raise refused
@@ -180,7 +180,7 @@ def test_a_limit_of_memory_ends_in_one_line() -> None:
 def test_errors_of_kolinear_are_told_as_they_are() -> None:
     with pytest.raises(KolinearError) as caught, working_on("photograph a"):
         raise KolinearError("what was needed")
-    assert told_of_error(caught.value) == "what was needed" and not hasattr(caught.value, "__notes__")
+    assert error_in_words(caught.value) == "what was needed" and not hasattr(caught.value, "__notes__")
 
 
 @pytest.mark.parametrize(

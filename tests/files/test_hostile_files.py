@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters.colmap.adjuster import told
+from adapters.colmap.adjuster import reason_of
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.formats.metashape import read_metashape, write_metashape
@@ -311,7 +311,7 @@ def test_one_row_over_very_many_lines_is_refused(tmp_path: Path) -> None:
 def test_what_colmap_says_of_a_file_is_cut_and_plain() -> None:
     """It repeats what the file holds."""
     assert (
-        told(RuntimeError("Unknown value: \u202e" + "M" * 10_000))
+        reason_of(RuntimeError("Unknown value: \u202e" + "M" * 10_000))
         == "Unknown value: \\u202e" + "M" * 184 + "..."
     )
 

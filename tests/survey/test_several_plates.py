@@ -19,7 +19,7 @@ from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
-from sfm.survey.assembly import told_settings
+from sfm.survey.assembly import settings_by_table
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import Naming
@@ -161,7 +161,7 @@ def test_a_further_plate_is_as_true_as_the_first(tmp_path: Path) -> None:
     (first, second) = bars("plate_sigma = 0.01", list(range(80, 128)))
     assert first[3] == pytest.approx(0.01 * np.sqrt(2)) == second[3]
     assert bars("", [80]) == [] and len(bars("", [80, 81])) == 2 and len(bars("", [80, 89])) == 1  # across
-    assert [name for name, _ in told_settings(two_plates(tmp_path))][1:3] == ["targets", "plate 2"]
+    assert [name for name, _ in settings_by_table(two_plates(tmp_path))][1:3] == ["targets", "plate 2"]
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Image points of a network in the order that the compiled kernels go through them.
 
 Object points are eliminated one by one, so image points are stored object point by object point, photographs
-ascending; the derivatives are taken photograph by photograph, for which an index tells their places.
+ascending; the derivatives are taken photograph by photograph, for which an index gives their places.
 """
 
 from __future__ import annotations

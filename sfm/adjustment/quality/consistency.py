@@ -8,9 +8,10 @@ Source: Bartlett (1937), Proc. R. Soc. A 160; Luhmann et al., Close-Range Photog
 
 Rejected rays for which another ray of the same point could have been rejected just as well.
 
-Of three rays two always nearly meet: which one is wrong is told by what remains along the epipolar line, and
-data snooping blames the wrong one in a quarter of such points with an error of ten standard deviations. Both
-explanations are compared by what they leave; where they differ by less than chance, the point is doubtful.
+Of three rays two always nearly meet: which one is wrong is decided by what remains along the epipolar line,
+and data snooping blames the wrong one in a quarter of such points with an error of ten standard deviations.
+Both explanations are compared by what they leave; where they differ by less than chance, the point is
+doubtful.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (separability of alternative
 hypotheses).

@@ -27,7 +27,7 @@ from sfm.distributions import f_sf
 from sfm.units import SWELLING
 
 LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
-MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
+MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be distinguished from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
 MIN_LEAD = log(100)  # of ln likelihood, below which two alternatives cannot be separated
 # An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does
@@ -94,8 +94,8 @@ class Kept:
         """Return what parameters beside those of the model would explain, by the score test.
 
         Args:
-            columns: derivatives of the differences by them, none of them 0, (m, q). What cannot be told from
-                the parameters of the model explains nothing.
+            columns: derivatives of the differences by them, none of them 0, (m, q). What cannot be
+                distinguished from the parameters of the model explains nothing.
 
         Source: Rao (1948), Math. Proc. Camb. Phil. Soc. 44(1) (score test).
         """

@@ -94,7 +94,7 @@ def words_of_motions(optimum: Optimum, layout: Unknowns) -> str:
     """Return the motions that the observations leave open: "shift along X and Y, rotation about Z, scale".
 
     A rotation about an axis that does not run through the centre of the points is a rotation here, the shift
-    that goes with it is not told.
+    that goes with it is not reported.
     """
     sound = optimum.equations.blocks.held == 0  # other points do not move as the motions do
     d = optimum.motions.defect

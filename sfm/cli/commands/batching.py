@@ -31,7 +31,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import MissingLibraryError, one_line
-from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Told, Work
+from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 
 INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
@@ -94,7 +94,7 @@ def batch(
         partial(calls_of, files, allow_outside=allow_outside),
         jobs=jobs,
         cluster=cluster,
-        tell=partial(print, file=sys.stderr),
+        send=partial(print, file=sys.stderr),
     )
     with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
@@ -122,7 +122,7 @@ def _others_of_worker(survey: Survey) -> OtherPrograms:
 
 
 def batch_engine(
-    busy: Callable[[], int], *, jobs: int | None, cluster: str | None, tell: Callable[[str], None]
+    busy: Callable[[], int], *, jobs: int | None, cluster: str | None, send: Callable[[str], None]
 ) -> AbstractContextManager[Engine]:
     """Return the engine of a batch.
 
@@ -130,7 +130,7 @@ def batch_engine(
         busy: returns how many calls can run at a time at most; more workers would wait for nothing.
         jobs: workers on this computer; as many as it bears if not given.
         cluster: address of a Dask scheduler in place of them.
-        tell: is told in one line that surveys run one after the other, and why.
+        send: receives one line where surveys run one after the other, and why.
 
     Raises:
         MissingLibraryError: a scheduler is asked for, and Dask is not installed.
@@ -140,7 +140,7 @@ def batch_engine(
     if dask is None:
         if cluster is not None:
             raise MissingLibraryError(f"--cluster {cluster}: Dask is not installed: {INSTALL_DASK}")
-        tell(f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}")
+        send(f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}")
         return in_process_engine()
     engine: AbstractContextManager[Engine]
     if cluster is not None:
@@ -180,7 +180,7 @@ class InProcess:
                 parts = []
                 for part in work.parts:
                     value, said = _called(part)
-                    yield from (Told(work.key, message) for message in said)
+                    yield from (Sent(work.key, message) for message in said)
                     parts.append(value)
                 value, said = _called(work.whole, parts)
             except KolinearError:
@@ -188,7 +188,7 @@ class InProcess:
             except Exception as error:
                 yield Lost(work.key, f"it failed: {type(error).__name__}: {one_line(error)}")
                 continue
-            yield from (Told(work.key, message) for message in said)
+            yield from (Sent(work.key, message) for message in said)
             yield Done(work.key, value)
 
 
@@ -205,4 +205,4 @@ def _called(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:
     """
     said: list[dict[str, Any]] = []
     with threadpool_limits(limits=1):
-        return call.function(*call.arguments, *more, tell=said.append), said
+        return call.function(*call.arguments, *more, send=said.append), said

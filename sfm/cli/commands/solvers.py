@@ -144,9 +144,9 @@ def convert(
             ENDINGS,
             FORMATS,
             format_named,
+            losses_in_words,
             read_content,
             refuse_taken,
-            told_losses,
             write_content,
             written,
         )
@@ -184,5 +184,5 @@ def convert(
     for note in content.notes:
         print(f"{source}: {note}")
     print(f"{target}: {written(form.name, network, estimate)} as {form.name}")
-    for loss in told_losses(form.name, content, gone):
+    for loss in losses_in_words(form.name, content, gone):
         print(f"{target}: {loss} left out, format {form.name} has no place for them")

@@ -249,7 +249,7 @@ def _run_survey(
     if not overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
     if from_photographs:
-        find_photographs(survey, images_dir=images)  # a wrong folder is told before anything is compiled
+        find_photographs(survey, images_dir=images)  # a wrong folder is reported before anything is compiled
     compile_first()
     jobs = jobs or cores()
     workers = jobs if from_photographs else 1

@@ -134,7 +134,7 @@ def validate(
         networks: how many.
         seed: of the random networks; network k is the same for any number of networks.
         jobs: processes at work, each on one thread.
-        progress: told of every network.
+        progress: receives every network.
     """
     progress.stage("networks", networks)
     trials = []

@@ -49,7 +49,7 @@ class ShapeFit:
     used: BoolArray  # which of them a robust fit has kept, (m,)
     parameters: Parameters  # names, values and what they are
     function: Function  # the parameters by the coordinates of its points
-    covariance: FloatArray  # of the parameters, (p, p); NaN where nothing tells
+    covariance: FloatArray  # of the parameters, (p, p); NaN where nothing determines
     from_residuals: (
         bool  # whether the covariance comes from the residuals, since that of the points is not known
     )

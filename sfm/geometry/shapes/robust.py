@@ -49,7 +49,7 @@ def robust_shape(
         placed: whether the origin may stand anywhere along the axis.
 
     Raises:
-        GeometryError: too few points to tell the good ones from the others.
+        GeometryError: too few points to separate the good ones from the others.
     """
     n, size = len(xyz), kind.min_points + MORE_POINTS
     if n < size + 1:

@@ -78,7 +78,7 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
     Args:
         result: the result; its photographs are read again from their files.
         jobs: photographs drawn at the same time.
-        progress: is told of every photograph.
+        progress: called for every photograph.
 
     Returns:
         The overlays in the order of the photographs; those that can no longer be read are left out.

@@ -27,7 +27,7 @@ def draw_patches(
 
     Above each row stand the name and r; of points that were not matched, the reason and the template, if it
     lies inside. The difference is grey where there is none and saturates at a quarter of the scale of the
-    template. The last line tells if not all points are drawn.
+    template. The last line states if not all points are drawn.
     """
     zoom = max(ZOOM, math.ceil(PANEL / template_px))
     drawn = min(len(found), MAX_PICTURES)

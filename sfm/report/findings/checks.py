@@ -1,6 +1,6 @@
 """How well the observations agree with one another: residuals in standard deviations, checks at control.
 
-The basis of a verdict. Standard deviations are those stated before the adjustment; sigma0 tells by how
+The basis of a verdict. Standard deviations are those stated before the adjustment; sigma0 shows by how
 much they were wrong, and must not hide it.
 """
 
@@ -17,7 +17,7 @@ from sfm.conventions import FloatArray
 from sfm.result import ControlCheck, SurveyResult
 
 LISTED = 10  # largest residuals
-TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
+TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is stated beside that of all
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
 
 

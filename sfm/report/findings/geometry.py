@@ -34,7 +34,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Rays, angles, coverage and residuals; NaN where there is nothing to tell."""
+    """Rays, angles, coverage and residuals; NaN where nothing is known."""
 
     rays: IntArray  # of each point, (n,)
     angle_deg: FloatArray  # largest angle between two rays of each point, 0 parallel to 90, deg, (n,)

@@ -1,8 +1,9 @@
 """Remarks on given values after the adjustment: residuals, checks, and whether the scale can be.
 
 Given values are judged by the image points alone before they take part; these are the tests of those that
-took part, and of those that only check the result. Given interior orientation is not tested here: whether it is wrong
-is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object points.
+took part, and of those that only check the result. Given interior orientation is not tested here: whether it
+is wrong is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object
+points.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def write_view(
         paths: files of the photographs by name.
         budget_mb: what the pictures inside may take, 10^6 bytes.
         jobs: photographs cut at the same time.
-        progress: is told of every photograph.
+        progress: called for every photograph.
 
     Raises:
         OutputError: something else is in its place, or it cannot be written.

@@ -101,7 +101,7 @@ def cut_pictures(
         budget_mb: what the embedded pictures may take, 10^6 bytes of the page.
         beside: folder of the files beside the page, as the page names it; "" if there are none.
         jobs: photographs cut at the same time.
-        progress: is told of every photograph.
+        progress: called for every photograph.
     """
     m, rays = len(scene.photographs), scene.rays
     if not any(name in paths for name in scene.photographs):

@@ -21,7 +21,7 @@ from sfm.survey.inputs.exterior_table import ObservedExterior
 
 MIN_POINTS = 3  # that fix position, attitude and scale
 NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
-SURE = 3.0  # standard deviations by which places must be off a line to tell the turn about it
+SURE = 3.0  # standard deviations by which places must be off a line to give the turn about it
 FLAT = 1e-6  # the same for places without error, over their extent
 ROUGH = 1e-3  # of the extent of the places: no start value needs to be better
 

@@ -35,7 +35,7 @@ C_SIGMA = 0.1  # of c by EXIF data, of c: focusing from infinity to 1 : 5 makes 
 RATIO_SIGMA = 1e-3  # of the ratio of two focal lengths, which is that of the sides of a pixel
 MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take part in the decision
 ROUNDS = 3  # of tests of what is still held
-FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing tells which; then the others
+FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing determines which; then the others
 
 Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey says what is free
 
@@ -217,7 +217,7 @@ def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
 
 
 def _rank(name: str) -> int:
-    """Return the place of a parameter in the order in which they are held where nothing tells which."""
+    """Return the place of a parameter in the order in which they are held where nothing determines which."""
     return FIRST_HELD.index(name) if name in FIRST_HELD else len(FIRST_HELD)
 
 

@@ -1,7 +1,7 @@
 """Start values nearer to the minimum of a network whose adjustment does not converge.
 
 With long lenses all rays of a photograph are nearly parallel: principal distance, distance of the photographs
-and depth of the object can hardly be told apart, Gauss-Newton creeps along a bent valley, and the object
+and depth of the object can hardly be distinguished, Gauss-Newton creeps along a bent valley, and the object
 turned inside out in depth is a minimum of its own. With the cameras held at their start values there is no
 such valley; from where that ends the cameras are freed.
 

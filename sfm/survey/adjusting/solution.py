@@ -69,7 +69,7 @@ from sfm.targets.codes.plates import points_of_plates
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
-GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
+GIVEN_IMAGE_POINTS = 3  # of one whose given orientation decides which of the four solutions is meant
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,7 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
     task, given = _judged(start, free, plates)
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.settled.adjustment
-        if alone.redundancy > 0:  # else nothing tells but what was stated
+        if alone.redundancy > 0:  # else nothing determines but what was stated
             factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":

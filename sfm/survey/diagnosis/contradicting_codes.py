@@ -2,7 +2,7 @@
 
 A sheet of codes that two objects carry orients the photographs of both alike, and every other code that the
 two have in common is at two places. Photographs are put together by the places at which they show such codes;
-those that do not agree with the largest group leave, and what is contested after that is told.
+those that do not agree with the largest group leave, and what is contested after that is reported.
 """
 
 from __future__ import annotations

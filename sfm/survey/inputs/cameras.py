@@ -172,7 +172,7 @@ def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCamer
 def _common_size(
     settings: CameraSettings, sizes: list[tuple[str, tuple[int, int]]]
 ) -> tuple[int, int] | None:
-    """Return the size of all photographs of one camera, None if nothing tells it."""
+    """Return the size of all photographs of one camera, None if nothing determines it."""
     size, source = settings.size_px, "size_px"
     for name, found in sizes:
         if size is None:

@@ -80,7 +80,7 @@ def read_observed_exterior(path: Path) -> ObservedExterior:
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
             negative or stands alone or is missing, one so small that its unit must be another, angles of
-            which only some are fixed, or that cannot be told apart.
+            which only some are fixed, or that cannot be distinguished.
     """
     header = read_header(path)
     sigmas_of_axes = SIGMAS_OF_AXES if any(name in header for name in SIGMAS_OF_AXES) else ()
@@ -152,5 +152,5 @@ def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) ->
         angles,
         phi[:, None] & np.array([False, True, False]),
         ANGLES,
-        "another than +-90, where omega and kappa cannot be told apart; leave the three angles empty",
+        "another than +-90, where omega and kappa cannot be distinguished; leave the three angles empty",
     )

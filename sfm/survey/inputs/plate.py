@@ -68,7 +68,7 @@ def plate_group(targets: TargetSettings, others: Sequence[PlateSettings]) -> Pla
 
 
 def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateSettings], where: str) -> None:
-    """Raise SurveyFileError where plates beside another are incomplete, or cannot be told apart."""
+    """Raise SurveyFileError where plates beside another are incomplete, or cannot be distinguished."""
     if not others:
         return
     if targets.codes not in PLATES:
@@ -149,7 +149,7 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
 
 
 def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:
-    """Raise SurveyFileError where each point has coordinates of its own, and which it is cannot be told."""
+    """Raise SurveyFileError where each point has coordinates of its own, and its identity cannot be known."""
     plate = plate_family(targets)
     if plate is None or datum == "control" or not plate.is_ambiguous:
         return

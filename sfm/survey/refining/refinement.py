@@ -183,7 +183,7 @@ def refine_model(
     """Measure all image points of a solved model by least squares matching and adjust it again.
 
     Windows that overlap measure the same pixels. The orientation is adjusted from points whose windows do
-    not, so that its precision is not told too good; the others are intersected afterwards.
+    not, so that its precision is not stated too good; the others are intersected afterwards.
 
     Args:
         network: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
@@ -195,7 +195,7 @@ def refine_model(
         masks_dir: folder of masks, named as their photographs with .png behind; key points where a mask is
             black take no part.
         targets: of its photographs, in the frame of the estimate; see `measure_model_targets`.
-        progress: told of stages and parts.
+        progress: receives stages and parts.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
@@ -488,8 +488,8 @@ def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
 
     Args:
         camera: of the model.
-        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not tell the principal point from a
-            rotation.
+        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not separate the principal point from
+            a rotation.
         fixed: names of parameters to hold; f is fx and fy, too, and either of these the only f.
     """
     free = camera.free

@@ -65,7 +65,7 @@ def measure_model_targets(
         estimate: its solution.
         images_dir: folder of its photographs.
         tolerance_px: of an image point from its intersected target; farther away it is another target's.
-        progress: told of photographs.
+        progress: receives photographs.
 
     Raises:
         SurveyFileError: the survey has no coded targets, or a photograph of the model is not in the folder.
@@ -164,7 +164,7 @@ def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Simila
 
     Raises:
         GeometryError: the datum is control, and fewer than three control points are among the targets; or
-            control or scale bars are given, and too few of them are among the targets to tell the scale.
+            control or scale bars are given, and too few of them are among the targets to give the scale.
     """
     control = own.control.complete
     known: BoolArray = np.isfinite(points.sum(axis=1))

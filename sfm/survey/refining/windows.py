@@ -83,7 +83,7 @@ def match_windows(
         reference: the row of each point that is its template, -1 for points that are not measured, (n,).
         window_px: odd side of the windows, in pixels of the photographs.
         limits: what is a match no more, in pixels of the photographs.
-        progress: told of reference photographs.
+        progress: receives reference photographs.
 
     Raises:
         PhotographError: a photograph that cannot be read, or of another size than its camera.

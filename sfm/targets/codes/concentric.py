@@ -44,7 +44,7 @@ from sfm.targets.outlines import (
 
 # Number of steps, their least width and what a set bit adds, in outer radii.
 WIDTHS = {"cctag3": (5, 0.10, 0.05), "cctag4": (7, 0.08, 0.04)}
-# Rings wider than this are told apart on every ray, as modules of tags are (`tags.MIN_MODULE_PX`).
+# Rings wider than this are distinguished on every ray, as modules of tags are (`tags.MIN_MODULE_PX`).
 RESOLVED_PX = 3.0
 # Rays on which edges are looked for, samples per px on them, and the share of rays that must show all edges.
 RAYS, SAMPLES_PER_PX, MIN_RAYS = 64, 2.0, 0.5
@@ -162,7 +162,7 @@ def find_concentric(
 
 
 def read_resolved(photograph: AnyArray) -> dict[str, IntArray]:
-    """Return the ids of the tags whose rings are told apart on every ray, by family, to see which is shown.
+    """Return the ids of the tags whose rings are distinguished on every ray, by family.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.

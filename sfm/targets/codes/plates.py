@@ -93,9 +93,9 @@ class PlateFamily:
     def turns(self) -> tuple[IntArray, ...]:
         """The turns after which the plate looks alike, none for most: the number each point then has, (n,).
 
-        The colours of its squares tell a checkerboard with an odd number of rows and columns together from
+        The colours of its squares distinguish a checkerboard with an odd number of rows and columns from
         one turned by 180 degrees, and one with an odd number of each, as many rows as columns, from one
-        turned by 90 degrees. Marks and tags tell every turn.
+        turned by 90 degrees. Marks and tags show every turn.
         """
         if self.marks or self.name in TAGGED:
             return ()
@@ -171,7 +171,7 @@ def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
 
     Raises:
         GeometryError: one looks alike when it is turned, so that it has no place among the others, or two
-            cannot be told apart.
+            cannot be distinguished.
     """
     first, grouped = 0, list[PlateFamily]()
     for plate in plates:
@@ -184,7 +184,7 @@ def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
             if _look_alike(plate, other):
                 raise GeometryError(
                     f"{other.name} of {other.rows} x {other.columns} and {plate.name} of {plate.rows} x "
-                    f"{plate.columns} are not told apart: needed other tags, or a plate of another kind"
+                    f"{plate.columns} are not distinguished: needed other tags, or a plate of another kind"
                 )
         grouped.append(replace(plate, first_point=first))
         first += plate.count

@@ -30,8 +30,8 @@ DICTIONARIES = {
 # Without those that are the first tags of a larger one.
 LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
-# A black module narrower than this is not told apart from the code behind it: the whole tag is fitted. Codes
-# of larger tags are confirmed by the same fit, in a picture reduced to modules of this width.
+# A black module narrower than this is not distinguished from the code behind it: the whole tag is fitted.
+# Codes of larger tags are confirmed by the same fit, in a picture reduced to modules of this width.
 MIN_MODULE_PX = 3.0
 # Such tags are looked for in the picture enlarged by this, down to this side.
 ENLARGED, MIN_SIDE_PX = 2, 6.0

@@ -29,7 +29,7 @@ ROUNDS, LAST_STEP_PX = 20, 1e-3
 FARTHEST = 1.0  # of the half window, by which a crossing may be off where it was expected
 MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; one edge has 0
 SMOOTHING_PX = 0.7  # of the gradients
-MIN_BLUR_PX = 0.1  # that is told from that of the filters
+MIN_BLUR_PX = 0.1  # that is distinguished from that of the filters
 REACH_PX = 4  # of the filters
 
 

@@ -1,6 +1,6 @@
 """Small square tag by the least squares fit of all its modules at once.
 
-Where modules are hardly wider than the blur, the two edges at a corner cannot be told apart from the code
+Where modules are hardly wider than the blur, the two edges at a corner cannot be distinguished from the code
 behind them, but the whole code is known once it is read. Model of the intensity at pixel (x, y) with the
 homography (u, v) = h(x, y) into modules, B the intensity of clear modules, A the step to black ones, s the
 blur, and c(i, j) = 1 for black modules:

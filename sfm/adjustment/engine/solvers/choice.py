@@ -3,7 +3,7 @@
 The reduced normal matrix has a block wherever two photographs share a point. In a block of photographs every
 one shares points with its neighbours only, and nested dissection eliminates them with little fill: fronts. A
 full matrix is summed as a product of full rows where most photographs see most points, else pair by pair of
-rays. Which is the least work is told by counting operations, among those that fit in memory.
+rays. Which is the least work is found by counting operations, among those that fit in memory.
 
 Source: George and Liu (1981), Computer Solution of Large Sparse Positive Definite Systems, ch. 8;
 operations: Golub and Van Loan (2013), sec. 4.2.

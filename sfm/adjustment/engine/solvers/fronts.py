@@ -14,7 +14,7 @@ halves without a common point; the halves are eliminated first, each split again
 separator last. For a block of m photographs the factor has of the order of m log m elements and takes m^1.5
 operations, where a band takes m^1.5 and m^2.
 
-Where to split is told by distances in the graph from four photographs at its far ends: by the difference of
+Where to split is found by distances in the graph from four photographs at its far ends: by the difference of
 two of them, or of two sums of two, as a block is split across its diagonals or along its sides.
 
 Source: George (1973), SIAM J. Numer. Anal. 10(2); George and Liu (1981), Computer Solution of Large Sparse

@@ -31,12 +31,12 @@ from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, remark
 
 MAX_ROUNDS = 200  # of data snooping
-MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum tell no gross errors
+MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum show no gross errors
 ROUND_TOLERANCE = 1e-2  # |A dx| / |v| of a last step after which gross errors can be judged
 BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
 BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
-MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they tell no depth
+MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they determine no depth
 REWEIGHTINGS = 30
 MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence one after another: more helped none of the 400
 # networks with gross errors of tests.adjustment.test_studies
@@ -282,7 +282,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
 def _without_angle(problem: Problem, state: State, used: BoolArray, changed: BoolArray) -> BoolArray:
     """Return all image points of points whose rays have changed and are almost one, (k,).
 
-    Two photographs from the same place tell no depth: the point would go to infinity, and no step of the
+    Two photographs from the same place determine no depth: the point would go to infinity, and no step of the
     others would be taken whole. Known points stay, and so do single rays, which ask for nothing.
 
     Args:

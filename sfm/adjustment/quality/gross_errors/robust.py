@@ -37,7 +37,7 @@ from sfm.adjustment.quality.reliability import standardised_residuals, tau_criti
 from sfm.adjustment.result import MIN_SIGMA_PX, ROUNDING
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
-MIN_RAYS = 3  # of a point, of which residuals tell the wrong one
+MIN_RAYS = 3  # of a point, of which residuals show the wrong one
 # Over the image points of a photograph: share by which the photograph may change a standardised residual,
 # about three times its six unknowns over two coordinates each
 INFLUENCE = 8.0

@@ -84,7 +84,7 @@ def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
 
 
 def _readable(paths: Sequence[Path]) -> list[Metadata]:
-    """Return the metadata of the photographs that have some; the others are told where they are read."""
+    """Return the metadata of the photographs that have some; the others are reported where they are read."""
     found = []
     for path in paths:
         with suppress(PhotographError, OSError):
