@@ -21,6 +21,7 @@ from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.solution import Correspondences, SolvedSurvey, solve_survey
 from sfm.survey.assembly import assemble_result
 from sfm.survey.board_turns import agree_on_turns
+from sfm.survey.camera_models import orient_with_models
 from sfm.survey.correspondences import find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
@@ -32,7 +33,6 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.other_sizes import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
-from sfm.survey.orientation import orient_survey
 from sfm.survey.other_programs import ALONE, OtherPrograms, compare_solution
 from sfm.survey.target_network import measure_targets
 
@@ -62,26 +62,27 @@ def run_survey(
     clock = StageClock(progress)
     with _naming(survey), own_threads(jobs):
         survey, measured = _measure(survey, images_dir, jobs, store, clock)
-        start, matched, solution = _solve(survey, measured, jobs, clock)
+        survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock)
         copies = find_copies(solution.adjustment)
         if copies:
             measured = without_copies(measured, copies)
-            start, matched, solution = _solve(survey, measured, jobs, clock)
+            survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock)
         compared = compare_solution(solution, others, clock, files=measured.files)
         return assemble_result(survey, measured, start, matched, solution, compared, clock)
 
 
 def _solve(
     survey: Survey, measured: Measurements, jobs: int, clock: StageClock
-) -> tuple[Orientation, Correspondences, SolvedSurvey]:
-    """Return what orientation, matching and adjustment make of the image points."""
+) -> tuple[Survey, Measurements, Orientation, Correspondences, SolvedSurvey]:
+    """Return what orientation, matching and adjustment make of the image points, and of which cameras."""
     with clock.stage("orientation"):
-        measured, start = agree_on_turns(survey, measured, orient_survey(survey, measured))
+        survey, measured, start = orient_with_models(survey, measured)
+        measured, start = agree_on_turns(survey, measured, start)
     with clock.stage("matching"):
         matched = find_correspondences(survey, measured, start, jobs=jobs)
     with clock.stage("adjustment"):
         solution = solve_survey(survey, matched)
-    return start, matched, solution
+    return survey, measured, start, matched, solution
 
 
 def _measure(

@@ -19,6 +19,14 @@ ROWS = (
         "Write free = [] to hold all parameters fixed.",
     ),
     Kind(
+        "fisheye_taken",
+        "note",
+        "Camera {camera} has a fisheye lens and was adjusted with model opencv_fisheye: {fitting} of {total} "
+        "image points of the tie points fit, and {before} with a central perspective.",
+        "the survey file does not state the model",
+        "Write the model into the survey file, which saves the trial.",
+    ),
+    Kind(
         "c_observed",
         "note",
         "{parameter} of camera {camera} was observed, as {photographs:photograph} {photographs:does|do} not "

@@ -14,6 +14,8 @@ from sfm.remarks.remark import Remark, remark
 
 FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing tells it
 FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing tells it
+# What makers call such lenses: "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D", "7.5mm Fish-eye"
+FISHEYE_NAME = re.compile("fish-?eye", re.IGNORECASE)
 MIN_IN_GROUP = 2  # photographs that a camera is kept with if another has more
 
 SensorWidth = Callable[[str, str], float | None]
@@ -33,6 +35,7 @@ class CameraGroup:
     c_mm: float
     c_source: str
     assumed: bool  # whether pixel or principal distance is known from nowhere
+    fisheye: str  # lens or camera whose name says that it is one; "" where none does
     remarks: tuple[Remark, ...]  # what a person should know of the photographs
 
 
@@ -107,6 +110,7 @@ def _group(
         c,
         c_source,
         assumed,
+        next((one for one in (first.lens, first.model) if one and FISHEYE_NAME.search(one)), ""),
         _remarks(label, {name: metadata[name] for name in names}),
     )
 

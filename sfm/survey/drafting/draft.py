@@ -20,6 +20,7 @@ from sfm.photographs.file_checks import conversion_of
 from sfm.photographs.satellite_positions import USUAL_SIGMAS_M
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.camera_models import FISHEYE
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
 from sfm.survey.drafting.target_trial import MANY_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
@@ -29,7 +30,9 @@ from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 COMMENT_WIDTH = 100  # letters
+FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
 FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
+FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
 PITCH = 25.0  # of a plate, UNIT, where none is given: that of many printed boards
@@ -189,12 +192,24 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
         f"images = {json.dumps(globs, ensure_ascii=False)}",
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
-        'model = "brown"',
-        f"free = {json.dumps(list(free))}"
-        if free
-        else '# free = ["c", "x0", "y0", "K1", "K2"]  # without it: what the photographs determine',
+        *_model_lines(camera, free),
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
+
+
+def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
+    """Return the lines of model and free parameters; of texture the adjustment chooses what is not known."""
+    lines = (
+        ['model = "brown"'] if free else ['# model = "brown"  # without it: what the photographs determine']
+    )
+    if camera.fisheye:
+        lines, free = (
+            [f'model = "{FISHEYE}"  # EXIF data: {as_plain(camera.fisheye)}'],
+            free and FREE_OF_FISHEYES,
+        )
+    usual = list(FREE_OF_FISHEYES if camera.fisheye else FREE_OF_TEXTURE)
+    without = "  # without it: what the photographs determine"
+    return [*lines, f"free = {json.dumps(list(free))}" if free else f"# free = {json.dumps(usual)}{without}"]
 
 
 def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:

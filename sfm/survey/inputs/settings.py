@@ -130,6 +130,13 @@ class CameraSettings(Section):
         )
 
     @property
+    def says_its_model(self) -> bool:
+        """Whether `model` is there, or parameters that are those of one; else the photographs decide."""
+        return bool(
+            "model" in self.model_fields_set or self.says_what_is_free or self.start or self.calibration
+        )
+
+    @property
     def may_be_free(self) -> tuple[str, ...]:
         """Parameters that are adjusted without an observation, or may be where nothing is said."""
         if self.says_what_is_free:

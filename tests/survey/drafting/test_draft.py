@@ -222,6 +222,27 @@ def test_a_changed_focal_length_and_hostile_names_make_a_file_that_reads(tmp_pat
     assert described.tie_points is not None, "there is no target"
 
 
+@pytest.mark.parametrize(
+    ("lens", "model"), [("AF Fisheye Nikkor 16mm f/2.8D", "opencv_fisheye"), ("EF16mm f/2.8 USM", None)]
+)
+def test_a_lens_that_is_called_a_fisheye_is_drafted_as_one(
+    tmp_path: Path, lens: str, model: str | None
+) -> None:
+    """Of others nothing is said where natural texture is measured: the photographs decide."""
+    for k in range(2):
+        exif = Image.Exif()
+        exif[ExifTags.IFD.Exif] = {
+            ExifTags.Base.FocalLength: IFDRational(16, 1),
+            ExifTags.Base.FocalLengthIn35mmFilm: 16,
+            ExifTags.Base.LensModel: lens,
+        }
+        Image.new("L", (120, 80), 10 * k).save(tmp_path / f"{k}.jpg", exif=exif)
+    (tmp_path / "survey.toml").write_text(draft_survey(tmp_path).text, encoding="utf-8")
+    (camera,) = read_survey_file(tmp_path / "survey.toml").cameras
+    assert camera.model == (model or "brown") and camera.says_its_model == (model is not None)
+    assert not camera.says_what_is_free
+
+
 def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
     for k in range(4):
         Image.effect_noise((120, 80), 60).save(tmp_path / f"{k}.jpg")
