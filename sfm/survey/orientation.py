@@ -159,6 +159,7 @@ def _hold_cameras_of_two(
     The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
     Zisserman 2003, sec. 11.1): hardly c, and neither principal point nor distortion, which bend the object
     instead. A control field in the datum determines them, and observed parameters have their own precision.
+    So is it where the survey does not say what is free, as one that was drafted.
     """
     estimate = found.estimate
     fixed = len(network.control) if survey.datum.kind == "control" else 0
@@ -169,7 +170,9 @@ def _hold_cameras_of_two(
     cameras = list(estimate.cameras)
     for index in used.tolist():
         camera = cameras[index]
-        names = [name for name, free in zip(camera.names, camera.free, strict=True) if free]
+        said = survey.cameras[index].says_what_is_free
+        free = set(np.array(camera.names)[camera.free]) if said else set(survey.cameras[index].may_be_free)
+        names = [name for name in camera.names if name in free]
         if names:
             cameras[index] = replace(camera, free=np.zeros_like(camera.free))
             remarks.append(remark("interior_held_of_pair", camera=camera.name, parameters=names))

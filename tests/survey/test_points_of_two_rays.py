@@ -15,6 +15,7 @@ from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.similarity import fit_similarity
+from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from tests.survey.texture_scenes import (
     C_PX,
@@ -47,12 +48,17 @@ backend = "none"
 MIDDLE = (np.array(SIZE_PX) - 1) / 2
 
 
-def run(folder: Path, scene: Scene, stations: list[int]) -> Findings:
-    """Return what a survey finds with the true camera in photographs from some stations of a scene."""
+def photographs(folder: Path, scene: Scene, stations: list[int]) -> None:
+    """Write the photographs from some stations of a scene."""
     rng = seed_of("two rays")
     for i in stations:
         grey = _photograph(scene, i) + rng.normal(0, NOISE, SIZE_PX[::-1])
         cv2.imwrite(str(folder / f"{i}.png"), np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+
+
+def run(folder: Path, scene: Scene, stations: list[int]) -> Findings:
+    """Return what a survey finds with the true camera in photographs from some stations of a scene."""
+    photographs(folder, scene, stations)
     (folder / "survey.toml").write_text(SURVEY, encoding="utf-8")
     return findings_of(run_survey(read_survey(folder / "survey.toml")))
 
@@ -98,6 +104,7 @@ def test_two_photographs_of_walls_make_a_survey_that_says_what_it_rests_on(tmp_p
     over, rays = errors_in_sigmas(scene, a)
     assert (rays == 2).all() and 0.8 < np.sqrt(np.mean(over**2)) < 1.3
     assert (over > 6).sum() <= 1  # no false match
+    assert not of_kind(found.verdict.remarks, "interior_held_of_pair")
     write_tables(found, tmp_path)
     with (tmp_path / "points.csv").open(encoding="utf-8") as file:
         assert {row["rays"] for row in csv.DictReader(file)} == {"2"}
@@ -119,3 +126,14 @@ def test_a_strip_of_which_most_is_in_two_photographs_is_covered_by_points_of_two
     assert (over > 6).sum() <= 1
     for some in (rays == 2, rays > 2):
         assert 0.7 < np.sqrt(np.mean(over[some] ** 2)) < 1.3
+
+
+def test_two_photographs_from_a_folder_do_not_calibrate_their_camera(tmp_path: Path) -> None:
+    """The draft assumes c, which scales the depth, and no residual shows it."""
+    scene = Scene(corner_of_walls(seed_of("walls")), *around(seed_of("stations"), 8))
+    photographs(tmp_path, scene, [2, 3])
+    (tmp_path / "survey.toml").write_text(draft_survey(tmp_path).text, encoding="utf-8")
+    found = findings_of(run_survey(read_survey(tmp_path / "survey.toml")))
+    assert len(found.result.adjustment.network.images) == 2 and found.verdict.level == "bad"
+    (held,) = of_kind(found.verdict.remarks, "interior_held_of_pair")
+    assert "c" in held.names("parameters") and held.severity == "error"

@@ -50,7 +50,13 @@ ROWS = (
         "an error of c scales the depth, one of the distortion bends the object; standard deviations do not "
         "contain it",
         "Give a calibrated camera, or add photographs.",
-        explains=("c_held_contradicted", "held_parameter", "scale_contradicted", "sigma0_high"),
+        explains=(
+            "c_held_contradicted",
+            "held_parameter",
+            "interior_held",
+            "scale_contradicted",
+            "sigma0_high",
+        ),
     ),
     Kind(
         "pair_contradicted",
