@@ -72,6 +72,13 @@ ROWS = (
         "Give this photograph a camera in the survey file, or leave it out.",
     ),
     Kind(
+        "c_per_photograph",
+        "warning",
+        "c of camera {camera} differs among its photographs and was adjusted in each: {least} to {most}.",
+        "a zoom that slipped, autofocus or a stabiliser",
+        "Hold zoom and focus in place; coordinates are less precise with c per photograph.",
+    ),
+    Kind(
         "plate_not_found",
         "note",
         "The calibration plate of {size} dots was not found in {photographs:photograph}: {photographs}.",

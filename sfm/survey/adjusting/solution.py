@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import base_name
 from sfm.conventions import BoolArray, IntArray
+from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
 from sfm.orientation.incremental.starting_pair import pair_solutions
@@ -61,12 +63,13 @@ from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
-from sfm.survey.inputs.settings import DatumSettings
+from sfm.survey.inputs.settings import CameraSettings, DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 from sfm.targets.codes.plates import points_of_plates
 
+OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation decides which of the four solutions is meant
@@ -120,10 +123,34 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
         survey: says the datum and the a priori sigma, and gives observed exterior orientation.
         matched: all image points, and approximate values of all that is to be adjusted.
 
+    Where the survey leaves to the photographs what is free, and texture shows that c differs among them, each
+    has its own.
+
     Raises:
         GeometryError: too little is left to adjust, or control is asked for and not seen.
     """
-    start = _prepared(survey, matched)
+    found = _solution(survey, matched)
+    varying = _varying(survey, found)
+    if varying:
+        report_step("adjusting c of each photograph")
+        with suppress(GeometryError):
+            own = _solution(survey, matched, varying)
+            if own.adjustment.converged and not own.adjustment.undetermined:
+                return own
+    return found
+
+
+def _varying(survey: Survey, found: Solution) -> frozenset[str]:
+    """Return the cameras of which texture shows that c differs among their photographs."""
+    differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
+    if survey.tie_points is None or not differs:
+        return frozenset()
+    return frozenset(one.name for one in survey.cameras if not one.says_what_is_free)
+
+
+def _solution(survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()) -> Solution:
+    """Return the solution of a survey, with c of each photograph of some cameras."""
+    start = _prepared(survey, matched, varying)
     solved = _solved(start, _plates(survey, matched.naming, matched.network))
     final, settled, whole = solved.final, solved.settled, start.whole
     if survey.tie_points is not None:
@@ -150,6 +177,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
         (
             *start.remarks,
             *solved.remarks,
+            *_own_c(varying, final.estimate),
             *_remarks(start.task.survey, told, len(whole.points), final),
             *not_calibrated(survey, final.estimate),
             *_handedness(start.task.survey, solved.given),
@@ -201,8 +229,14 @@ class _Solved:
     c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
 
 
-def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
-    """Bring network and approximate values into the frame and cameras that the survey asks for."""
+def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
+    """Bring network and approximate values into the frame and cameras that the survey asks for.
+
+    Args:
+        survey: asks for them.
+        matched: network and approximate values.
+        varying: names of the cameras of which every photograph has c by itself, where it is adjusted.
+    """
     placed = add_exterior(matched.network, matched.estimate, survey.exterior, survey.datum.kind)
     network, estimate = placed.network, placed.estimate
     datum = Datum(survey.datum.kind)
@@ -218,7 +252,8 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
     chosen = choose_free_parameters(
         survey, replace(network, scale_bars=ScaleBars()), estimate, datum=datum.kind
     )
-    survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
+    cameras = tuple(_with_own_c(one) if one.name in varying else one for one in chosen.cameras)
+    survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
@@ -232,6 +267,14 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
         matched.min_rays,
         (*placed.remarks, *chosen.remarks),
     )
+
+
+def _with_own_c(settings: CameraSettings) -> CameraSettings:
+    """Return the settings with c per photograph, if it is adjusted."""
+    focal = tuple(one.name for one in MODELS[settings.model].parameters if one.role is Role.FOCAL)
+    if not set(focal) <= set(settings.free):
+        return settings
+    return settings.model_copy(update={"per_photograph": focal})
 
 
 @dataclass(frozen=True)
@@ -481,6 +524,18 @@ def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, 
     settings = [one for one in survey.cameras if one.name in first]
     pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
     return unlike_squares(settings, pixels, [one.adjusted for one in settings])
+
+
+def _own_c(varying: frozenset[str], estimate: Estimate) -> list[Remark]:
+    """Return the remarks on cameras of which every photograph has c by itself."""
+    remarks = []
+    for name in sorted(varying):
+        own = [one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name]
+        c = [float(one.parameters[0]) for one in own]
+        if own:
+            unit = own[0].units[0]
+            remarks.append(remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit)))
+    return remarks
 
 
 def _sigma_of_c(a: Adjustment) -> list[float]:
