@@ -24,7 +24,7 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
@@ -357,6 +357,12 @@ def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Ne
     assert bad.level == "bad"
     assert bad.remarks[0].kind == "sigma0_high"
     assert bad.remarks[0].number("stated") == pytest.approx(0.0005, rel=0.2)
+    assert "common" not in bad.remarks[0].numbers
+    shared = replace(a, error_correlation=ErrorCorrelation(alone=0.2, common=4.0, length_px=800.0))
+    high = findings_of(result_of(multiplied(shared, 200.0))).verdict.remarks[0]
+    assert high.number("common") == pytest.approx(2 * a.sigma0_px, rel=0.01) and high.number("length") == 800
+    apart = replace(a, error_correlation=ErrorCorrelation(alone=2.0, common=1.0, length_px=800.0))
+    assert "common" not in findings_of(result_of(multiplied(apart, 200.0))).verdict.remarks[0].numbers
     text = summary(findings_of(result_of(multiplied(a, 3.0))))
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 

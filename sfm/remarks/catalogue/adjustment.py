@@ -31,7 +31,9 @@ ROWS = (
     Kind(
         "sigma0_high",
         SIGMA0,
-        "Sigma0 is {ratio} times the expected standard deviation of an image coordinate ({stated}).",
+        "Sigma0 is {ratio} times the expected standard deviation of an image coordinate ({stated}).[[ "
+        "Neighbours have errors of {common} in common over {length}: the camera model does not describe the "
+        "photographs, as with a rolling shutter or a stabiliser.]]",
         "the camera, the names of points or given values contradict the photographs, or sigma_px is too "
         "small",
         "Look for a camera that changed between photographs, wrong names and wrong given values; set "

@@ -112,7 +112,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *photograph_remarks(result),
         *result.remarks,
         *other_solution_remarks(result),
-        *sigma0_remarks(sigma0, statistics),
+        *sigma0_remarks(sigma0, statistics, a),
         *residual_remarks(result, longest),
         *ray_remarks(a),
         *consistency_remarks(consistency),

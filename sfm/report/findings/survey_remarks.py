@@ -102,9 +102,14 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     return tuple(found)
 
 
-def sigma0_remarks(sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]:
-    """Return whether sigma0 a posteriori is far from that a priori."""
-    remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=(sigma0.stated_px, "px")))]
+def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustment) -> tuple[Remark, ...]:
+    """Return whether sigma0 a posteriori is far from that a priori, and how much of it neighbours share."""
+    parts, shared = {}, adjustment.error_correlation
+    if shared is not None and shared.common > shared.alone:
+        parts["common"] = (shared.sigmas_px(adjustment.sigma0_px)[1], "px")
+        parts["length"] = (shared.length_px, "px")
+    stated = (sigma0.stated_px, "px")
+    remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=stated, **parts))]
     image = component_tests(statistics.kinds, alpha=2 * ALPHA)[0]
     if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
         remarks.append(
