@@ -115,6 +115,15 @@ ROWS = (
         short="points that moved",
     ),
     Kind(
+        "windows_elsewhere",
+        SHIFT,
+        "The windows of {points:point} show another place from {from} on, {distance} away at most, {shift} "
+        f"standard deviations: {{points}}.{INSTEAD}",
+        "edges of a surface before another, shine, shadows, or something that moved",
+        "Do not use {points:this point|these points}; photographs at smaller steps show fewer of them.",
+        short="windows that show another place",
+    ),
+    Kind(
         "plate_moved",
         SHIFT,
         "A plate moved against the others from {from} on, by up to {distance}, {shift} standard deviations: "

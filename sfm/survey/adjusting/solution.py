@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -181,9 +182,9 @@ def _solution(survey: Survey, matched: Correspondences, varying: frozenset[str] 
             *_remarks(start.task.survey, told, len(whole.points), final),
             *not_calibrated(survey, final.estimate),
             *_handedness(start.task.survey, solved.given),
-            *judged.causes,
+            *_of_windows(survey, judged.causes),
             *judged.unchecked,
-            *explain_rejections(final, unit=unit, bodies=plates),
+            *_of_windows(survey, explain_rejections(final, unit=unit, bodies=plates)),
             *contradicted(solved.c_held, judged.causes),
         ),
         left_out,
@@ -524,6 +525,15 @@ def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, 
     settings = [one for one in survey.cameras if one.name in first]
     pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
     return unlike_squares(settings, pixels, [one.adjusted for one in settings])
+
+
+def _of_windows(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+    """Return remarks in which points of texture did not move, but are seen at other places."""
+    if survey.tie_points is None:
+        return tuple(remarks)
+    return tuple(
+        replace(one, kind="windows_elsewhere") if one.kind == "points_moved" else one for one in remarks
+    )
 
 
 def _own_c(varying: frozenset[str], estimate: Estimate) -> list[Remark]:
