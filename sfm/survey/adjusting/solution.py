@@ -141,7 +141,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     return found
 
 
-def _varying(survey: Survey, found: Solution) -> frozenset[str]:
+def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
     """Return the cameras of which texture shows that c differs among their photographs."""
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     if survey.tie_points is None or not differs:
@@ -149,7 +149,9 @@ def _varying(survey: Survey, found: Solution) -> frozenset[str]:
     return frozenset(one.name for one in survey.cameras if not one.says_what_is_free)
 
 
-def _solution(survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()) -> Solution:
+def _solution(
+    survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()
+) -> SolvedSurvey:
     """Return the solution of a survey, with c of each photograph of some cameras."""
     start = _prepared(survey, matched, varying)
     solved = _solved(start, _plates(survey, matched.naming, matched.network))
