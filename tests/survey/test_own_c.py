@@ -11,7 +11,7 @@ from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity
-from sfm.survey.adjusting.solution import Correspondences, Solution, solve_survey
+from sfm.survey.adjusting.solution import OF_CAMERAS, Correspondences, SolvedSurvey, solve_survey
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.synthetic import make_network, seed_of
@@ -34,7 +34,7 @@ def zoomed(change: float) -> tuple[Network, Estimate]:
     return replace(network, image_points=replace(seen, xy=xy).select(kept)), truth
 
 
-def solved(change: float, *, textured: bool = True, **settings: object) -> tuple[Solution, float]:
+def solved(change: float, *, textured: bool = True, **settings: object) -> tuple[SolvedSurvey, float]:
     """Return the solution, and the error of its projection centres over their extent."""
     network, truth = zoomed(change)
     camera = truth.cameras[0]
@@ -68,3 +68,8 @@ def test_c_is_one_where_it_is_or_where_the_survey_says_so(
 ) -> None:
     found, _ = solved(change, textured=textured, **settings)
     assert not of_kind(found.remarks, "c_per_photograph")
+
+
+def test_a_difference_of_c_that_focusing_makes_is_reported_alone() -> None:
+    found, _ = solved(0.015)
+    assert of_kind(found.remarks, *OF_CAMERAS) and not of_kind(found.remarks, "c_per_photograph")
