@@ -23,7 +23,7 @@ from sfm.report.phrases import words_of_neighbours
 from sfm.survey.adjusting.solution import Correspondences, solve_survey
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of
 
 SIGMA_PX = 0.1
 
@@ -233,3 +233,16 @@ def test_given_coordinates_are_judged_with_common_errors(scene: tuple[Network, E
     assert of_targets.what == textured.what == "control"
     assert of_targets.probability < 0.01 and textured.probability > 0.1
     assert textured.statistic == pytest.approx(textured.dof, rel=0.15)
+
+
+def test_control_leaves_no_datum_to_common_errors(scene: tuple[Network, Estimate]) -> None:
+    network, truth = scene
+    names = network.points[:6]
+    noisy = observed_anew(network, truth, 0.1, seed_of("control and common errors"))
+    controlled = noisy.with_control(names, truth.points[:6], 1e-4)
+    a = adjust(controlled, truth, datum="control")
+    none = with_error_correlation(a, ErrorCorrelation(alone=1.0, common=0.0, length_px=200.0))
+    np.testing.assert_allclose(none.covariance.points, a.covariance.points, rtol=1e-9)
+    found = with_error_correlation(a, ErrorCorrelation(alone=0.8, common=0.2, length_px=200.0))
+    assert (np.linalg.eigvalsh(found.covariance.points) > 0).all()
+    assert not np.allclose(found.covariance.points, a.covariance.points, rtol=0.05)

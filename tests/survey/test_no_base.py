@@ -18,12 +18,13 @@ SIGMA_PX, C_PX, SIZE_PX = 0.1, 600.0, (640, 480)
 IMAGES, POINTS, DISTANCE = 6, 300, 5.0
 
 
-def turned(base_px: float, *, frontal: bool = False) -> tuple[Network, Estimate]:
+def turned(base_px: float, *, frontal: bool = False, distant: float = 0.0) -> tuple[Network, Estimate]:
     """Return photographs side by side, the image points of each moved by so many px against the last.
 
     Args:
         base_px: parallax of neighbours at the middle distance.
         frontal: a wall from the front; else an object in space, and the camera turns.
+        distant: part of the points a hundred times as far away.
     """
     rng = seed_of("no base")
     lens = () if frontal else (("K1", -2e-4),)
@@ -34,6 +35,7 @@ def turned(base_px: float, *, frontal: bool = False) -> tuple[Network, Estimate]
     position = np.column_stack([step * np.arange(IMAGES), np.zeros((IMAGES, 2))])
     angle = np.zeros(IMAGES) if frontal else np.linspace(-0.3, 0.3, IMAGES)
     depth = np.full(POINTS, DISTANCE) if frontal else rng.uniform(0.7, 3.0, POINTS) * DISTANCE
+    depth = np.where(np.arange(POINTS) < distant * POINTS, 100 * DISTANCE, depth)
     spread = rng.uniform(-0.7, 0.7, (POINTS, 2))
     points = np.column_stack([spread * depth[:, None], -depth])
     names, places, xy = [], [], []
@@ -98,3 +100,8 @@ def test_few_points_in_common_say_nothing() -> None:
     network, start = turned(0.0)
     few = network.image_points.point < 10
     refuse_no_base(replace(network, image_points=network.image_points.select(few)), start.cameras)
+
+
+def test_a_near_object_before_distant_hills_has_a_base() -> None:
+    network, start = turned(60.0 * MIN_PARALLAX * SIGMA_PX, distant=0.75)
+    refuse_no_base(network, start.cameras)

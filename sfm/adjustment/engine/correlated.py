@@ -96,7 +96,7 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
         linear,
         through,
         linear.scores,
-        own.reshape(-1, d),
+        own.reshape(2 * len(linear.own), d),
         whole,
         motions.reduced,
         motions.points.reshape(3 * n, d),

@@ -25,6 +25,8 @@ from sfm.orientation.homography import rays_of
 from sfm.orientation.image_rays import image_tangents
 
 MIN_PARALLAX = 10.0  # standard deviations of image points, below which a depth is known to a tenth at best
+DISTANT = 0.9  # part of the points of a pair that may have no depth, as distant hills behind a near object;
+# a smaller rest may be wrong matches
 MIN_COMMON = 20  # points of a pair of photographs: rotation and camera take five coordinates of them
 SCALES = np.geomspace(0.5, 2.0, 15)  # of c that are tried, 10 % apart; the best is improved
 TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
@@ -55,8 +57,8 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
         return
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one place; rotations "
-        f"alone fit their points to {np.median(parallax):.2g} px (median), and depths need {needed:.2g} px; "
-        "photograph from several places, at least a twentieth of the distance apart"
+        f"alone fit {DISTANT:.0%} of their points to {np.median(parallax):.2g} px, and depths need "
+        f"{needed:.2g} px; photograph from several places"
     )
 
 
@@ -83,7 +85,7 @@ def _conjugate_points(network: Network) -> list[tuple[IntArray, IntArray]]:
 def _least_parallax(
     network: Network, cameras: tuple[Camera, ...], pairs: list[tuple[IntArray, IntArray]]
 ) -> FloatArray | None:
-    """Return the median parallax of each pair with c and radial distortion that make them least, px.
+    """Return the parallax of each pair with c and radial distortion that make it least, px.
 
     None where these are at the end of what is tried.
     """
@@ -110,7 +112,7 @@ def _least_parallax(
 
 
 def _parallax(first: FloatArray, second: FloatArray) -> float:
-    """Return the median angle between conjugate rays after the rotation that fits most of them, rad.
+    """Return the angle that DISTANT of conjugate rays do not exceed after the rotation that fits most, rad.
 
     Args:
         first: rays of one photograph, (k, 3).
@@ -124,4 +126,4 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
         U, _, Vt = np.linalg.svd(second[near].T @ first[near])
         R = (U * np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])) @ Vt
         apart = np.linalg.norm(first @ R.T - second, axis=1)
-    return float(np.median(apart))
+    return float(np.quantile(apart, DISTANT))
