@@ -14,6 +14,7 @@ from tests.places import ROOT
 LAYERS = (
     (
         *(
+            "sfm.arguments",
             "sfm.conventions",
             "sfm.errors",
             "sfm.distributions",
