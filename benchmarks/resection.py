@@ -13,7 +13,7 @@ import pycolmap
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
 from sfm.orientation.resection.ransac import resect_robust
-from sfm.orientation.resection.zeng_wang import resect_triples_zeng_wang
+from sfm.textbook.resection.zeng_wang import resect_triples_zeng_wang
 
 TRIPLES = 10_000
 RIGHT = 1e-6  # error of position and rotation up to which a solution is the true one

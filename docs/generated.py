@@ -102,7 +102,8 @@ class PythonReference(_Made):
         for name in sorted(sfm.__all__, key=str.lower):
             value = getattr(sfm, name)
             domain.note_object(f"sfm.{name}", "function", label_of(f"sfm.{name}"))
-            signature = name if inspect.isclass(value) else f"{name}{inspect.signature(value)}"
+            described = inspect.isfunction(value)
+            signature = f"{name}{inspect.signature(value)}" if described else name
             text = f"{signature}\n\n{inspect.getdoc(value)}"
             found.append((f"sfm.{name}", [nodes.literal_block("", text, language="text")]))
         return found

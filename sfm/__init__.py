@@ -4,61 +4,36 @@
     >>> "adjust" in dir(sfm)
     True
 
-Every public name is listed in `__init__.pyi` and is imported when it is first asked for.
+A survey is `run_survey`; image points measured elsewhere go through `Network`, `orient` and `adjust`. The
+methods below them are in rooms, each with a list of its public names and an example:
+
+- `targets`, `matching`: what is measured in photographs.
+- `orientation`, `adjustment`: photographs and points from image points, with covariance and tests.
+- `geometry`, `comparison`, `epochs`: shapes and tolerances, two results of one object, what moved.
+- `planning`: what a network will give before anything is photographed.
+- `textbook`: methods of the literature that a survey does not need.
+- `camera`, `conventions`: cameras and their distortion, frames and rotations.
+
+    >>> sfm.textbook.resect_church.__name__
+    'resect_church'
+
+Every name is listed in `__init__.pyi` and is imported when it is first asked for.
 """
 
 from __future__ import annotations
 
 from sfm.runtime.installation import refuse_mixed_installation
+from sfm.runtime.public_names import public_names
 
 refuse_mixed_installation()
 
-_MODULES = {
-    "sfm.adjustment.covariance": ("change_datum",),
-    "sfm.adjustment.datum": ("Datum",),
-    "sfm.adjustment.result": ("Adjustment",),
-    "sfm.adjustment.solve": ("adjust",),
-    "sfm.api": (
-        "compare",
-        "distance",
-        "fit_shape",
-        "measure",
-        "network_from_colmap",
-        "read_result",
-        "run_survey",
-        "write_result",
-    ),
-    "sfm.camera": ("Camera", "camera_from_values", "project"),
-    "sfm.errors": ("KolinearError",),
-    "sfm.network": ("Estimate", "Network", "empty_estimate"),
-    "sfm.orientation.incremental.sequence": ("orient",),
-    "sfm.photographs.reading": ("read_photograph",),
-    "sfm.result": ("SurveyResult",),
-    "sfm.similarity": ("Similarity", "fit_similarity"),
-    "sfm.solution": ("Solution",),
-    "sfm.survey.inputs.exterior_table": ("ObservedExterior",),
-    "sfm.survey.inputs.given": ("KnownPoints", "Observations", "ScaleBar"),
-    "sfm.survey.inputs.survey": ("CameraSetup", "Survey", "read_survey"),
-    "sfm.targets.detect": ("Targets", "find_targets"),
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-__all__ = sorted(_MODULE_OF)
+_public, __dir__, __all__ = public_names(__name__, __path__[0])
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name when it is first asked for."""
-    from importlib import import_module
-
+    """Return a public name, or the version of the installation."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("kolinear")
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'sfm' has no attribute '{name}'")
-    value = getattr(import_module(_MODULE_OF[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
+    return _public(name)

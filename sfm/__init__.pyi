@@ -1,4 +1,4 @@
-"""The public names of Kolinear; `sfm/__init__.py` imports each when it is first asked for."""
+"""The public names of Kolinear and its rooms, a row each."""
 
 from sfm.adjustment.covariance import change_datum as change_datum
 from sfm.adjustment.datum import Datum as Datum
@@ -34,5 +34,17 @@ from sfm.survey.inputs.survey import Survey as Survey
 from sfm.survey.inputs.survey import read_survey as read_survey
 from sfm.targets.detect import Targets as Targets
 from sfm.targets.detect import find_targets as find_targets
+
+from . import adjustment as adjustment
+from . import camera as camera
+from . import comparison as comparison
+from . import conventions as conventions
+from . import epochs as epochs
+from . import geometry as geometry
+from . import matching as matching
+from . import orientation as orientation
+from . import planning as planning
+from . import targets as targets
+from . import textbook as textbook
 
 __version__: str

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
+from sfm.arguments import checked_arguments
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
 from sfm.geometry.measured import measured_points
@@ -38,6 +39,7 @@ load_adapters()
 BACKENDS = ("colmap", "none")
 
 
+@checked_arguments()
 def run_survey(
     survey: Survey | str | Path,
     *,
@@ -92,6 +94,7 @@ def run_survey(
         )
 
 
+@checked_arguments()
 def read_result(path: str | Path) -> Solution:
     """Read a result: the folder of a survey, a COLMAP model, or another format that is known.
 
@@ -111,6 +114,7 @@ def read_result(path: str | Path) -> Solution:
     return read_comparable(Path(path))
 
 
+@checked_arguments()
 def write_result(
     result: SurveyResult | Adjustment | Solution,
     folder: str | Path,
@@ -158,6 +162,7 @@ def write_result(
         )
 
 
+@checked_arguments()
 def compare(
     a: SurveyResult | Adjustment | Solution,
     b: SurveyResult | Adjustment | Solution,
@@ -188,6 +193,7 @@ def compare(
     )
 
 
+@checked_arguments()
 def distance(result: SurveyResult | Adjustment | Solution, start: str, end: str) -> tuple[float, float]:
     """Return the distance of two points and its standard deviation, object unit.
 
@@ -215,6 +221,7 @@ def distance(result: SurveyResult | Adjustment | Solution, start: str, end: str)
     return length, float(np.sqrt(J @ solution.covariance_of((start, end)) @ J))
 
 
+@checked_arguments()
 def fit_shape(
     result: SurveyResult | Adjustment | Solution,
     kind: str,
@@ -250,6 +257,7 @@ def fit_shape(
     return fit_points(measured, kind, chosen, weights=weights, hold=hold, robust=robust, offset=offset)
 
 
+@checked_arguments()
 def measure(
     result: SurveyResult | Adjustment | Solution,
     features: str | Path | None = None,
@@ -298,7 +306,14 @@ def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:
     """
     from adapters.colmap.camera_models import network_of_scene, read_model
 
-    return read_model(Path(model)) if isinstance(model, str | Path) else network_of_scene(model)
+    if isinstance(model, str | Path):
+        return read_model(Path(model))
+    if not hasattr(model, "points3D"):
+        raise GeometryError(
+            f"network_from_colmap: model is a {type(model).__name__}, expected a folder or a "
+            "pycolmap.Reconstruction"
+        )
+    return network_of_scene(model)
 
 
 def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherPrograms:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, WIDE_ANGLE, Role, number_of, observe
@@ -168,6 +169,7 @@ class Camera:
         return replace(self, parameters=np.array(parameters, dtype=float))
 
 
+@checked_arguments()
 def camera_from_values(
     name: str,
     model: str,
@@ -309,6 +311,7 @@ def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.asarray(np.column_stack([uv, -np.ones(len(uv))]) @ rotation.T)
 
 
+@checked_arguments(position="3", rotation="3 3", points="n 3")
 def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
     """Return pixel coordinates of object points by the collinearity equations.
 

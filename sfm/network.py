@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, triu
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
@@ -363,6 +364,7 @@ def rows_of(index: IntArray, count: int) -> list[IntArray]:
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
+@checked_arguments()
 def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
     """Return an estimate of which only the start values of the cameras are known.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -51,6 +52,7 @@ class Similarity:
         return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
 
 
+@checked_arguments(source="n 3", target="m 3", weights="n")
 def fit_similarity(
     source: FloatArray,
     target: FloatArray,
@@ -87,6 +89,10 @@ def fit_similarity(
     if n < 3:
         raise GeometryError(f"similarity: {counted(n, 'common point')}, at least 3 are needed")
     w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+    if not (np.isfinite(w).all() and w.min() >= 0 and w.sum() > 0):
+        raise GeometryError(
+            "similarity: weights that are negative, not finite or all 0, expected positive ones"
+        )
     w = w / w.sum()
     centre_s, centre_t = w @ source, w @ target
     s, t = source - centre_s, target - centre_t

@@ -35,7 +35,6 @@ from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
-from sfm.orientation.resection.zeng_wang import resect_zeng_wang
 from sfm.planning.design.gain import gains
 from sfm.planning.sight.occlusion import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
@@ -47,6 +46,7 @@ from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family
 from sfm.targets.codes.tags import tag_family, tag_modules
 from sfm.targets.detect import find_targets
+from sfm.textbook.resection.zeng_wang import resect_zeng_wang
 
 IMAGES, POINTS = 8, 40
 SINGLE_IMAGES = 18  # enough unknowns for steps in single precision

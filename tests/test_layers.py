@@ -31,7 +31,15 @@ LAYERS = (
         *("sfm.point_table", "sfm.solution", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
-    ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),
+    (
+        "sfm.textbook",
+        "sfm.comparison",
+        "sfm.geometry",
+        "sfm.epochs",
+        "sfm.planning",
+        "sfm.rendering",
+        "sfm.printing",
+    ),
     ("sfm.result",),
     ("sfm.survey", "sfm.inspection"),
     ("sfm.report",),
@@ -40,7 +48,7 @@ LAYERS = (
 )
 CV2_ROOMS = (
     *("sfm.photographs", "sfm.targets", "sfm.matching", "sfm.rendering", "sfm.printing", "sfm.report"),
-    *("sfm.orientation", "sfm.survey"),
+    *("sfm.orientation", "sfm.survey", "sfm.textbook"),
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
 TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
@@ -109,7 +117,14 @@ def test_measuring_depends_on_nothing_else() -> None:
             found.add(name)
             left += imported(MODULES[name])
     rooms = {".".join(name.split(".")[:2]) for name in found}
-    assert rooms == {"sfm.conventions", "sfm.errors", "sfm.kernels", "sfm.photographs", "sfm.targets"}
+    assert rooms == {
+        "sfm.arguments",
+        "sfm.conventions",
+        "sfm.errors",
+        "sfm.kernels",
+        "sfm.photographs",
+        "sfm.targets",
+    }
 
 
 def test_only_the_command_line_and_the_public_functions_import_adapters() -> None:

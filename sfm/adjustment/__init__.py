@@ -1,6 +1,30 @@
-"""Bundle adjustment with self-calibration: begin with `solve.adjust`.
+"""Bundle adjustment with self-calibration.
 
-A caller needs `solve` (adjust a network), `result` (what comes back), `datum` (what decides position,
-attitude and scale), `covariance` (joint covariances and change of datum of a finished adjustment) and
-`separate` (points and orientations in turn). How it is computed is in `engine`, how good it is in `quality`.
+- `adjust`: begin here; a network and start values in, an `Adjustment` with covariance and tests out.
+- `predict`: the covariance of a network that nobody has photographed yet.
+- `Datum`, `change_datum`: what decides position, attitude and scale.
+- `marginal_of`: joint covariances of points.
+- `w_test`, `tau_test`: gross errors in image coordinates.
+- `estimate_error_correlation`, `with_error_correlation`, `with_neighbours`: errors that neighbouring image
+  points have in common.
+
+How it is computed is in `engine`, how good it is in `quality`.
+
+    >>> import numpy as np
+    >>> import sfm
+    >>> lens = sfm.camera_from_values("lens", "brown", (4000, 3000), (0.006, 0.006), c_mm=24.0)
+    >>> points = np.random.default_rng(1).uniform(-1, 1, (12, 3))
+    >>> centres = np.array([[-2.0, 0, 8], [2, 0, 8], [0, 2, 8], [0, -2, 8]])
+    >>> xy = np.vstack([sfm.project(lens, centre, np.eye(3), points) for centre in centres])
+    >>> network = sfm.Network.from_arrays(np.repeat(list("abcd"), 12), np.tile(range(12), 4).astype(str), xy)
+    >>> start = sfm.orient(network, [lens]).estimate
+    >>> adjustment = sfm.adjustment.adjust(network, start, sigma_px=0.1)
+    >>> adjustment.converged, adjustment.redundancy  # 96 coordinates, 60 unknowns, 7 of the datum
+    (True, 43)
 """
+
+from __future__ import annotations
+
+from sfm.runtime.public_names import public_names
+
+__getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

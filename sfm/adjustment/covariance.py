@@ -24,6 +24,7 @@ from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
 from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
+from sfm.arguments import checked_arguments
 from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
@@ -157,6 +158,7 @@ class JointOnDemand:
         return np.asarray(T @ found @ T.T)
 
 
+@checked_arguments()
 def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:
     """Return a finished adjustment with its normal equations at hand.
 
@@ -188,6 +190,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout, cross=cross))
 
 
+@checked_arguments()
 def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
     """Return the adjustment carried into another datum by an S-transformation, without adjusting again.
 
@@ -219,6 +222,7 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
     return replace(changed, datum=kind, datum_points=points)
 
 
+@checked_arguments()
 def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation) -> Adjustment:
     """Return the adjustment with a covariance that knows that errors of neighbouring image points agree.
 

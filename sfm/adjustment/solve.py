@@ -45,6 +45,7 @@ from sfm.adjustment.quality.reliability import (
     standardised_residuals,
 )
 from sfm.adjustment.result import Adjustment, Covariance
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distributions import normal_sf
@@ -59,6 +60,7 @@ MIN_HOLD = 0.01  # largest weight of the image points of a photograph below whic
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
 
 
+@checked_arguments()
 def adjust(
     network: Network,
     estimate: Estimate,
@@ -142,6 +144,7 @@ def adjust(
         )
 
 
+@checked_arguments()
 def predict(
     network: Network, estimate: Estimate, *, datum: Datum | str = FREE, sigma_px: float = 0.1
 ) -> Adjustment:

@@ -1,9 +1,22 @@
 """Comparison of solutions: two adjusters on one network, a survey with a baseline, two results of one object.
 
-- `adjusters.compare`, `adjusters.compare_adjusters`: two solutions of one network; begin here.
-- `common_problem`, `unshared`, `camera_conversion`, `undistortion`: the same problem for both: equal weights,
-  one camera model, image points without distortion.
-- `significance.compare_results`: two results by names, aligned and tested.
-- `baseline.compare_baseline`: a survey beside photographs oriented by another pipeline.
-- `adjuster_validation.validate`: two adjusters over the networks of `random_network`.
+- `compare_results`: begin here; two results by names, aligned and tested.
+- `compare`: two solutions of one network, as `sfm.compare` and the report have them.
+- `find_stable_points`, `robust_weights`: points that did not move between two epochs.
+
+`two_adjusters` puts the same problem to both: equal weights, one camera model, image points without
+distortion.
+
+    >>> import numpy as np
+    >>> from sfm.comparison import robust_weights
+    >>> shift = np.tile(np.eye(3), (5, 1))  # the datum of five points leaves their position open
+    >>> moved = np.array([[0.0, 0.1, 0], [0.1, 0, 0], [0, 0, 0.1], [0, 0, 0], [3, 0, 0]])
+    >>> robust_weights(moved, shift, np.ones(5, dtype=bool)).round(2)  # the last moved
+    array([0.57, 0.97, 0.57, 1.  , 0.02])
 """
+
+from __future__ import annotations
+
+from sfm.runtime.public_names import public_names
+
+__getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

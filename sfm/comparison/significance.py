@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
 from sfm.comparison.causes import Cause, find_cause
@@ -99,6 +100,7 @@ class ResultComparison:
         )
 
 
+@checked_arguments()
 def compare_results(
     a: Solution,
     b: Solution,

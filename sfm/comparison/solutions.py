@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Covariance
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
 from sfm.comparison.point_pairs import rounding_of
 from sfm.conventions import FloatArray
@@ -77,6 +78,7 @@ class Comparison:
         return _longest(self.points)
 
 
+@checked_arguments()
 def compare(
     a: Estimate,
     b: Estimate,

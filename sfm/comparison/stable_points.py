@@ -21,6 +21,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distributions import chi2_isf, f_isf
@@ -89,6 +90,7 @@ def candidates_of(
     return Candidates(chosen, difference, d, _weights(covariance[np.ix_(rows, rows)], basis), G.shape[1])
 
 
+@checked_arguments()
 def find_stable_points(
     among: Candidates,
     *,
@@ -219,6 +221,7 @@ def _motion_in_datum(
     return H, difference - (G @ (H @ difference.ravel())).reshape(-1, m)
 
 
+@checked_arguments(difference="n m", G="q u", candidates="n")
 def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray) -> FloatArray:
     """Return the weights of the datum in which the sum of the lengths of all differences is least (L1 norm).
 
@@ -229,9 +232,18 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
         G: what is no change, (n m, u).
         candidates: points that take part, (n,).
 
+    Raises:
+        GeometryError: no candidates, or motions of other points.
+
     Source: Chen (1983), Analysis of deformation surveys (iterative weighted similarity transformation).
     """
     m = difference.shape[1]
+    if len(G) != difference.size:
+        raise GeometryError(
+            f"robust_weights: G has {len(G)} rows, expected {difference.size}, a row a coordinate"
+        )
+    if not candidates.any():
+        raise GeometryError("robust_weights: no point takes part, expected some candidates")
     weight = candidates.astype(float)
     if not G.shape[1]:
         return weight

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value, in_datum
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
@@ -74,6 +75,7 @@ class BlockMotion:
         return any(part.significant for part in self.parts)
 
 
+@checked_arguments()
 def block_motion(
     found: Displacements, group: BoolArray, *, name: str, model: str = "rigid", alpha: float | None = None
 ) -> BlockMotion:

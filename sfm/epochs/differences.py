@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.comparison.congruency import MOTIONS, motions
 from sfm.comparison.pairing import fit_robustly, pair_results
 from sfm.comparison.point_pairs import PointPairs, coordinates_of, held_points, pairs_of_results
@@ -58,6 +59,7 @@ class Differences:
         return motions(self.xyz)[:, : MOTIONS[self.motion]]
 
 
+@checked_arguments()
 def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     """Bring the second epoch into the frame of the first, and return the differences.
 

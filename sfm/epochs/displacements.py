@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import ncfdtr
 
 from sfm.adjustment.quality.statistics import POWER
+from sfm.arguments import checked_arguments
 from sfm.comparison.causes import Cause, find_cause
 from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.stable_points import critical_value, point_blocks
@@ -86,7 +87,8 @@ class Displacements:
         return bool(self.moved.any()) or not self.agreed or self.cause is not None
 
 
-def displacements(
+@checked_arguments()
+def find_displacements(
     found: Differences, *, reference: BoolArray | None = None, alpha: float = ALPHA
 ) -> Displacements:
     """Test which points moved.

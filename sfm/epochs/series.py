@@ -12,10 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray
 from sfm.epochs.blocks import MIN_POINTS, MODELS, BlockMotion, block_motion
 from sfm.epochs.differences import Differences, epoch_differences
-from sfm.epochs.displacements import ALPHA, Displacements, displacements
+from sfm.epochs.displacements import ALPHA, Displacements, find_displacements
 from sfm.epochs.epoch import Epoch
 from sfm.epochs.together import SharedCamera, adjust_together
 from sfm.errors import GeometryError
@@ -59,6 +60,7 @@ class EpochSeries:
         return any(pair.displacements.changed for pair in self.pairs)
 
 
+@checked_arguments()
 def analyse_epochs(
     epochs: Sequence[Epoch],
     *,
@@ -101,7 +103,7 @@ def analyse_epochs(
     def analysed(first: Epoch, second: Epoch) -> EpochPair:
         found = epoch_differences(first, second)
         chosen = _reference(found, reference, (first, second)) if reference else None
-        moved = displacements(found, reference=chosen, alpha=alpha)
+        moved = find_displacements(found, reference=chosen, alpha=alpha)
         return EpochPair(
             moved,
             tuple(

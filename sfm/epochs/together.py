@@ -24,6 +24,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import FloatArray, IntArray
 from sfm.epochs.epoch import SAME, Common, Epoch, given_observations
@@ -63,6 +64,7 @@ class _Alone:
     given: dict[str, tuple[FloatArray, float]]  # Q g / s of each given value, (p + 3 k,), and the value
 
 
+@checked_arguments()
 def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[SharedCamera, ...]]:
     """Adjust epochs as one, with one interior orientation of each camera that took photographs of several.
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from sfm.arguments import checked_arguments
 from sfm.comparison.pairing import fit_robustly
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
@@ -132,6 +133,7 @@ class Nominal:
     covariance: FloatArray | None = None  # of each, object unit^2; exactly known if not given, (n, 3, 3)
 
 
+@checked_arguments()
 def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin: str) -> Alignment:
     """Return the 3-2-1 alignment: three points on Z = 0, two on Y = 0, one on X = 0.
 
@@ -168,6 +170,7 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
     return _defined("3-2-1", Similarity(1.0, rotation, t), entities)
 
 
+@checked_arguments()
 def align_features(
     z_axis: Function, x_axis: Function, origin: Function, *, on_plane: Function | None = None
 ) -> Alignment:
@@ -199,6 +202,7 @@ def align_features(
     return _defined("features", Similarity(1.0, rotation, -at), entities)
 
 
+@checked_arguments()
 def align_points(
     points: MeasuredPoints,
     nominal: Nominal,

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of
 
 
+@checked_arguments()
 def point_function(points: MeasuredPoints, name: str) -> Function:
     """Return the coordinates of a point as a function of themselves.
 
@@ -37,6 +39,7 @@ def joined(functions: list[Function]) -> Function:
     return Function(np.concatenate([one.value for one in functions]), points, np.vstack(rows))
 
 
+@checked_arguments()
 def distance(a: Function, b: Function) -> Function:
     """Return the distance of two points (object unit).
 
@@ -62,6 +65,7 @@ def difference(a: Function, b: Function) -> Function:
     return joined([a, b]).times(np.hstack([-np.eye(3), np.eye(3)]), b.value - a.value)
 
 
+@checked_arguments()
 def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -> Function:
     """Return the angle between two vectors (rad).
 
@@ -91,6 +95,7 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
     return joined([a, b]).times(J[None], np.array([np.arctan2(sine, u @ v)]))
 
 
+@checked_arguments()
 def angle_at(vertex: Function, a: Function, b: Function) -> Function:
     """Return the angle at a point between two others (rad).
 
@@ -104,6 +109,7 @@ def angle_at(vertex: Function, a: Function, b: Function) -> Function:
     return angle_of_directions(difference(vertex, a), difference(vertex, b))
 
 
+@checked_arguments()
 def height(point: Function, origin: Function, direction: Function) -> Function:
     """Return the height of a point above a plane (object unit), positive on the side of its normal.
 
@@ -120,6 +126,7 @@ def height(point: Function, origin: Function, direction: Function) -> Function:
     return joined([point, origin, direction]).times(J[None], np.array([d @ n]))
 
 
+@checked_arguments()
 def distance_from_axis(point: Function, origin: Function, direction: Function) -> Function:
     """Return the distance of a point from a line (object unit).
 
@@ -144,6 +151,7 @@ def distance_from_axis(point: Function, origin: Function, direction: Function) -
     return joined([point, origin, direction]).times(J[None], np.array([length]))
 
 
+@checked_arguments(origin="3", rotation="3 3")
 def coordinates_in(
     points: MeasuredPoints, names: list[str], origin: FloatArray, rotation: FloatArray, scale: float = 1.0
 ) -> Function:

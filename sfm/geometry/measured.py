@@ -17,6 +17,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import index_of
@@ -158,6 +159,7 @@ class MeasuredPoints:
         return np.asarray((change > INVARIANT * most.max(axis=1, keepdims=True)).any(axis=1))
 
 
+@checked_arguments()
 def measured_points(result: Solution) -> MeasuredPoints:
     """Return the points of a result that have coordinates, with the covariance that is known of them.
 

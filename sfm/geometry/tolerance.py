@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import Nominal
@@ -45,6 +46,7 @@ class Deviations:
         return self.decision.count(decision)
 
 
+@checked_arguments()
 def deviations_from_points(
     points: MeasuredPoints,
     nominal: Nominal,
@@ -69,6 +71,8 @@ def deviations_from_points(
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
+    if chosen is not None:
+        check_indices("deviations_from_points: chosen", chosen, len(points.names))
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
     common = [one for one in nominal.names if one in points.names and one in wanted]
     if not common:
@@ -87,6 +91,7 @@ def deviations_from_points(
     return Deviations(name, "nominal points", rows, length, sigma, d, 0.0, upper, coverage, decision, missing)
 
 
+@checked_arguments()
 def deviations_from_mesh(
     points: MeasuredPoints,
     mesh: Mesh,
@@ -117,6 +122,7 @@ def deviations_from_mesh(
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
+    check_indices("deviations_from_mesh: chosen", chosen, len(points.names))
     found = distances_from_mesh(points.xyz[chosen], mesh)
     value = found.distance - offset
     variance = np.einsum("ni,nij,nj->n", found.normal, points.blocks[chosen], found.normal)
@@ -126,6 +132,7 @@ def deviations_from_mesh(
     return Deviations(name, against, chosen, value, sigma, vector, lower, upper, coverage, decision)
 
 
+@checked_arguments()
 def deviations_from_shape(
     points: MeasuredPoints,
     fit: ShapeFit,
@@ -155,6 +162,7 @@ def deviations_from_shape(
     return Deviations(name, against, fit.points, value, fit.sigma, vector, lower, upper, coverage, decision)
 
 
+@checked_arguments(value="n", sigma="n")
 def decide(
     value: FloatArray, sigma: FloatArray, lower: float, upper: float, coverage: float
 ) -> tuple[str, ...]:

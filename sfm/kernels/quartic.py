@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.kernels.options import compiled_fused
 
@@ -21,6 +22,7 @@ APART = 1e-5  # discriminant of a factor over p^2 + 4 |q| above which its roots 
 CONVERGED = 1e-9  # relative step; the error after it is its square, or what rounding allows
 
 
+@checked_arguments(coefficients="5")
 def positive_roots(coefficients: FloatArray) -> FloatArray:
     """Return the positive real roots of G4 x^4 + G3 x^3 + G2 x^2 + G1 x + G0.
 

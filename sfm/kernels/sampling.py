@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled, compiled_fast, inlined_fast
@@ -38,6 +39,7 @@ def as_grey(photograph: AnyArray) -> AnyArray:
     return np.ascontiguousarray(photograph, dtype=np.float32)
 
 
+@checked_arguments(photograph="h w", xy="... 2")
 def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_tap") -> FloatArray:
     """Return the intensities of a photograph at any places.
 

@@ -1,13 +1,25 @@
 """Matching: the same points in several photographs, measured by their texture or found among unnamed targets.
 
-- `conjugate.match_points`: begin here; points of one photograph in another, by correlation and least squares.
-- `local_affinity`, `turned_templates`: its starts on wide baselines, by key points or by turned templates.
-- `relative_blur`: which photograph is blurred more, and both brought to one blur.
-- `correlation`: normalised cross-correlation in windows, along epipolar lines and in pyramids.
-- `lsm`: least squares matching of two photographs, and of many tied together by their orientation.
-- `tracks`: points of many photographs: unnamed targets, and natural texture.
-- `epipolar.epipolar_paths`: the lines, bent by distortion, on which a point may be in another photograph.
-- `normal_images.normal_images`: two photographs resampled so that these lines are their rows.
-- `radiometry`: mean, contrast and histogram of patches, equalisation, brightness of one brought to another.
-- `match_flags`: why matching gives no position.
+- `match_points`: begin here; points of one photograph in another, by correlation and least squares.
+- `match_ncc`: normalised cross-correlation in a search window; `match_lsm`: least squares matching.
+- `find_tie_points`, from `natural_points`: points of natural texture in many photographs.
+- `foerstner_points`: corners and centres of circles in the texture.
+- `match_targets`: unnamed targets of many oriented photographs.
+- `epipolar_paths`: the lines, bent by distortion, on which a point may be in another photograph.
+- `radiometry_of`, `histogram`, `equalise_histogram`, `match_brightness`, `fit_radiometry`: mean, contrast and
+  histogram, and the brightness of one photograph brought to another.
+- `resample`: intensities between pixels.
+
+    >>> import numpy as np
+    >>> from sfm.matching import match_ncc
+    >>> left = np.random.default_rng(1).integers(0, 255, (120, 120)).astype(np.uint8)
+    >>> right = np.roll(left, (2, 5), axis=(0, 1))  # 2 px down, 5 px to the right
+    >>> match_ncc(left, right, [[60, 60]], [[60, 60]], search_px=41).xy.round(1)
+    array([[65., 62.]])
 """
+
+from __future__ import annotations
+
+from sfm.runtime.public_names import public_names
+
+__getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

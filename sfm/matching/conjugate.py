@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.conjugate_patches import (
@@ -35,6 +36,7 @@ MIN_REACH_PX = 4  # of that search
 TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, LsmFlag.FLAT_TEXTURE))
 
 
+@checked_arguments(xy_left="k 2", xy_right="k 2")
 def match_points(
     left: AnyArray,
     right: AnyArray,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.camera import project, ray_directions, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, skew
 from sfm.kernels.options import compiled
@@ -33,6 +34,7 @@ def essential_matrices(position: FloatArray, rotation: FloatArray, pairs: IntArr
     return np.asarray(np.swapaxes(rotation[j], 1, 2) @ skew(unit) @ rotation[i])
 
 
+@checked_arguments(camera="m", xy="k 2")
 def epipolar_paths(
     estimate: Estimate,
     camera: IntArray,
@@ -58,8 +60,15 @@ def epipolar_paths(
         k polygons (n, 2) in px, from near to far; points behind the right camera are left out. Use them with
         `ncc.match_along_line`.
 
+    Raises:
+        GeometryError: an index of a photograph or camera that is not there.
+
     Source: Kraus (2007), sec. 4.3: an epipolar line is the picture of the other photograph's ray.
     """
+    check_indices(
+        "epipolar_paths: left, right", np.array([left, right]), min(len(camera), len(estimate.position))
+    )
+    check_indices("epipolar_paths: camera", camera, len(estimate.cameras))
     uv = tangents_from_pixel(estimate.cameras[camera[left]], xy)
     direction = ray_directions(uv, estimate.rotation[left])
     # equal steps in 1 / depth are about equal steps in the picture

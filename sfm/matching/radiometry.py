@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 
@@ -128,6 +129,7 @@ def patch_around(photograph: AnyArray, centre: tuple[int, int], side_px: int) ->
     return photograph[row - half : row + half + 1, col - half : col + half + 1]
 
 
+@checked_arguments()
 def radiometry_of(patch: AnyArray) -> Radiometry:
     """Return mean, standard deviation and extremes of a patch or photograph.
 
@@ -141,6 +143,7 @@ def radiometry_of(patch: AnyArray) -> Radiometry:
     return Radiometry(float(values.mean()), deviation, float(values.min()), float(values.max()))
 
 
+@checked_arguments()
 def histogram(photograph: AnyArray) -> IntArray:
     """Return the number of pixels at each intensity, (256,) or (65536,) for 16 bit.
 
@@ -161,6 +164,7 @@ def histogram(photograph: AnyArray) -> IntArray:
     return np.asarray(np.bincount(values, minlength=levels))
 
 
+@checked_arguments()
 def equalise_histogram(photograph: AnyArray) -> AnyArray:
     """Return the photograph with the intensities spread so that all are equally frequent, same type.
 
@@ -185,6 +189,7 @@ def equalise_histogram(photograph: AnyArray) -> AnyArray:
     return np.asarray(np.rint(np.clip(share, 0, 1) * (len(counts) - 1)).astype(kind)[values])
 
 
+@checked_arguments()
 def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
     """Return offset and gain that bring the intensities of one patch nearest to another, pixel by pixel.
 
@@ -212,6 +217,7 @@ def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
     return LinearRadiometry(float(b.mean() - gain * a.mean()), gain, float(r))
 
 
+@checked_arguments()
 def match_brightness(source: AnyArray, target: AnyArray) -> FloatArray:
     """Return the source with mean and standard deviation of the target; the two need not show the same.
 

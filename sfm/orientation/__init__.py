@@ -1,13 +1,29 @@
 """Orientation: from measured image points to approximate values of photographs and object points.
 
-- `sequence.orient`: begin here; a whole network from its image points and nothing else.
-- `resection`: one photograph on known points, one method a file.
-- `relative.relative_orientations`: two photographs from conjugate rays alone, whatever the scene;
-  `pair.orient_dependent`, `pair.orient_independent`: with the five classical parameters;
-  `coplanarity.refine_coplanarity`: the adjustment below both.
-- `intersection.intersect`: object points from the rays of oriented photographs.
-- `absolute.orient_absolute`: a model onto control; `direct.orient_direct`: photographs onto control at once.
-- `fiducials.orient_fiducials`: interior orientation of scanned photographs.
-- `photo_coordinates.correct_photo_coordinates`, `photo_coordinates.photo_coordinates`: corrections for
-  distortion, refraction and earth curvature, and simulated photographs.
+- `orient`: begin here; a whole network from its image points and nothing else.
+- `resect_robust`: one photograph on known points, of which some may be wrong; `resect_fischler_bolles` from
+  three points (by the roots of `leg_quartic`; `choose_by_line` finds the true one of its solutions),
+  `resect_least_squares` from a start, with its covariance. `expected_trials`: how many samples it takes.
+- `relative_orientations`: two photographs from conjugate rays alone, whatever the scene;
+  `refine_coplanarity`: the adjustment of them.
+- `intersect`: object points from the rays of oriented photographs.
+- `orient_absolute`: a model onto control.
+
+Rays are tangents u = -U/W, v = -V/W, which `sfm.camera.tangents_from_pixel` makes of pixels. Other methods of
+resection, of pairs and of scanned photographs are in `sfm.textbook`.
+
+    >>> import numpy as np
+    >>> from sfm.orientation import resect_robust, tangents_of
+    >>> points = np.array([[0.0, 0, 0], [4, 0, 1], [4, 3, 0], [0, 3, 1], [2, 1, 2]])
+    >>> tangents = tangents_of([2, 1, 10], np.eye(3), points)  # of a camera above them that looks down
+    >>> tangents[4] += 0.1  # a gross error
+    >>> found = resect_robust(tangents, points, tolerance=0.001)
+    >>> found.position.round(6), found.inliers
+    (array([ 2.,  1., 10.]), array([ True,  True,  True,  True, False]))
 """
+
+from __future__ import annotations
+
+from sfm.runtime.public_names import public_names
+
+__getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

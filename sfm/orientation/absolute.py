@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
 from sfm.similarity import Similarity, fit_similarity
 
@@ -23,6 +24,7 @@ class AbsoluteOrientation:
     covariance: FloatArray  # of scale, three small turns about control axes (rad) and the shift, (7, 7)
 
 
+@checked_arguments(model="n 3", control="n 3", weights="n")
 def orient_absolute(
     model: FloatArray, control: FloatArray, *, weights: FloatArray | None = None
 ) -> AbsoluteOrientation:

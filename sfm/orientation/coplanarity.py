@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -16,6 +17,7 @@ CONVERGED = 1e-12  # sum of the five steps, rad
 HALVINGS = 8
 
 
+@checked_arguments(first="n 2", second="n 2", base="3", rotation="3 3")
 def refine_coplanarity(
     first: FloatArray, second: FloatArray, base: FloatArray, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

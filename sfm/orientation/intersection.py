@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import solve_scaled
@@ -31,6 +32,7 @@ class Intersection:
     redundancy: int  # 2 (rays used) - 3 (points)
 
 
+@checked_arguments(tangents="k 2", image="k", point="k", positions="m 3", rotations="m 3 3", weights="k 2 2")
 def intersect(
     tangents: FloatArray,
     image: IntArray,
@@ -60,11 +62,16 @@ def intersect(
     Returns:
         Points with covariance; a point needs two rays and lies in front of all photographs that see it.
 
+    Raises:
+        GeometryError: an index of a photograph or point that is not there.
+
     Source: Foerstner, Wrobel (2016), sec. 13.4: the point nearest to the rays, then Gauss-Newton on
     the collinearity equations. The two-ray candidates are weighed against all other rays as in RANSAC.
     """
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     n = int(np.max(point, initial=-1)) + 1 if n_points is None else n_points
+    check_indices("intersect: image", image, len(positions))
+    check_indices("intersect: point", point, n)
     P = np.broadcast_to(np.eye(2), (len(uv), 2, 2)) if weights is None else weights
     oriented = np.asarray(np.isfinite(positions).all(axis=1))
     usable = oriented[image] & np.isfinite(uv).all(axis=1)

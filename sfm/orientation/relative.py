@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from scipy.special import fdtri
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -66,6 +67,7 @@ class RelativeOrientation:
         return float(np.sqrt(np.mean(self.residuals[self.inliers] ** 2)))
 
 
+@checked_arguments(first="n 2", second="n 2")
 def relative_orientations(
     first: FloatArray,
     second: FloatArray,

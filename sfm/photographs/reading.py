@@ -10,6 +10,7 @@ from typing import overload
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray
 from sfm.errors import PhotographError
 from sfm.photographs.file_checks import opened_header, read_bytes, refuse_bomb, refuse_truncated
@@ -22,6 +23,7 @@ CHANNELS = ("luminance", "red", "green", "blue")
 SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
 
 
+@checked_arguments()
 def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray:
     """Read one photograph as stored: never turned by its EXIF orientation, all bits kept.
 

@@ -1,8 +1,21 @@
 """Planning: what a network must be like before anything is photographed.
 
-- `sight.visibility.sight_of`: which point is seen from where, and how precisely.
-- `prediction.predict_network`: what photographs from given stations will give.
-- `design.designer.design_network`: stations that give what is wanted.
-- `plan.plan_of`: all that is said of a plan.
-- `target_size.target_size`: how large targets must be.
+- `compute_target_size`: how large targets must be.
+- `shape_object`, `object_of_points`, `object_of_mesh`: the object.
+- `arrangement`, then `predict_network`: stations of the textbooks, and what photographs from them give.
+- `design_network`: stations that give what is wanted; `further_photographs`: what to add to a survey.
+- `sight_of`, `depth_of_field`, `hidden_points` (by the `box_tree` of a mesh), `centre_covariance`: which
+  point is seen from where, and how precisely.
+- `calibratability`, `choose_coded`: whether the camera can be calibrated, and which targets must be coded.
+
+    >>> from sfm.planning import compute_target_size
+    >>> size = compute_target_size(p=10, w_mm=36.0, d=3000.0, c_mm=28.0, n=6000)
+    >>> round(size.diameter, 2), round(size.ring, 2)  # mm, as the distance
+    (6.43, 19.29)
 """
+
+from __future__ import annotations
+
+from sfm.runtime.public_names import public_names
+
+__getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

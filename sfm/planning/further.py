@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
@@ -46,6 +47,7 @@ class Further:
     adjustment: Adjustment  # predicted, of survey and further photographs together
 
 
+@checked_arguments()
 def further_photographs(
     network: Network,
     estimate: Estimate,

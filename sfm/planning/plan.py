@@ -16,7 +16,7 @@ from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.shots import Shot, choose_coded, shots
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations
-from sfm.planning.target_size import MIN_PIXELS, STEEPEST_DEG, TargetSize, target_size
+from sfm.planning.target_size import MIN_PIXELS, STEEPEST_DEG, TargetSize, compute_target_size
 from sfm.planning.wanted import Wanted, short_of
 from sfm.planning.weakness import (
     Calibratability,
@@ -90,7 +90,7 @@ def describe_plan(
     camera = prediction.camera
     far = max(float(d) for d in _distances(prediction))
     width = camera.size_px[0]
-    size = target_size(
+    size = compute_target_size(
         p=MIN_PIXELS,
         w_mm=width * float(camera.pixel_mm[0]),
         d=far,

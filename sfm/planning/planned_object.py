@@ -16,6 +16,7 @@ from heapq import heapify, heappop, heappushpop
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -63,6 +64,7 @@ class PlannedObject:
         return float(np.linalg.norm(np.ptp(self.xyz, axis=0)))
 
 
+@checked_arguments(xyz="n 3", normals="n 3")
 def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArray | None) -> PlannedObject:
     """Return points as an object without a surface.
 
@@ -72,11 +74,14 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
         normals: directions that they face, of any length, (n, 3); None where not known.
 
     Raises:
-        GeometryError: fewer than 3 points, all on one line, too large, or a normal of length 0.
+        GeometryError: fewer than 3 points, more or fewer names, all on one line, too large, or a normal of
+            length 0.
     """
     count = counted(len(xyz), "point")
     if len(xyz) < 3:
         raise GeometryError(f"object: {count}, needed 3 or more")
+    if len(names) != len(xyz):
+        raise GeometryError(f"object: {len(names)} names for {count}, needed one for each")
     _refuse_too_large(xyz)
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if extent[1] <= ON_LINE * extent[0]:
@@ -89,6 +94,7 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
     return PlannedObject(names, xyz, normals / length[:, None])
 
 
+@checked_arguments()
 def object_of_mesh(
     mesh: Mesh, count: int, *, open_surface: bool = False, bare: BoolArray | None = None
 ) -> PlannedObject:
@@ -140,6 +146,7 @@ def object_of_mesh(
     return PlannedObject(names, xyz[kept], (across / np.maximum(area, 1e-300)[:, None])[which[kept]], mesh)
 
 
+@checked_arguments()
 def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObject:
     """Return points spread evenly over a simple shape.
 

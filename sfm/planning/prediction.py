@@ -19,6 +19,7 @@ import numpy as np
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
@@ -135,6 +136,7 @@ class Prediction:
         return largest_length_sigma(a.estimate.points[some], Q)
 
 
+@checked_arguments()
 def predict_network(
     planned: PlannedObject,
     camera: Camera,

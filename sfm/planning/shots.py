@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.planning.sight.optics import best_focus
 from sfm.planning.stations import Stations
@@ -81,6 +82,7 @@ def roll_deg(rotation: FloatArray) -> float:
     return float(np.round(np.degrees(np.arctan2(rotation[:, 0] @ up, rotation[:, 0] @ level)), 9) + 0.0)
 
 
+@checked_arguments(seen="m n")
 def choose_coded(seen: BoolArray, *, per_photograph: int = CODED) -> IntArray:
     """Return few points which, as coded targets, give every photograph so many, or all that it shows.
 

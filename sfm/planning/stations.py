@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
@@ -55,6 +56,7 @@ class Stations:
         return len(np.unique(np.round(self.position, 9), axis=0))
 
 
+@checked_arguments()
 def arrangement(text: str, planned: PlannedObject, camera: Camera) -> Stations:
     """Return the stations of an arrangement that fills the photographs with the object.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from sfm.arguments import checked_arguments
 from sfm.errors import GeometryError
 
 MIN_PIXELS = 7.0  # on a target, as the source takes it; the measurement itself begins at 3
@@ -20,7 +21,8 @@ class TargetSize:
     pixel: float  # side of a pixel at the object, unit of the distance
 
 
-def target_size(
+@checked_arguments()
+def compute_target_size(
     *,
     p: float,
     w_mm: float,

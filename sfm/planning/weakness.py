@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from sfm.adjustment.quality.correlations import OrientationCorrelation, orientation_correlations
 from sfm.adjustment.quality.projection import projection_covariance
 from sfm.adjustment.quality.statistics import Correlation, correlations
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
 from sfm.display import counted
@@ -134,6 +135,7 @@ def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(network.images[k] for k in one) for one in groups)
 
 
+@checked_arguments()
 def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability | None:
     """Return whether the network determines the free parameters of its camera; None where it has none.
 

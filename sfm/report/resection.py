@@ -10,9 +10,9 @@ from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.files.plain_text import or_none
-from sfm.orientation.resection.by_method import Resected
 from sfm.orientation.resection.candidates import ResectionSolution
-from sfm.orientation.resection.dlt import DirectLinearTransformation
+from sfm.textbook.resection.by_method import Resected
+from sfm.textbook.resection.dlt import DirectLinearTransformation
 
 
 def resection_json(found: Resected, c: float) -> dict[str, Any]:

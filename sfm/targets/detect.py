@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.kernels.sampling import as_grey
@@ -83,6 +84,7 @@ class Targets:
         return f"<{len(self)} targets, {coded} of them coded, {rejected} candidates rejected>"
 
 
+@checked_arguments()
 def find_targets(
     photograph: AnyArray,
     *,

@@ -17,12 +17,12 @@ from sfm.adjustment.engine.solvers.dense import schur_complement
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.separate import adjust_separately
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, project
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.textbook.separate import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 
 FREE = Datum("free")

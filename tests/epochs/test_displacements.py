@@ -11,7 +11,7 @@ from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import FloatArray
 from sfm.epochs.blocks import block_motion
 from sfm.epochs.differences import epoch_differences
-from sfm.epochs.displacements import Displacements, detectable_shift, displacements
+from sfm.epochs.displacements import Displacements, detectable_shift, find_displacements
 from sfm.errors import GeometryError
 from tests.epochs.scenes import BAR_SIGMA, POINTS, epoch, scene
 
@@ -19,7 +19,7 @@ MOVED = (4, 16, 21, 40, 57)
 
 
 def compared(seed: int, shift: FloatArray | None = None, **options: object) -> Displacements:
-    return displacements(epoch_differences(epoch(2 * seed), epoch(2 * seed + 1, shift)), **options)  # type: ignore[arg-type]
+    return find_displacements(epoch_differences(epoch(2 * seed), epoch(2 * seed + 1, shift)), **options)  # type: ignore[arg-type]
 
 
 def shift_of(points: tuple[int, ...], sigmas: float, seed: int) -> FloatArray:
@@ -229,14 +229,14 @@ def test_a_reference_on_a_line_is_refused() -> None:
     found = epoch_differences(epoch(1), epoch(2))
     line = replace(found, xyz=np.where(np.arange(POINTS)[:, None] < 5, found.xyz * [1.0, 0, 0], found.xyz))
     with pytest.raises(GeometryError, match="lie on a line"):
-        displacements(line, reference=np.arange(POINTS) < 5)
+        find_displacements(line, reference=np.arange(POINTS) < 5)
 
 
 def test_bad_input_is_one_line() -> None:
     found = epoch_differences(epoch(1), epoch(2))
     with pytest.raises(GeometryError, match=r"3 points of reference, expected 4 or more"):
-        displacements(found, reference=np.arange(POINTS) < 3)
-    moved = displacements(found)
+        find_displacements(found, reference=np.arange(POINTS) < 3)
+    moved = find_displacements(found)
     with pytest.raises(GeometryError, match=r"group pier: 2 points, a rigid motion needs 3 or more"):
         block_motion(moved, np.arange(POINTS) < 2, name="pier")
     with pytest.raises(GeometryError, match="0 stable points outside of it"):

@@ -13,7 +13,7 @@ from sfm.comparison.stable_points import in_datum
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.epochs.differences import Differences, epoch_differences
-from sfm.epochs.displacements import displacements
+from sfm.epochs.displacements import find_displacements
 from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import analyse_epochs
 from sfm.epochs.together import adjust_together
@@ -150,7 +150,7 @@ def statistics(pairs: int) -> list[float]:
         pair = epoch(2 * seed, bar_errors=errors), epoch(2 * seed + 1, bar_errors=errors)
         differences = epoch_differences(*adjust_together(pair)[0])
         assert differences.shared == ("bar 1 - 31", "bar 12 - 50")
-        found.append(displacements(differences).congruency.first_test.statistic)
+        found.append(find_displacements(differences).congruency.first_test.statistic)
     return found
 
 

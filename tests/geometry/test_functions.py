@@ -20,9 +20,9 @@ from sfm.geometry.functions import (
     height,
     point_function,
 )
+from sfm.geometry.hidden_points import with_hidden_point
 from sfm.geometry.measured import Function, MeasuredPoints, matches, measured_points
 from sfm.geometry.shapes.fit import fit_shape
-from sfm.inspection.measure import with_hidden_point
 from tests.geometry.simulated import in_free_datum, random_covariance
 from tests.inspection.benches import one_bench
 from tests.synthetic import seed_of

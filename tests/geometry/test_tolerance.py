@@ -11,11 +11,11 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import Nominal
 from sfm.geometry.functions import distance, point_function
+from sfm.geometry.hidden_points import with_hidden_point
 from sfm.geometry.measured import MeasuredPoints
 from sfm.geometry.mesh import Mesh, distances_from_mesh
 from sfm.geometry.shapes.fit import fit_shape
 from sfm.geometry.tolerance import decide, deviations_from_mesh, deviations_from_points, deviations_from_shape
-from sfm.inspection.measure import with_hidden_point
 from tests.geometry.simulated import points_on, random_covariance, simulated_shape
 from tests.synthetic import seed_of
 

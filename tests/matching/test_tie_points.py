@@ -30,7 +30,6 @@ from sfm.conventions import (
     rotation_from_vector,
 )
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import SHARED, Covered, Windows, first_alike, points_apart
@@ -62,6 +61,7 @@ from sfm.survey.measuring.covering_points import _returning, find_covering_point
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import refine_model, refinement_text
+from sfm.textbook.along_line import match_along_line
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
 

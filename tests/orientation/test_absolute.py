@@ -7,8 +7,8 @@ from sfm.camera import tangents_from_pixel
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.orientation.absolute import orient_absolute
-from sfm.orientation.direct import orient_direct
 from sfm.similarity import Similarity
+from sfm.textbook.direct import orient_direct
 from tests.synthetic import make_network, seed_of
 
 

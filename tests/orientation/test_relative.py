@@ -7,8 +7,8 @@ from sfm.conventions import rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.orientation.coplanarity import coplanarity_residuals, refine_coplanarity, turned_pair
 from sfm.orientation.homography import decompose_homography, fit_homography
-from sfm.orientation.incremental.pair import orient_dependent, orient_independent
 from sfm.orientation.relative import model_points, relative_orientations
+from sfm.textbook.pair import orient_dependent, orient_independent
 from tests.synthetic import seed_of
 
 SIGMA = 1e-5

@@ -10,22 +10,24 @@ import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.planning.target_size import target_size
+from sfm.planning.target_size import compute_target_size
 from sfm.report.figures.design_diagram import DIAGRAM_PIXELS, design_diagram
 
 
 def test_formula_of_document_000() -> None:
     # 7 px with the document's Nikon D60 (23.6 mm, 3872 px) and 18 mm: a line through the origin
-    size = target_size(p=7, w_mm=23.6, d=5000.0, c_mm=18.0, n=3872)
+    size = compute_target_size(p=7, w_mm=23.6, d=5000.0, c_mm=18.0, n=3872)
     assert size.diameter == pytest.approx(7 * 23.6 * 5000 / (18 * 3872), abs=1e-12)
     assert size.diameter == pytest.approx(11.85, abs=0.01)
     assert size.ring == pytest.approx(3 * size.diameter)
-    assert target_size(p=7, w_mm=23.6, d=10.0, c_mm=18.0, n=3872).diameter == pytest.approx(0.0237, abs=1e-4)
+    assert compute_target_size(p=7, w_mm=23.6, d=10.0, c_mm=18.0, n=3872).diameter == pytest.approx(
+        0.0237, abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("tilt", [0.0, 60.0])
 def test_a_target_of_that_size_shows_that_many_pixels(tilt: float) -> None:
-    size = target_size(p=12, w_mm=36.0, d=3000.0, c_mm=28.0, n=6000, tilt_deg=tilt)
+    size = compute_target_size(p=12, w_mm=36.0, d=3000.0, c_mm=28.0, n=6000, tilt_deg=tilt)
     camera = camera_from_values("c", "brown", (6000, 4000), (0.006, 0.006), c_mm=28.0)
     t = np.linspace(0, 2 * np.pi, 721)
     r, slope = size.diameter / 2, np.radians(tilt)
@@ -47,7 +49,7 @@ def test_a_target_of_that_size_shows_that_many_pixels(tilt: float) -> None:
 def test_nonsense_is_refused(wrong: dict[str, float], message: str) -> None:
     given = {"p": 7, "w_mm": 36.0, "d": 1000.0, "c_mm": 24.0, "n": 6000} | wrong
     with pytest.raises(GeometryError, match=message):
-        target_size(**given)
+        compute_target_size(**given)
 
 
 def test_command() -> None:
@@ -79,7 +81,7 @@ def test_command() -> None:
 def test_the_design_diagram_ends_at_the_diameters_of_the_farthest_distance() -> None:
     """Document 000, fig. 2.11: 7 px of a Nikon D60 at 18 mm; 23.6 mm x 7 / (18 mm x 3872) = 2.37 mm per m."""
     given = {"w_mm": 23.6, "d": 10.0, "c_mm": 18.0, "n": 3872}
-    assert 1000 * target_size(p=7, **given).diameter == pytest.approx(23.703, abs=5e-4)
+    assert 1000 * compute_target_size(p=7, **given).diameter == pytest.approx(23.703, abs=5e-4)
     root = ElementTree.fromstring(design_diagram(unit="m", **given))
     path = "{http://www.w3.org/2000/svg}path"
     ends = {}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.orientation.resection import METHODS
-from sfm.orientation.resection.by_method import resect, resect_by_all
 from sfm.report.resection import comparison_table, resection_json, resection_text
 from sfm.survey.inputs.resection_points import read_task
+from sfm.textbook.resection import METHODS
+from sfm.textbook.resection.by_method import resect, resect_by_all
 from tests.orientation.resection.test_least_squares import LAB2, TRUTH
 from tests.places import ROOT
 

@@ -20,6 +20,7 @@ from scipy.sparse import csr_matrix
 from sfm.adjustment.covariance import marginal_of, with_error_correlation
 from sfm.adjustment.engine.linearised import linearise
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import rows_of
 
@@ -29,6 +30,7 @@ WAVES = 64  # of a field in one photograph
 ROUNDS = 5  # of weighting by the expectations; the second hardly changes them
 
 
+@checked_arguments()
 def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | None:
     """Return the correlation of the errors of neighbouring image points that fits the residuals best.
 
@@ -75,6 +77,7 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
     return ErrorCorrelation(float(of_each), float(of_neighbours), float(length_px))
 
 
+@checked_arguments()
 def with_neighbours(adjustment: Adjustment) -> Adjustment:
     """Return the adjustment with the covariance of errors that neighbours have in common by the residuals."""
     found = estimate_error_correlation(adjustment)

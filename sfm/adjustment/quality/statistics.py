@@ -17,10 +17,12 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
 from sfm.adjustment.result import Adjustment
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MODELS
 from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
+from sfm.errors import GeometryError
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
@@ -146,11 +148,13 @@ def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> Glob
     return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)
 
 
+@checked_arguments()
 def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     """Return Baarda's test of each image coordinate: w is standard normal where sigma0 is as stated."""
     return _coordinate_test(adjustment, adjustment.standardised, float(normal_ppf(1 - alpha / 2)), alpha)
 
 
+@checked_arguments()
 def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     """Return Pope's test of each image coordinate, which takes sigma0 from the adjustment."""
     critical = tau_critical(alpha, adjustment.redundancy)
@@ -188,6 +192,10 @@ def more_than_chance(events: IntArray, trials: IntArray, level: float) -> BoolAr
 def _coordinate_test(
     adjustment: Adjustment, statistic: FloatArray, critical: float, alpha: float
 ) -> CoordinateTest:
+    if not 0 < alpha < 1:
+        raise GeometryError(
+            f"test of image coordinates: alpha is {alpha:g}, expected more than 0 and below 1"
+        )
     r = adjustment.redundancy_numbers
     checked = np.isfinite(r) & (r > UNCONTROLLED)
     shown = np.where(np.isfinite(r), statistic, np.nan)

@@ -10,8 +10,8 @@ import typer
 
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.orientation.resection import METHODS
 from sfm.runtime.faults import working_on
+from sfm.textbook.resection import METHODS
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray
@@ -142,10 +142,10 @@ def resect(
     By any of the methods, or all of them for a comparison.
     """
     with loading():
-        from sfm.orientation.resection.by_method import resect as resect_by
-        from sfm.orientation.resection.by_method import resect_by_all
         from sfm.report.resection import comparison_json, comparison_table, resection_json, resection_text
         from sfm.survey.inputs.resection_points import read_task
+        from sfm.textbook.resection.by_method import resect as resect_by
+        from sfm.textbook.resection.by_method import resect_by_all
 
     with working_on(str(points)):
         task = read_task(

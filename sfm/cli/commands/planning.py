@@ -10,7 +10,7 @@ import typer
 from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.target_size import MIN_PIXELS, target_size
+from sfm.planning.target_size import MIN_PIXELS, compute_target_size
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def target_size_command(
     codes = code_family(family)
     if not isinstance(codes, CodeFamily):
         raise SurveyFileError(f"--family {family}: needed rings, such as ring14")
-    size = target_size(
+    size = compute_target_size(
         p=pixels, w_mm=width, d=distance, c_mm=c, n=columns, tilt_deg=tilt, ring_per_dot=codes.outer
     )
     print(f"diameter of the dot   {size.diameter:.4g} {unit}, {pixels:g} px across at {tilt:g} deg tilt")

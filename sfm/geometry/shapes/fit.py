@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
@@ -100,6 +101,7 @@ class ShapeFit:
         return float(self.parameter_sigma[self.parameters.rows(name)][0])
 
 
+@checked_arguments()
 def fit_shape(
     points: MeasuredPoints,
     kind: str,
@@ -143,7 +145,8 @@ def _rows(points: MeasuredPoints, chosen: Sequence[str] | IntArray | None) -> In
     if chosen is None:
         return np.arange(len(points.names))
     if isinstance(chosen, np.ndarray):
-        return np.asarray(chosen, dtype=np.int64)
+        check_indices("fit_shape: chosen", chosen, len(points.names))
+        return chosen.astype(np.int64)
     return np.array([points.index(one) for one in chosen], dtype=np.int64)
 
 

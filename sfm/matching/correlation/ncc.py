@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -60,6 +61,7 @@ class NccMatches:
         return np.asarray(self.flag == 0)
 
 
+@checked_arguments(xy_left="k 2", xy_right="n 2")
 def match_ncc(
     left: AnyArray,
     right: AnyArray,

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -85,6 +86,7 @@ class LsmMatches:
         return np.asarray(self.flag == 0)
 
 
+@checked_arguments(xy_left="k 2", xy_right="n 2")
 def match_lsm(
     left: AnyArray | Grey,
     right: AnyArray | Grey,

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
@@ -54,6 +55,7 @@ class Correspondences:
         return np.bincount(self.point, minlength=len(self.points))
 
 
+@checked_arguments(camera="m")
 def match_targets(
     estimate: Estimate,
     camera: IntArray,
@@ -95,11 +97,27 @@ def match_targets(
     (epipolar search in several photographs); Moisan and Stival (2004), IJCV 57(3) (false alarms).
     """
     m = len(estimate.position)
-    for what, given in (("cameras", camera), ("lists of targets", targets)):
-        if len(given) != m:
+    lists = (
+        ("cameras", camera),
+        ("lists of targets", targets),
+        ("kinds", kinds),
+        ("diameters", diameters_px),
+    )
+    for what, given in lists:
+        if given is not None and len(given) != m:
             raise GeometryError(
                 f"matching: {len(given)} {what} for {counted(m, 'photograph')}, needed one for each"
             )
+    for i, one in enumerate(targets):
+        if one.size and one.shape != (len(one), 2):
+            raise GeometryError(f"matching: targets of photograph {i} of shape {one.shape}, needed (k, 2)")
+        for numbers in (kinds, diameters_px):
+            if numbers is not None and len(numbers[i]) != len(one):
+                raise GeometryError(
+                    f"matching: {len(numbers[i])} kinds or diameters for {counted(len(one), 'target')} of "
+                    f"photograph {i}, needed one for each"
+                )
+    check_indices("match_targets: camera", camera, len(estimate.cameras))
     if min_rays < 2:
         raise GeometryError(f"matching: min_rays is {min_rays}, an object point needs at least 2 rays")
     scene, unusable = _scene(estimate, camera, targets, kinds, diameters_px, tolerance_px, max_size_ratio)

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
 from sfm.matching.grey_photographs import GreyPhotographs
@@ -61,6 +63,7 @@ class TiePoints:
         return len(self.image)
 
 
+@checked_arguments()
 def find_tie_points(
     photographs: Sequence[AnyArray],
     natural: Sequence[NaturalPoints],
@@ -91,9 +94,17 @@ def find_tie_points(
     Returns:
         The tie points; n may be 0.
 
+    Raises:
+        GeometryError: no photographs, or natural points of more or fewer.
+
     Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
     (1985) for the measurement.
     """
+    if not photographs or len(natural) != len(photographs):
+        raise GeometryError(
+            f"find_tie_points: {len(photographs)} photographs and natural points of {len(natural)}, expected "
+            "those of each"
+        )
     m, fewest = len(photographs), min_rays if min_image_points == 0 else min(2, min_rays)
     tracks = link_features(
         natural, min_rays=fewest, seed=seed, threads=threads, known=known, neighbours=neighbours

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -44,6 +45,7 @@ class InterestPoints:
         return len(self.xy)
 
 
+@checked_arguments()
 def foerstner_points(
     photograph: AnyArray,
     *,

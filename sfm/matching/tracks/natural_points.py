@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.tracks.features import Features, sift_features
@@ -21,6 +22,7 @@ class NaturalPoints(Features):
     corners: FloatArray  # px, the strongest first, (c, 2); none where features stay where they are
 
 
+@checked_arguments()
 def natural_points(
     photograph: AnyArray, *, detector: str = "foerstner", max_features: int = 2000
 ) -> NaturalPoints:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted, listed
@@ -62,6 +63,7 @@ class Orientation:
     remarks: tuple[Remark, ...] = ()  # given values of no use, and what the image points do not decide
 
 
+@checked_arguments()
 def orient(
     network: Network,
     estimate: Estimate | Sequence[Camera],

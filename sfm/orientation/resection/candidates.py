@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -55,6 +56,7 @@ class LineFit:
     departure: float  # root mean square distance from the line of slope 1 through 0, tangents
 
 
+@checked_arguments(tangents="n 2")
 def choose_by_line(
     solutions: tuple[ResectionSolution, ...], tangents: FloatArray
 ) -> tuple[ResectionSolution, tuple[LineFit, ...]]:
@@ -68,7 +70,8 @@ def choose_by_line(
         The chosen solution, and the line of every solution in the order given.
 
     Raises:
-        GeometryError: fewer than four points, or no solution that has all of them in front of the camera.
+        GeometryError: fewer than four points, others than those of the solutions, or no solution that has all
+            of them in front of the camera.
 
     Source: document 001, secs. 4.2.1 and 5.1: the unique solution of the P3P by fitting a line through at
     least four points. The document names the principle without formulas; this is our reading of it.
@@ -76,6 +79,11 @@ def choose_by_line(
     if len(tangents) < MIN_TO_CHOOSE:
         raise GeometryError(
             f"line fitting: {counted(len(tangents), 'point')}, at least {MIN_TO_CHOOSE} are needed"
+        )
+    if any(len(solution.residuals) != len(tangents) for solution in solutions):
+        raise GeometryError(
+            f"line fitting: {counted(len(tangents), 'image point')}, needed those that the solutions have "
+            "residuals of"
         )
     lines = tuple(_fit(tangents.ravel(), (tangents + solution.residuals).ravel()) for solution in solutions)
     departures = [line.departure for line in lines]
@@ -94,6 +102,7 @@ def _fit(measured: FloatArray, computed: FloatArray) -> LineFit:
     return LineFit(float(slope), float(intercept), float(scatter), float(departure))
 
 
+@checked_arguments(position="3", rotation="3 3", points="n 3")
 def tangents_of(position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
     """Return the tangents of object points by the collinearity equations.
 

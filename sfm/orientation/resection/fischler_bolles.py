@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled_fused
@@ -32,6 +33,7 @@ class Poses:
     legs: FloatArray  # distances from the projection centre to the points, object unit, (k, 4, 3)
 
 
+@checked_arguments(tangents="k 2", points="n 3")
 def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientations from the first three points, the one that all points confirm first.
 
@@ -75,6 +77,7 @@ def resect_triples(rays: FloatArray, points: FloatArray) -> Poses:
     return Poses(*_resect_batch(rays, points))
 
 
+@checked_arguments(rays="3 3", points="3 3")
 def leg_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     """Return the coefficients G4, G3, G2, G1, G0 of the quartic in x = b/a of one triple, shape (5,).
 

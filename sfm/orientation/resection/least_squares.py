@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -38,6 +39,7 @@ class Resection:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
+@checked_arguments(tangents="n 2", points="n 3", position="3", rotation="3 3", weights="n 2 2")
 def resect_least_squares(
     tangents: FloatArray,
     points: FloatArray,

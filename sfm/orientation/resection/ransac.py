@@ -10,8 +10,10 @@ from math import comb
 import numpy as np
 from scipy.special import bdtrc
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
+from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
@@ -67,6 +69,7 @@ class RobustResection:
         return not self.reason
 
 
+@checked_arguments(tangents="n 2", points="n 3")
 def resect_robust(
     tangents: FloatArray,
     points: FloatArray,
@@ -165,6 +168,7 @@ def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAM
     return bisect_left(range(n), True, lo=needed, key=enough)
 
 
+@checked_arguments()
 def expected_trials(w: float, n: int) -> tuple[float, float]:
     """Return expectation E(k) and standard deviation SD(k) of the trials until a sample is free of errors.
 
@@ -172,8 +176,13 @@ def expected_trials(w: float, n: int) -> tuple[float, float]:
         w: probability that a point is right.
         n: points in a sample.
 
+    Raises:
+        GeometryError: a probability or number that cannot be.
+
     Source: Fischler, Bolles (1981), sec. II.B: E(k) = w^-n, SD(k) = sqrt(1 - w^n) w^-n.
     """
+    if not (0 < w <= 1 and n > 0):
+        raise GeometryError(f"expected_trials: w is {w:g} and n is {n}, expected 0 < w <= 1 and n >= 1")
     good = w**n
     return 1.0 / good, float(np.sqrt(1.0 - good)) / good
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
@@ -49,6 +50,7 @@ class Design:
     photographs_tried: int  # candidates, upright and rolled
 
 
+@checked_arguments()
 def design_network(
     planned: PlannedObject,
     camera: Camera,

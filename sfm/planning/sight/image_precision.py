@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
@@ -37,6 +38,7 @@ class TargetImage:
                 raise GeometryError(f"target: {name} is {value:g}, needed more than 0")
 
 
+@checked_arguments(axes="k 2")
 def centre_covariance(axes: FloatArray, target: TargetImage) -> FloatArray:
     """Return the covariance of the centres of ellipses, px^2, (k, 2, 2).
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.geometry.mesh import Mesh
 from sfm.kernels.options import compiled
@@ -33,6 +34,7 @@ class BoxTree:
     tolerance: float  # distance from a point within which nothing hides it, object unit
 
 
+@checked_arguments()
 def box_tree(mesh: Mesh) -> BoxTree:
     """Return a mesh sorted into boxes."""
     corners = mesh.vertices[mesh.triangles]
@@ -66,6 +68,7 @@ def box_tree(mesh: Mesh) -> BoxTree:
     )
 
 
+@checked_arguments(position="3", xyz="n 3")
 def hidden_points(tree: BoxTree, position: FloatArray, xyz: FloatArray) -> BoolArray:
     """Return which points a mesh hides from a projection centre, (n,).
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from sfm.arguments import checked_arguments
 from sfm.errors import GeometryError
 
 
@@ -30,6 +31,7 @@ class DepthOfField:
     focus: float  # distance in focus
 
 
+@checked_arguments()
 def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
     """Return between which distances a lens is sharp, mm.
 

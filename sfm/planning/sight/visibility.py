@@ -11,6 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera, pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -93,6 +94,7 @@ class Sight:
         )
 
 
+@checked_arguments(position="m 3", rotation="m 3 3")
 def sight_of(
     planned: PlannedObject, camera: Camera, position: FloatArray, rotation: FloatArray, seeing: Seeing
 ) -> Sight:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from sfm.planning.target_size import MIN_PIXELS, target_size
+from sfm.planning.target_size import MIN_PIXELS, compute_target_size
 
 SIZE_IN = (7.0, 4.5)
 DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # lines of the diagram
@@ -44,7 +44,7 @@ def design_diagram(
     FigureCanvasSVG(figure)
     axes = figure.add_subplot()
     for pixels in lines:
-        end = target_size(p=pixels, w_mm=w_mm, d=d, c_mm=c_mm, n=n, tilt_deg=tilt_deg).diameter
+        end = compute_target_size(p=pixels, w_mm=w_mm, d=d, c_mm=c_mm, n=n, tilt_deg=tilt_deg).diameter
         axes.plot([0, d], [0, end], gid=f"{pixels:g} px")  # in proportion
         axes.annotate(f"{pixels:g} px", (d, end), xytext=(4, 0), textcoords="offset points", va="center")
     axes.set(

@@ -10,7 +10,7 @@ from sfm.camera import camera_from_values, tangents_from_pixel
 from sfm.conventions import FloatArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
-from sfm.orientation.resection.by_method import Task
+from sfm.textbook.resection.by_method import Task
 
 _DISTORTION = ("K1", "K2", "K3", "P1", "P2", "b1", "b2")
 _CAMERA = ("c", "x0", "y0", *_DISTORTION)

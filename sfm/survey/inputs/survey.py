@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from sfm.adjustment.datum import Datum
+from sfm.arguments import checked_arguments
 from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
@@ -203,6 +204,7 @@ class Survey:
         return f"<Survey {self.name}: {', '.join(what)}, datum {self.datum.kind}>"
 
 
+@checked_arguments()
 def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
     """Read a survey file and the tables that it names, each once.
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.sampling import as_grey
@@ -38,6 +39,7 @@ class EdgeEllipses(NamedTuple):
     """(p, q, r) of S, 1/px, shape (k, 3)"""
 
 
+@checked_arguments(photograph="h w", xy="k 2", shape="k 3", sign="k")
 def measure_edge_ellipses(
     photograph: AnyArray, xy: FloatArray, shape: FloatArray, sign: IntArray, *, noise: float
 ) -> EdgeEllipses:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import ResectionSolution, checked_points, solution_of
@@ -20,21 +21,21 @@ _I, _J = np.array([0, 1, 2]), np.array([1, 2, 0])
 
 
 @dataclass(frozen=True)
-class ChurchResection:
+class ChurchResection(ResectionSolution):
     """The solution that Church's iteration reaches from its start, and the way there."""
 
-    solution: ResectionSolution
     history: FloatArray  # projection centre before the first and after every step, object unit, (s + 1, 3)
 
 
-def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -> ChurchResection:
+@checked_arguments(tangents="k 2", points="n 3", position="3")
+def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray) -> ChurchResection:
     """Return the exterior orientation that Church's method converges to from a start position.
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3; the first three
             are used, the others only judge.
         points: object points, shape (n, 3), object unit.
-        start: approximate projection centre, shape (3,), object unit.
+        position: approximate projection centre, shape (3,), object unit.
 
     Raises:
         GeometryError: fewer than three points, points on one line, a start that coincides with a point, or
@@ -48,7 +49,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -
     X = xyz[:MIN_POINTS]
     lmn = rays_from_tangents(uv[:MIN_POINTS])
     k = np.sum(lmn[_I] * lmn[_J], axis=1)
-    position = np.array(start, dtype=float).reshape(3)
+    position = np.array(position, dtype=float).reshape(3)
     history = [position]
     misfit = np.abs(k - _cosines(X, position)).sum()
     for _ in range(MAX_STEPS):
@@ -80,7 +81,8 @@ def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -
         raise GeometryError(
             "church: the iteration ended on the mirror side of the points, start on the other side"
         )
-    return ChurchResection(solution_of(position, U @ Vt, uv, xyz), np.array(history))
+    found = solution_of(position, U @ Vt, uv, xyz)
+    return ChurchResection(found.position, found.rotation, found.residuals, np.array(history))
 
 
 def _directions(X: FloatArray, position: FloatArray) -> FloatArray:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
 NEAR = 0.05  # relative distance below which the error of the position grows more than tenfold
 
 
+@checked_arguments(position="3", points="3 3")
 def cylinder_distance(position: FloatArray, points: FloatArray) -> float:
     """Return how far a projection centre is from the critical cylinder of three points, in radii.
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -15,6 +16,7 @@ from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
 from sfm.matching.radiometry import grey_of, odd_window
 
 
+@checked_arguments(xy_left="k 2")
 def match_along_line(
     left: AnyArray,
     right: AnyArray,
@@ -49,6 +51,10 @@ def match_along_line(
     """
     side = odd_window("NCC template", template_px)
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
+    if any(line.ndim != 2 or line.shape[1] != 2 for line in lines):
+        raise GeometryError(
+            "match_along_line: a line is no array of shape (n, 2), expected its vertices in px"
+        )
     if len(lines) != len(a):
         raise GeometryError(
             f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(lines), 'line')} in "

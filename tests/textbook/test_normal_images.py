@@ -10,8 +10,8 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.matching.normal_images import MAX_LARGER, normal_images
 from sfm.network import Estimate, Network
+from sfm.textbook.normal_images import MAX_LARGER, make_normal_images
 from tests.synthetic import make_network, seed_of
 
 
@@ -26,7 +26,7 @@ def pair(base: tuple[float, float, float] = (0.5, 0.1, 0.05)) -> tuple[Network, 
 
 def test_conjugate_points_are_in_one_row_and_their_parallax_gives_the_depth() -> None:
     network, truth = pair()
-    normal = normal_images(network, truth, network.images[0], network.images[1])
+    normal = make_normal_images(network, truth, network.images[0], network.images[1])
     rows = []
     for side in range(2):
         camera = truth.cameras[network.camera[side]]
@@ -45,7 +45,7 @@ def test_conjugate_points_are_in_one_row_and_their_parallax_gives_the_depth() ->
 
 def test_the_format_holds_both_photographs_and_no_more() -> None:
     network, truth = pair()
-    normal = normal_images(network, truth, network.images[0], network.images[1])
+    normal = make_normal_images(network, truth, network.images[0], network.images[1])
     corners = []
     for side, camera in enumerate(normal.source.cameras):
         width, height = np.array(camera.size_px) - 1
@@ -63,7 +63,7 @@ def test_the_format_holds_both_photographs_and_no_more() -> None:
 
 def test_intensities_come_from_where_the_photograph_shows_them() -> None:
     network, truth = pair()
-    normal = normal_images(network, truth, network.images[1], network.images[0])
+    normal = make_normal_images(network, truth, network.images[1], network.images[0])
     assert normal.images == network.images[:2]  # the left one first, however they are given
     width, height = normal.source.cameras[0].size_px
     y, x = np.mgrid[:height, :width]
@@ -83,7 +83,7 @@ def test_intensities_come_from_where_the_photograph_shows_them() -> None:
 def test_pairs_without_a_base_across_the_rays_are_refused(base: tuple[float, float, float]) -> None:
     network, truth = pair(base)
     with pytest.raises(GeometryError, match="normal images"):
-        normal_images(network, truth, network.images[0], network.images[1])
+        make_normal_images(network, truth, network.images[0], network.images[1])
     assert MAX_LARGER == 4.0
 
 
@@ -92,4 +92,4 @@ def test_photographs_without_orientation_are_refused() -> None:
     position = truth.position.copy()
     position[1] = np.nan
     with pytest.raises(GeometryError, match="not oriented"):
-        normal_images(network, replace(truth, position=position), network.images[0], network.images[1])
+        make_normal_images(network, replace(truth, position=position), network.images[0], network.images[1])

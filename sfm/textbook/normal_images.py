@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
@@ -72,7 +73,8 @@ class NormalImages:
         return resample(photograph, xy.reshape(height, width, 2), interpolation="bicubic")
 
 
-def normal_images(network: Network, estimate: Estimate, first: str, second: str) -> NormalImages:
+@checked_arguments()
+def make_normal_images(network: Network, estimate: Estimate, first: str, second: str) -> NormalImages:
     """Return the normal images of two oriented photographs, large enough to show both of them whole.
 
     Args:

@@ -22,6 +22,7 @@ from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights, step, unknowns_of
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -40,6 +41,7 @@ class SeparateAdjustment:
     converged: bool  # whether the last round decreased v'Pv by no more than the tolerance
 
 
+@checked_arguments()
 def adjust_separately(
     network: Network, estimate: Estimate, *, max_rounds: int = 2000, tolerance: float = TOLERANCE
 ) -> SeparateAdjustment:

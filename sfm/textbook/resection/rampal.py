@@ -6,6 +6,7 @@ from itertools import combinations, islice
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
@@ -16,7 +17,7 @@ from sfm.orientation.resection.candidates import (
     solution_of,
 )
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents
-from sfm.orientation.resection.zeng_wang import direction_test, trilaterate
+from sfm.textbook.resection.zeng_wang import direction_test, trilaterate
 
 MIN_POINTS = 3
 MAX_STEPS = 100
@@ -27,6 +28,7 @@ SAME = 1e-6  # distance of two positions, in extents of the points, below which 
 MAX_TRIPLES = 20
 
 
+@checked_arguments(tangents="k 2", points="n 3")
 def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientation by Rampal, which needs no approximate values.
 
@@ -137,8 +139,7 @@ def _position(S: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
     Across the plane of coplanar points (and of three) the linear equations say nothing; there the
     spheres of the first three points close the solution.
     """
-    closing = np.empty(3)
-    trilaterate(np.ascontiguousarray(X[:3]), S[:3], direction_test(np.ascontiguousarray(rays[:3])), closing)
+    closing = trilaterate(X[:3], S[:3], direction_test(rays[:3]))
     centre = X.mean(axis=0)
     P = X - centre
     # |X0|^2 - 2 P . X0 + |P|^2 = S^2 minus its mean over the points

@@ -5,14 +5,14 @@ import pytest
 
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.orientation.fiducials import orient_fiducials
-from sfm.orientation.photo_coordinates import (
+from sfm.textbook.fiducials import orient_fiducials
+from sfm.textbook.photo_coordinates import (
     PhotoCorrections,
     RadialTable,
+    compute_photo_coordinates,
     correct_photo_coordinates,
     curvature_displacement,
     distort_photo_coordinates,
-    photo_coordinates,
     photo_from_pixel,
     pixel_from_photo,
     radial_from_table,
@@ -170,12 +170,12 @@ def test_simulated_photo_coordinates():
     ground = np.stack(
         [rng.uniform(500, 1500, 50), rng.uniform(1500, 2500, 50), rng.uniform(0, 50, 50)], axis=1
     )
-    ideal = photo_coordinates(ground, X0, R, c_mm=152.0)
+    ideal = compute_photo_coordinates(ground, X0, R, c_mm=152.0)
     UVW = (ground - X0) @ R
     np.testing.assert_allclose(ideal, -152 * UVW[:, :2] / UVW[:, 2:], rtol=1e-12)
-    real = photo_coordinates(ground, X0, R, c_mm=152.0, corrections=ALL)
+    real = compute_photo_coordinates(ground, X0, R, c_mm=152.0, corrections=ALL)
     np.testing.assert_allclose(correct_photo_coordinates(real, ALL, c_mm=152.0), ideal, atol=1e-10)
-    assert np.isnan(photo_coordinates(X0[None] + R[:, 2] * 10, X0, R, c_mm=152.0)).all()
+    assert np.isnan(compute_photo_coordinates(X0[None] + R[:, 2] * 10, X0, R, c_mm=152.0)).all()
 
 
 def test_correction_refusals():

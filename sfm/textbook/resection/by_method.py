@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
@@ -16,16 +17,16 @@ from sfm.orientation.resection.candidates import (
     choose_by_line,
     rotation_from_position,
 )
-from sfm.orientation.resection.church import resect_church
-from sfm.orientation.resection.critical_cylinder import cylinder_warning
-from sfm.orientation.resection.dlt import DirectLinearTransformation, resect_dlt
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import resect_least_squares
-from sfm.orientation.resection.p4p import resect_p4p
-from sfm.orientation.resection.rampal import resect_rampal
 from sfm.orientation.resection.ransac import resect_robust
-from sfm.orientation.resection.unknown_noise import resect_unknown_noise
-from sfm.orientation.resection.zeng_wang import resect_zeng_wang
+from sfm.textbook.resection.church import resect_church
+from sfm.textbook.resection.critical_cylinder import cylinder_warning
+from sfm.textbook.resection.dlt import DirectLinearTransformation, resect_dlt
+from sfm.textbook.resection.p4p import resect_p4p
+from sfm.textbook.resection.rampal import resect_rampal
+from sfm.textbook.resection.unknown_noise import resect_unknown_noise
+from sfm.textbook.resection.zeng_wang import resect_zeng_wang
 
 START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
 ALL_POINTS = 3  # fewest points of any method
@@ -65,6 +66,7 @@ class Resected:
     warning: str = ""  # where the three points hardly determine the position
 
 
+@checked_arguments()
 def resect(task: Task, method: str) -> Resected:
     """Return the exterior orientation of a photograph by one of `resection.METHODS`.
 
@@ -91,6 +93,7 @@ def resect(task: Task, method: str) -> Resected:
     return replace(found, solutions=solutions, line_fit=lines, warning=warning)
 
 
+@checked_arguments()
 def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
     """Return what each method finds, or why it finds nothing, by its name.
 
@@ -125,7 +128,7 @@ def _church(task: Task) -> Resected:
     if task.start is None:
         raise GeometryError("church: a start position is needed (--start X,Y,Z)")
     result = resect_church(task.tangents, task.points, task.start[:3])
-    return Resected("church", len(task.points), (result.solution,), history=result.history)
+    return Resected("church", len(task.points), (result,), history=result.history)
 
 
 def _dlt(task: Task) -> Resected:

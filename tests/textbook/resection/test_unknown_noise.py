@@ -11,7 +11,7 @@ import pytest
 from sfm import cli
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.orientation.resection.ransac import RobustResection
-from sfm.orientation.resection.unknown_noise import resect_unknown_noise
+from sfm.textbook.resection.unknown_noise import resect_unknown_noise
 from tests.places import ROOT
 from tests.synthetic import seed_of
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.orientation.coplanarity import UNKNOWNS, refine_coplanarity, turned_pair
@@ -39,6 +40,7 @@ class PairOrientation:
     redundancy: int  # n - 5
 
 
+@checked_arguments(first="n 2", second="n 2", start="5")
 def orient_dependent(
     first: FloatArray, second: FloatArray, *, bx: float = 1.0, start: FloatArray | None = None
 ) -> PairOrientation:
@@ -79,6 +81,7 @@ def orient_dependent(
     return _pair("dependent", DEPENDENT, parameters, b, R, v, Q, positions, rotations)
 
 
+@checked_arguments(first="n 2", second="n 2", start="5")
 def orient_independent(
     first: FloatArray, second: FloatArray, *, start: FloatArray | None = None
 ) -> PairOrientation:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
@@ -23,6 +24,7 @@ from sfm.orientation.resection.fischler_bolles import (
 MIN_POINTS = 3
 
 
+@checked_arguments(tangents="k 2", points="n 3")
 def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientations by Zeng and Wang, the one that the further points confirm first.
 
@@ -57,6 +59,7 @@ def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
     return Poses(*_resect_batch(rays, points))
 
 
+@checked_arguments(rays="3 3", points="3 3")
 def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     """Return the coefficients N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,).
 
@@ -69,6 +72,68 @@ def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
     gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))
     return np.array(_quartic(ab, ac, bc, gab / 2, gac / 2, gbc / 2)[::-1])
+
+
+@checked_arguments(rays="3 3")
+def direction_test(rays: FloatArray) -> float:
+    """Return the sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+
+    Returns:
+        +1 or -1.
+
+    Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
+    order of the points is free.
+    """
+    return float(_turning_sign(np.ascontiguousarray(rays)))
+
+
+@checked_arguments(points="3 3", distances="3")
+def trilaterate(points: FloatArray, distances: FloatArray, T: float) -> FloatArray:
+    """Return the point at three distances from three points, on the side of their plane that T says.
+
+    Args:
+        points: object points, shape (3, 3), object unit.
+        distances: of the point from them, shape (3,), object unit.
+        T: sign of the direction test, +1 or -1.
+
+    Returns:
+        The point, shape (3,), object unit; in the plane of the points where the distances are too short.
+
+    Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
+    differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
+    that can vanish is divided by.
+    """
+    S = np.empty(3)
+    _place(np.ascontiguousarray(points), np.ascontiguousarray(distances), float(T), S)
+    return S
+
+
+@checked_arguments(rays="3 3", points="3 3", position="3")
+def pope_hinsken(rays: FloatArray, points: FloatArray, position: FloatArray) -> FloatArray:
+    """Return R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
+
+    The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
+    product of two of them. Of the three rays and their cross products the pair with the longest product is
+    taken, so that rays near the axis do no harm.
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+        position: projection centre, shape (3,), object unit.
+
+    Returns:
+        R, image to object axes, shape (3, 3).
+
+    Source: Hinsken (1988), PE&RS 54(7), and Zeng, Wang (1992); document 001, eqs. 2.83-2.93. The sign of
+    the angle, which eq. 2.91 leaves open, is taken from g . (image x object).
+    """
+    rotation = np.empty((3, 3))
+    rays, points = np.ascontiguousarray(rays), np.ascontiguousarray(points)
+    _fill_rotation(rays, points, np.ascontiguousarray(position), rotation)
+    return rotation
 
 
 @compiled
@@ -117,10 +182,10 @@ def _solve(
             if not fits or n == MAX_SOLUTIONS or is_known(R1, R2, R3, distances, n):
                 continue
             R123[0], R123[1], R123[2] = R1, R2, R3
-            trilaterate(points, R123, direction_test(rays), S)
+            _place(points, R123, _turning_sign(rays), S)
             distances[n] = R123
             position[n] = S
-            pope_hinsken(rays, points, S, rotation[n])
+            _fill_rotation(rays, points, S, rotation[n])
             n += 1
     return n
 
@@ -148,15 +213,8 @@ def _quartic(
 
 
 @compiled
-def direction_test(rays: FloatArray) -> float:
-    """Return the sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
-
-    Args:
-        rays: unit vectors in the image frame, shape (3, 3).
-
-    Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
-    order of the points is free.
-    """
+def _turning_sign(rays: FloatArray) -> float:
+    """Return the result of `direction_test`."""
     det = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -165,19 +223,8 @@ def direction_test(rays: FloatArray) -> float:
 
 
 @compiled
-def trilaterate(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
-    """Fill the point S at three distances from three points, on the side of their plane that T says.
-
-    Args:
-        points: object points, shape (3, 3), object unit.
-        distances: of S from them, shape (3,), object unit.
-        T: sign of the direction test, +1 or -1.
-        S: receives the point, shape (3,), object unit.
-
-    Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
-    differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
-    that can vanish is divided by.
-    """
+def _place(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
+    """Fill the point S of `trilaterate`."""
     e, f, g, q = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for d in range(3):
         e[d] = points[1, d] - points[0, d]
@@ -205,22 +252,8 @@ def trilaterate(points: FloatArray, distances: FloatArray, T: float, S: FloatArr
 
 
 @compiled
-def pope_hinsken(rays: FloatArray, points: FloatArray, S: FloatArray, rotation: FloatArray) -> None:
-    """Fill R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
-
-    The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
-    product of two of them. Of the three rays and their cross products the pair with the longest product is
-    taken, so that rays near the axis do no harm.
-
-    Args:
-        rays: unit vectors in the image frame, shape (3, 3).
-        points: object points, shape (3, 3), object unit.
-        S: projection centre, shape (3,), object unit.
-        rotation: receives R, image to object axes, shape (3, 3).
-
-    Source: Hinsken (1988), PE&RS 54(7), and Zeng, Wang (1992); document 001, eqs. 2.83-2.93. The sign of
-    the angle, which eq. 2.91 leaves open, is taken from g . (image x object).
-    """
+def _fill_rotation(rays: FloatArray, points: FloatArray, S: FloatArray, rotation: FloatArray) -> None:
+    """Fill the rotation of `pope_hinsken`."""
     p, l, diff = np.empty((6, 3)), np.empty((6, 3)), np.empty((6, 3))
     for i in range(3):
         norm = np.sqrt((points[i, 0] - S[0]) ** 2 + (points[i, 1] - S[1]) ** 2 + (points[i, 2] - S[2]) ** 2)

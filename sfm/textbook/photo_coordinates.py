@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import tangents_of
@@ -41,6 +42,7 @@ class PhotoCorrections:
     curvature_height_km: float | None = None  # H over ground: earth curvature if given
 
 
+@checked_arguments(xy_mm="... 2")
 def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
     """Return photo coordinates to which the collinearity equations apply.
 
@@ -64,6 +66,7 @@ def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
     return xy
 
 
+@checked_arguments(xy_mm="... 2")
 def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
     """Return the measured photo coordinates of ideal ones; inverse of `correct_photo_coordinates`.
 
@@ -86,7 +89,8 @@ def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
     return xy + corrections.principal_point_mm
 
 
-def photo_coordinates(
+@checked_arguments(points="n 3", position="3", rotation="3 3")
+def compute_photo_coordinates(
     points: FloatArray,
     position: FloatArray,
     rotation: FloatArray,
@@ -112,6 +116,7 @@ def photo_coordinates(
     return distort_photo_coordinates(ideal, corrections or PhotoCorrections(), c_mm=c_mm)
 
 
+@checked_arguments(pixel="... 2", pixel_mm="2")
 def photo_from_pixel(
     pixel: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
 ) -> FloatArray:
@@ -135,6 +140,7 @@ def photo_from_pixel(
     return (np.asarray(pixel, dtype=float) - centre) * np.asarray(pixel_mm) * (1.0, _sign(rows))
 
 
+@checked_arguments(photo_mm="... 2", pixel_mm="2")
 def pixel_from_photo(
     photo_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
 ) -> FloatArray:
@@ -158,6 +164,7 @@ def pixel_from_photo(
     return np.asarray(photo_mm, dtype=float) / (np.asarray(pixel_mm) * (1.0, _sign(rows))) + centre
 
 
+@checked_arguments()
 def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
     """Return the distortion dr at given radii by linear interpolation in a calibration certificate.
 
@@ -183,6 +190,7 @@ def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
     return np.asarray(np.interp(radius_mm, r, dr))
 
 
+@checked_arguments()
 def refraction_coefficient(flying_height_km: float, terrain_height_km: float) -> float:
     """Return K of the refraction dr = K (r + r^3 / c^2), dimensionless.
 
@@ -202,6 +210,7 @@ def refraction_coefficient(flying_height_km: float, terrain_height_km: float) ->
     return (2410 * H / (H**2 - 6 * H + 250) - 2410 * h**2 / ((h**2 - 6 * h + 250) * H)) * 1e-6
 
 
+@checked_arguments()
 def curvature_displacement(radius_mm: FloatArray, *, height_km: float, c_mm: float) -> FloatArray:
     """Return the displacement towards the centre by the curvature of the earth, same shape as the radii, mm.
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.separate import adjust_separately
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
 from sfm.network import ObjectPoints, ScaleBars
+from sfm.textbook.separate import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -51,6 +52,7 @@ class FiducialTransformation:
         return float(np.arctan2(-self.matrix[0, 1], self.matrix[1, 1])) - self.rotation
 
 
+@checked_arguments(measured="k 2", calibrated="n 2")
 def orient_fiducials(
     measured: FloatArray, calibrated: FloatArray, *, kind: str = AFFINE
 ) -> FiducialTransformation:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import (
@@ -19,6 +20,7 @@ COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residu
 PARALLEL = 1e-12  # |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel
 
 
+@checked_arguments(tangents="k 2", points="n 3")
 def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
     """Return the exterior orientation from four or more points in one plane.
 

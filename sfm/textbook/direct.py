@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import check_indices, checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
 from sfm.errors import GeometryError
 from sfm.network import rows_of
@@ -33,6 +34,7 @@ class DirectOrientation:
     converged: bool  # whether the last step was negligible
 
 
+@checked_arguments(tangents="k 2", image="k", point="k", control="n 3")
 def orient_direct(
     tangents: FloatArray, image: IntArray, point: IntArray, control: FloatArray
 ) -> DirectOrientation:
@@ -53,7 +55,13 @@ def orient_direct(
     """
     uv = np.ascontiguousarray(tangents, dtype=float)
     known = np.asarray(np.isfinite(control).all(axis=1))
-    m = int(image.max()) + 1
+    m = int(image.max(initial=-1)) + 1
+    if not m:
+        raise GeometryError(
+            "direct orientation: no rays, at least four control points a photograph are needed"
+        )
+    check_indices("orient_direct: image", image, m)
+    check_indices("orient_direct: point", point, len(control))
     positions, rotations = _resected(uv, image, point, control, known, m)
     start = intersect(uv, image, point, positions, rotations, n_points=len(control)).points
     points = np.where(known[:, None], control, start)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
@@ -41,6 +42,7 @@ class DirectLinearTransformation:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
+@checked_arguments(xy_mm="k 2", points="n 3")
 def resect_dlt(
     xy_mm: FloatArray, points: FloatArray, *, distortion: tuple[str, ...] = ()
 ) -> DirectLinearTransformation:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.correlation.ncc import NccMatches, match_ncc
@@ -15,6 +16,7 @@ from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of_8_bit, odd
 FINE_REACH = 4  # a pixel of the level above is two here, and as much again for its error, px
 
 
+@checked_arguments(xy_left="k 2", xy_right="n 2")
 def match_pyramid(
     left: AnyArray,
     right: AnyArray,

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import gammaln
 
+from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.orientation.resection.least_squares import UNKNOWNS, Resection, pose_normals, resect_least_squares
@@ -23,6 +24,7 @@ LEAST_RESIDUAL = 1e-9
 ROUNDS = 20  # of least squares and new choice of the right points
 
 
+@checked_arguments(tangents="k 2", points="n 3")
 def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int = 0) -> RobustResection:
     """Return the exterior orientation that makes the measured points most likely, their noise unknown.
 

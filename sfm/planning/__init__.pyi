@@ -1,0 +1,33 @@
+"""The public names of `sfm.planning`, a row each."""
+
+from sfm.planning.design.candidates import Allowed as Allowed
+from sfm.planning.design.designer import Design as Design
+from sfm.planning.design.designer import design_network as design_network
+from sfm.planning.further import Further as Further
+from sfm.planning.further import further_photographs as further_photographs
+from sfm.planning.planned_object import PlannedObject as PlannedObject
+from sfm.planning.planned_object import object_of_mesh as object_of_mesh
+from sfm.planning.planned_object import object_of_points as object_of_points
+from sfm.planning.planned_object import shape_object as shape_object
+from sfm.planning.prediction import Prediction as Prediction
+from sfm.planning.prediction import ScaleBarPlan as ScaleBarPlan
+from sfm.planning.prediction import predict_network as predict_network
+from sfm.planning.shots import choose_coded as choose_coded
+from sfm.planning.sight.image_precision import TargetImage as TargetImage
+from sfm.planning.sight.image_precision import centre_covariance as centre_covariance
+from sfm.planning.sight.occlusion import BoxTree as BoxTree
+from sfm.planning.sight.occlusion import box_tree as box_tree
+from sfm.planning.sight.occlusion import hidden_points as hidden_points
+from sfm.planning.sight.optics import DepthOfField as DepthOfField
+from sfm.planning.sight.optics import Lens as Lens
+from sfm.planning.sight.optics import depth_of_field as depth_of_field
+from sfm.planning.sight.visibility import Seeing as Seeing
+from sfm.planning.sight.visibility import Sight as Sight
+from sfm.planning.sight.visibility import sight_of as sight_of
+from sfm.planning.stations import Stations as Stations
+from sfm.planning.stations import arrangement as arrangement
+from sfm.planning.target_size import TargetSize as TargetSize
+from sfm.planning.target_size import compute_target_size as compute_target_size
+from sfm.planning.wanted import Wanted as Wanted
+from sfm.planning.weakness import Calibratability as Calibratability
+from sfm.planning.weakness import calibratability as calibratability
