@@ -193,15 +193,13 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
     """
     if rejected is None:
         return np.zeros(k, dtype=bool)
-    given = np.asarray(rejected)
-    if given.shape != (k,) or given.dtype != bool:
+    if rejected.shape != (k,):
         raise GeometryError(
-            f"rejected of shape {given.shape} and type {given.dtype}, expected one truth value for each of "
-            f"{k} image points"
+            f"rejected of shape {rejected.shape}, expected one truth value for each of {k} image points"
         )
-    if given.all():
+    if rejected.all():
         raise GeometryError(f"rejected: all {counted(k, 'image point')}, expected some that are not")
-    return given
+    return rejected
 
 
 def _without_weight(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:

@@ -2,10 +2,6 @@
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, chs. 6 and 8; the module of each
 step names its own.
-
-Hidden points: on the line of two targets of a probe, at a known distance behind the second.
-
-Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.6 (hidden-point devices).
 """
 
 from __future__ import annotations

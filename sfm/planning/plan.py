@@ -14,9 +14,10 @@ from sfm.planning.design.designer import Design
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.shots import Shot, choose_coded, shots
+from sfm.planning.sight import MIN_PIXELS
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations
-from sfm.planning.target_size import MIN_PIXELS, STEEPEST_DEG, TargetSize, compute_target_size
+from sfm.planning.target_size import STEEPEST_DEG, TargetSize, compute_target_size
 from sfm.planning.wanted import Wanted, short_of
 from sfm.planning.weakness import (
     Calibratability,

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from sfm.arguments import checked_arguments
 from sfm.errors import GeometryError
 
-MIN_PIXELS = 7.0  # on a target, as the source takes it; the measurement itself begins at 3
 STEEPEST_DEG = 75.0  # beyond, a target is not recognised
 
 

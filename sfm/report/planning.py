@@ -15,7 +15,7 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
-from sfm.planning.target_size import MIN_PIXELS
+from sfm.planning.sight import MIN_PIXELS
 from sfm.planning.wanted import ALPHA, found_displacement
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, or_unlimited, raised, significant

@@ -96,8 +96,8 @@ def test_image_points_rejected_before_are_one_truth_value_each(reject):
     network, truth = make_network(seed_of("truth values"), images=4, points=20)
     k = len(network.image_points)
     wrong = {
-        rf"shape \(3,\) and type bool, .* {k} image": np.zeros(3, dtype=bool),
-        rf"shape \({k},\) and type int64": np.arange(k),
+        rf"shape \(3,\), .* {k} image": np.zeros(3, dtype=bool),
+        rf"int64 of shape \({k},\)": np.arange(k),
         rf"all {k} image points": np.ones(k, dtype=bool),
     }
     for message, rejected in wrong.items():

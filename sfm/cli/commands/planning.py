@@ -10,7 +10,7 @@ import typer
 from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.target_size import MIN_PIXELS, compute_target_size
+from sfm.planning.sight import MIN_PIXELS
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ def target_size_command(
     with loading():
         from sfm.conventions import METRES
         from sfm.files.whole_files import refuse_existing, whole_file
+        from sfm.planning.target_size import compute_target_size
         from sfm.targets.codes.families import code_family
         from sfm.targets.codes.rings import CodeFamily
 

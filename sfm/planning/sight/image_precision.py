@@ -38,7 +38,7 @@ class TargetImage:
                 raise GeometryError(f"target: {name} is {value:g}, needed more than 0")
 
 
-@checked_arguments(axes="k 2")
+@checked_arguments(axes="k 2 2")
 def centre_covariance(axes: FloatArray, target: TargetImage) -> FloatArray:
     """Return the covariance of the centres of ellipses, px^2, (k, 2, 2).
 

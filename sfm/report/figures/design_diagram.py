@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from sfm.planning.target_size import MIN_PIXELS, compute_target_size
+from sfm.planning.sight import MIN_PIXELS
+from sfm.planning.target_size import compute_target_size
 
 SIZE_IN = (7.0, 4.5)
 DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # lines of the diagram
