@@ -140,7 +140,7 @@ def _array_of(value: object, kinds: str, dtype: Any) -> AnyArray | None:
 def _as_annotated(value: Any, hint: Any) -> object:
     """Return a value that fits, as the list or tuple of arrays that is annotated."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if origin in SEQUENCES and inner and any(row[0] == inner[0] for row in ARRAYS):
+    if isinstance(value, list | tuple) and origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS):
         value = [_taken("", one, inner[:1]) for one in value]
     return origin(value) if origin in (list, tuple) else value
 
@@ -160,7 +160,7 @@ def _fits(value: object, hint: Any) -> bool:
         origin = Sequence
     if not isinstance(value, origin) or (isinstance(value, str) and origin is not str):
         return False
-    if not isinstance(value, Sequence) or not inner:
+    if not isinstance(value, list | tuple) or not inner:  # others may read their elements from files
         return True
     if typing.get_origin(hint) is tuple and Ellipsis not in inner:
         return len(value) == len(inner) and all(map(_is, value, inner))

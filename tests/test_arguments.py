@@ -109,6 +109,21 @@ def test_arguments_that_no_function_has_are_left_to_python() -> None:
         collect(scale=3)  # type: ignore[call-arg]
 
 
+class Unread(Sequence[Any]):
+    """A sequence whose elements cost something, as photographs that are read when they are asked for."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: Any) -> Any:
+        raise AssertionError("an element was asked for")
+
+
+def test_elements_that_are_read_from_files_are_left_alone() -> None:
+    paths = Unread()
+    assert collect(paths=paths)["paths"] is paths
+
+
 def test_indices_lead_to_something() -> None:
     check_indices("f: point", np.array([0, 4]), 5)
     check_indices("f: point", np.zeros(0, dtype=np.int64), 0)
