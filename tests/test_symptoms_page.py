@@ -165,3 +165,10 @@ def test_a_new_message_is_seen_and_has_no_entry(code: str) -> None:
     said = [text for _, text in error_messages(ast.parse(code))]
     assert len(said) == 1 and said[0].startswith("a new one")
     assert not any(pattern_of(entry).search(said[0]) for entry in ENTRIES)
+
+
+def test_the_page_on_natural_texture_quotes_remarks_as_they_are() -> None:
+    page = (ROOT / "docs/how-to/natural-texture.md").read_text(encoding="utf-8")
+    quoted = re.findall(r'^\| "(.+?)" \|', page, re.M)
+    assert len(quoted) >= 3
+    assert [one for one in quoted if re.sub(r"\d+", VARIES, one) not in PAGE] == []

@@ -162,7 +162,7 @@ def _number(one: Quantity, spec: str) -> str:
     elif spec:
         text = format(one.value, spec)
     elif not one.unit and float(one.value).is_integer() and abs(one.value) < 1e15:
-        text = f"{one.value:.0f}"
+        text = f"{one.value:,.0f}"
     else:
         text = significant(one.value)
     return f"{text} {one.unit}".rstrip()
