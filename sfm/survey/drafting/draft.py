@@ -272,15 +272,19 @@ def _described(plate: PlateFamily) -> str:
 
 def _example_lines(trial: TargetTrial) -> list[str]:
     first, second = trial.repeated[:2] if len(trial.repeated) > 1 else ("1", "2")
+    ends, known = "targets", "coordinates"
+    if trial.codes == "none":  # natural texture, whose points have their names from the first run
+        first, second = "t00001", "t00002"
+        ends, known = "points of points.csv of a first run", "coordinates of such points"
     return [
-        "# The scale comes from a measured distance between two targets (repeat the section for more):",
+        f"# The scale comes from a measured distance between two {ends} (repeat the section for more):",
         "# [[scale_bar]]",
         f"# from = {_quoted(first)}",
         f"# to = {_quoted(second)}",
         f"# length = 1000.0  # {UNIT}",
         f"# sigma = 0.05  # {UNIT}",
         "#",
-        "# Known coordinates, a table id,X,Y,Z[,sX,sY,sZ] beside this file:",
+        f"# Known {known}, a table id,X,Y,Z[,sX,sY,sZ] beside this file:",
         "# [control]",
         '# file = "control.csv"',
     ]
