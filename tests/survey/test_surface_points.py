@@ -211,6 +211,20 @@ def test_windows_are_taken_whose_rays_together_are_precise(
     assert surface_points._best_windows([], network, truth, seen, given, 1).side_px == 15
 
 
+def test_windows_that_agree_off_the_surface_do_not_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of ten points of two rays half are left out: no window of the 20 contradicts another."""
+    network, truth = make_network(seed_of("off the surface"), images=2, points=10)
+    seen, camera = network.image_points, network.camera
+    good = np.arange(len(truth.points)) % 2 == 0
+    monkeypatch.setattr(surface_points, "on_surface", lambda *_: good)
+    found = CoveringPoints(seen, truth.points, np.zeros((len(seen), 2)), len(seen))
+    left = surface_points.without_far_points(found, truth, camera)
+    assert len(left.points) == good.sum() < len(good)
+    assert left.matched == len(left.image_points) > 0
+    assert surface_points.remarks_on_disagreement(left) == ()
+    assert surface_points.remarks_on_disagreement(replace(left, matched=found.matched)) != ()
+
+
 def test_rays_that_do_not_fit_tell_nothing_of_the_surface() -> None:
     """Nor do points that lose one of three by that."""
     _, truth, _ = small_scene()

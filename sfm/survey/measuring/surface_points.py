@@ -188,7 +188,10 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
 
 
 def without_far_points(found: CoveringPoints, estimate: Estimate, camera: IntArray) -> CoveringPoints:
-    """Return the points without those of two rays that are off the surface of their neighbours."""
+    """Return the points without those of two rays that are off the surface of their neighbours.
+
+    Their windows agree with each other, so that they are no longer among the matched ones.
+    """
     seen, n = found.image_points, len(found.points)
     two = np.bincount(seen.point, minlength=n) < MIN_RAYS
     good = on_surface(seen, camera, replace(estimate, points=found.points), two)
@@ -198,7 +201,7 @@ def without_far_points(found: CoveringPoints, estimate: Estimate, camera: IntArr
         replace(seen.select(kept), point=number[seen.point[kept]]),
         found.points[good],
         found.residuals[kept],
-        found.matched,
+        found.matched - int((~kept).sum()),
     )
 
 
