@@ -122,6 +122,7 @@ def test_three_photographs_observe_c_with_what_exif_data_are_worth() -> None:
     assert (
         observed.kind == "c_observed" and observed.severity == "note" and observed.number("photographs") == 3
     )
+    assert "weighted with its start value: 10.2 mm, standard deviation 1.02 mm" in observed.text
     assert observed.number("given") == 10.2 and observed.number("sigma") == pytest.approx(1.02)
     assert freed.kind == "parameters_freed" and set(freed.names("parameters")) == set(one.free)
 

@@ -29,9 +29,10 @@ ROWS = (
     Kind(
         "c_observed",
         "note",
-        "{parameter} of camera {camera} was observed, as {photographs:photograph} {photographs:does|do} not "
-        "determine it: {given} with a standard deviation of {sigma}.",
-        "the survey file does not state what is free; a focal length of EXIF data is no better",
+        "With {photographs:photograph}, {parameter} of camera {camera} was weighted with its start value: "
+        "{given}, standard deviation {sigma}.",
+        "the survey file does not state what is free; so few photographs may leave it uncertain, and a focal "
+        "length of EXIF data is no better",
         "State a calibration, or add photographs, some turned by 90 degrees.",
     ),
     Kind(
