@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -85,12 +86,24 @@ def test_every_other_photograph_is_enough(tmp_path: Path) -> None:
     assert np.abs(result.adjustment.estimate.position - truth).max() < 0.1
 
 
-@pytest.mark.parametrize("sigma_m", [SIGMA_M, (5.0, 10.0)])
-def test_positions_that_do_not_differ_give_no_datum(tmp_path: Path, sigma_m: tuple[float, float]) -> None:
-    """All the same, and those of a telephone at a close range."""
-    same = (lambda places: np.tile(places[:1], (len(places), 1))) if sigma_m == SIGMA_M else (lambda e: e)
-    with pytest.raises(GeometryError, match=r"8 places .*, no farther apart than their standard deviations"):
-        run_with(tmp_path, "same", same, sigma_m)
+def test_positions_that_do_not_differ_give_no_datum(tmp_path: Path) -> None:
+    def same(places: FloatArray) -> FloatArray:
+        return np.tile(places[:1], (len(places), 1))
+
+    extents = r"8 places .*, (all the same|of RMS extents 0\.0 and 0\.0 standard deviations), "
+    with pytest.raises(GeometryError, match=extents):
+        run_with(tmp_path, "same", same)
+
+
+def test_positions_of_a_telephone_at_a_close_range_give_no_datum(tmp_path: Path) -> None:
+    """The error says how far apart they are in standard deviations, of 7.1 m, and what is needed."""
+    with pytest.raises(GeometryError) as refused:
+        run_with(tmp_path, "same", lambda places: places, (5.0, 10.0))
+    said = re.search(r"extents (\S+) and (\S+) standard deviations, needed 3 in both", str(refused.value))
+    assert said is not None
+    places = written(tmp_path, "same")[1].position
+    extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[:2] / np.sqrt(len(places) * 50)
+    np.testing.assert_allclose([float(one) for one in said.groups()], extents, atol=0.06)
 
 
 def test_heights_may_be_missing(tmp_path: Path) -> None:

@@ -114,8 +114,7 @@ def _placed(
     elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
         similarity = fit_similarity(source, target, weights=weight)
     else:
-        how = "on a line" if length > SURE * noise else "no farther apart than their standard deviations"
-        raise GeometryError(_too_few(len(target), 0, f", {how}"))
+        raise GeometryError(_too_few(len(target), 0, f", {_arrangement(length, breadth, noise)}"))
     return similarity.apply_estimate(estimate)
 
 
@@ -151,6 +150,18 @@ def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
     w = weight / weight.sum()
     spread = np.linalg.svd((places - w @ places) * np.sqrt(w)[:, None], compute_uv=False)
     return float(spread[0]), float(spread[1])
+
+
+def _arrangement(length: float, breadth: float, noise: float) -> str:
+    """Say how places that do not place the network lie, by their extents and standard deviation."""
+    if length == 0:
+        return "all the same"
+    if length > SURE * noise and breadth <= max(noise, FLAT * length):  # no broader than by their errors
+        return "on a line"
+    return (
+        f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
+        f"{SURE:g} in both directions"
+    )
 
 
 def _too_few(places: int, turned: int, how: str = "") -> str:
