@@ -150,3 +150,20 @@ def test_photographs_without_positions_are_named(tmp_path: Path) -> None:
     path.write_text(path.read_text() + "[exterior]\nexif_sigma_m = [3.0, 6.0]\n", encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"none of 2 photographs has one; leave it out, or give a file"):
         run_survey(read_survey(path))
+
+
+@pytest.mark.parametrize("groups", [(3, 3), (2, 1, 2), (1, 1)])
+def test_positions_in_distant_groups_are_refused_unless_one_has_most(
+    tmp_path: Path, groups: tuple[int, ...]
+) -> None:
+    """Also where the middle of all is in the smallest group."""
+    east = 500_000.0 * np.repeat(np.arange(len(groups)), groups)
+    named = {f"photo {k}.png": at(x, 0.1 * k, 5.0) for k, x in enumerate(east.tolist(), 1)}
+    path = write_photograph_survey(tmp_path / "groups", "groups", photographs=len(named))
+    for name, position in named.items():
+        state_position(path.parent / name, position)
+    path.write_text(path.read_text() + "[exterior]\nexif_sigma_m = [3.0, 6.0]\n", encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"more than 100 km apart, as photo 1.*, and none has most"):
+        run_survey(read_survey(path))
+    named["another.png"] = at(0.0, 5.0, 5.0)
+    assert len(plausible_positions(named)) == (groups[0] + 1 if len(groups) == 2 else 0)

@@ -32,7 +32,7 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
         files: its photographs; those that cannot be read, or state no position, are not observed.
 
     Raises:
-        SurveyFileError: no photograph states a position.
+        SurveyFileError: no photograph states a position, or most positions are not of one place.
     """
     if survey.exif_sigma_m is None:
         return survey, ()
@@ -50,6 +50,13 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
             f"{counted(len(files), 'photograph')} has one; leave it out, or give a file"
         )
     near = plausible_positions(positions)
+    if not near:
+        raise SurveyFileError(
+            f"{survey.source}: [exterior] exif_sigma_m: the positions in EXIF data of "
+            f"{counted(len(positions), 'photograph')} are in places more than {MAX_DISTANCE_M / 1000:g} km "
+            f"apart, as {' and '.join(_farthest(positions))}, and none has most of them; remove the "
+            "wrong ones, or give a file"
+        )
     origin, exterior = observed_positions(near, survey.exif_sigma_m, survey.unit)
     found = remark(
         "exif_positions",
@@ -67,12 +74,21 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:
     """Return the positions of photographs, by name, without those that are not of one survey with the others.
 
-    Errors of less than MAX_DISTANCE_M are left to the tests of the adjustment.
+    Errors of less than MAX_DISTANCE_M are left to the tests of the adjustment. Where most are of no one
+    place, none is plausible.
     """
     _, places = local_coordinates(tuple(positions.values()))
     distance = np.linalg.norm(places[:, :2] - np.median(places[:, :2], axis=0), axis=1)
     near = distance <= MAX_DISTANCE_M
+    if 2 * near.sum() <= len(near):
+        return {}
     return {name: position for (name, position), keep in zip(positions.items(), near, strict=True) if keep}
+
+
+def _farthest(positions: Mapping[str, SatellitePosition]) -> tuple[str, str]:
+    """Return the names of the first photograph and the one that is farthest from it."""
+    names, (_, places) = list(positions), local_coordinates(tuple(positions.values()))
+    return names[0], names[int(np.linalg.norm(places[:, :2] - places[0, :2], axis=1).argmax())]
 
 
 def observed_positions(
