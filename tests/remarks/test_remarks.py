@@ -8,7 +8,7 @@ import re
 import pytest
 
 from sfm.display import MAX_LISTED
-from sfm.remarks.catalogue import KINDS
+from sfm.remarks.catalogue import KINDS, SUBJECTS
 from sfm.remarks.catalogue.hypotheses import SHIFT
 from sfm.remarks.kind import Grade, Kind, significant
 from sfm.remarks.remark import Quantity, Remark, kinds_of, of_kind, remark, unless_note
@@ -303,6 +303,26 @@ def test_of_many_remarks_of_a_kind_the_first_are_printed() -> None:
     assert lines[0].remedy == many[0].row.remedy and not any(one.remedy for one in lines[1:])
     assert len(lines_of(many[:MAX_LISTED])) == MAX_LISTED
     assert judge(many, HEADLINES).lines == lines  # type: ignore[arg-type]
+
+
+def test_remedies_speak_of_targets_and_names_only_where_there_are_any() -> None:
+    """Points of natural texture are no targets, and their names are nobody's: t00001, t00002 ..."""
+    subjects = (
+        "The adjustment",
+        "Causes and assumptions",
+        "Cameras",
+        "Photographs",
+        "Points and image points",
+    )
+    speaking = {
+        row.name
+        for subject in subjects
+        for row in SUBJECTS[subject]
+        if re.search(r"\b(targets?|names?|rename)\b", row.remedy)
+    }
+    of_tables = {"image_points_contradicting"}
+    of_targets = {"code_at_several_places", "code_rays_apart", "codes_too_small", "diameters_differ"}
+    assert speaking == of_tables | of_targets
 
 
 def test_another_kind_has_its_short_name_in_a_sentence() -> None:

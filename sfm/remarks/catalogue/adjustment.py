@@ -17,7 +17,7 @@ ROWS = (
         "not_converged",
         "error",
         "The adjustment did not converge in {iterations:iteration}.",
-        "poor start values, too many free parameters, or wrong names of points",
+        "poor start values, too many free parameters, or misidentified points",
         "Check c_mm and pixel_mm, shorten free, look at the photograph or point with the largest residuals.",
         short="no convergence",
     ),
@@ -34,10 +34,10 @@ ROWS = (
         "Sigma0 is {ratio} times the expected standard deviation of an image coordinate ({stated}).[[ "
         "Neighbours have errors of {common} in common over {length}: the camera model does not describe the "
         "photographs, as with a rolling shutter or a stabiliser.]]",
-        "the camera, the names of points or given values contradict the photographs, or sigma_px is too "
+        "the camera, misidentified points or given values contradict the photographs, or sigma_px is too "
         "small",
-        "Look for a camera that changed between photographs, wrong names and wrong given values; set "
-        "sigma_px to what the residuals show only where none is found.",
+        "Look for a camera that changed between photographs, misidentified points and wrong given values; "
+        "set sigma_px to what the residuals show only where none is found.",
     ),
     Kind(
         "sigma_px_cautious",
@@ -68,7 +68,8 @@ ROWS = (
         "image_points_rejected",
         REJECTED,
         "{rejected} of {total} image points {rejected:was|were} rejected.",
-        "wrong matches or names, an object that moved, or a camera model that does not suit the lens",
+        "wrong matches, misidentified points, an object that moved, or a camera model that does not suit the "
+        "lens",
         "Look at the rejected image points in the report.",
     ),
     Kind(
@@ -76,14 +77,14 @@ ROWS = (
         "warning",
         "Data snooping ended after {rounds:round} that did not converge.",
         "gross errors in most of the observations, or an undetermined network",
-        "Look for wrong names and wrong start values.",
+        "Look for misidentified points and wrong start values.",
     ),
     Kind(
         "reweighting_not_converging",
         "warning",
         "Reweighting ended after {rounds:round} that did not converge.",
         "gross errors in most of the observations, or an undetermined network",
-        "Look for wrong names and wrong start values.",
+        "Look for misidentified points and wrong start values.",
     ),
     Kind(
         "snooping_unsolvable",
@@ -99,8 +100,8 @@ ROWS = (
         "No image point fits in {photographs}: nothing determines {photographs:its|their} position and "
         "rotation.",
         "the robust estimator gives all image points of a photograph a small weight",
-        "Remove {photographs:the photograph|these photographs}, or correct the names of "
-        "{photographs:its|their} points.",
+        "Remove {photographs:the photograph|these photographs}, or correct {photographs:its|their} "
+        "misidentified points.",
     ),
     Kind(
         "weights_not_converged",

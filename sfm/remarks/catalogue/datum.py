@@ -17,14 +17,14 @@ ROWS = (
         "warning",
         "Control is not in the result: {points}.",
         "names that no measured point has, or points with too few rays",
-        "Correct the names; coded targets are named by their numbers.",
+        "Correct the names: those of points.csv; coded targets have their numbers.",
     ),
     Kind(
         "scale_bars_missing",
         "warning",
         "Scale bars have an end that is not in the result: {bars}.",
         "names that no measured point has, or points with too few rays",
-        "Correct from and to; coded targets are named by their numbers.",
+        "Correct from and to: names of points.csv; coded targets have their numbers.",
     ),
     Kind(
         "model_keeps_frame",

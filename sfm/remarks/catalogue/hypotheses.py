@@ -201,21 +201,21 @@ ROWS = (
         "warning",
         "Point {point} is at a second place in {photographs}, {distance} away "
         "({sigmas} standard deviations).",
-        "two targets carry one name, or the target was moved",
-        "Rename one of the two, or remove the point.",
+        "two points were taken for one, or the point moved",
+        "Measure the two places as two points, or remove the point.",
     ),
     Kind(
         "names_exchanged",
         "warning",
-        "Points {first} and {second} have exchanged names in {photographs}.",
-        "the names were confused when the photographs were measured",
-        "Exchange the two names in these photographs.",
+        "Points {first} and {second} are exchanged in {photographs}.",
+        "they were confused when the photographs were measured",
+        "Exchange the two in these photographs.",
     ),
     Kind(
         "image_points_misnamed",
         "note",
         "{count:rejected image point} {count:lies|lie} where another point is seen, in {photographs}.",
-        "a name was given to the wrong target",
-        "Correct the names; the result does not depend on them.",
+        "a point was misidentified",
+        "Correct these image points if you need them; the result does not depend on them.",
     ),
 )

@@ -43,7 +43,7 @@ ROWS = (
         "warning",
         "The photographs differ in precision (Bartlett's test, {p:<}): sigma0 of {photograph} is {ratio} "
         "times the median.",
-        "a photograph that is not sharp or of a camera that moved, or wrong names in it",
+        "a photograph that is not sharp or of a camera that moved, or misidentified points in it",
         "Look at this photograph; leave it out if you do not trust it.",
     ),
     Kind(
@@ -224,14 +224,14 @@ ROWS = (
         "warning",
         "It shows {seen:point} of the network; {needed} are needed.",
         "too few common points",
-        "Add photographs or targets.",
+        "Add photographs that overlap more with it, or points that it shows.",
     ),
     Kind(
         "photograph_with_few_fitting",
         "warning",
         "Only {fitting} of its {points:point} {fitting:fits|fit} the network; {needed} are needed.",
-        "wrong names of points, another object, or a wrong principal distance",
-        "Check the names of its points and the camera.",
+        "misidentified points, another object, or a wrong principal distance",
+        "Check its points and the camera.",
     ),
     Kind(
         "photograph_contradicting",
@@ -246,7 +246,7 @@ ROWS = (
         "photograph_against_the_others",
         "warning",
         "Its image points contradict the others.",
-        "another object or wrong names",
+        "another object or misidentified points",
         "Leave it out, or survey it by itself.",
     ),
     Kind(
@@ -295,7 +295,7 @@ ROWS = (
         "photograph_with_few_accepted",
         "warning",
         "Fewer than {needed} of its image points were accepted.",
-        "wrong names of points, or a photograph of another object",
-        "Check the names of its points.",
+        "misidentified points, or a photograph of another object",
+        "Check its points, or leave it out.",
     ),
 )

@@ -9,7 +9,7 @@ ROWS = (
         "rays_rejected",
         "warning",
         "More rays of {points:point} were rejected than chance makes: {points}.",
-        "a point moved, has the name of another, or is hard to measure",
+        "a point moved, was misidentified, or is hard to measure",
         "Look at {points:its|their} rejected image points in the report.",
     ),
     Kind(
@@ -33,8 +33,8 @@ ROWS = (
         "warning",
         "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "meet: {points}.",
-        "a point moved, or its name stands for two points",
-        "Look at the reasons in left_out.csv; measure {points:the point|the points} again or rename "
+        "a point moved, or was misidentified in a photograph",
+        "Look at the reasons in left_out.csv; correct {points:its|their} image points, or do without "
         "{points:it|them}.",
     ),
     Kind(
@@ -62,15 +62,15 @@ ROWS = (
         "point_with_rays_apart",
         "warning",
         "Its {rays} rays do not meet in front of their photographs.",
-        "the point moved, or its name stands for two points",
-        "Measure the point again or rename it.",
+        "the point moved, or was misidentified in a photograph",
+        "Correct its image points, or do without it.",
     ),
     Kind(
         "point_with_rays_rejected",
         "warning",
         "{accepted} of its {measured} rays {accepted:was|were} accepted; {needed} are needed.",
-        "the point moved, its name stands for two points, or its rays are almost parallel",
-        "Measure the point again or rename it.",
+        "the point moved, was misidentified in a photograph, or its rays are almost parallel",
+        "Correct its image points, or do without it.",
     ),
     Kind(
         "points_doubtful",
@@ -84,9 +84,8 @@ ROWS = (
         "points_with_large_residuals",
         "warning",
         "The residuals of {points:point} are together larger than chance: {points}.",
-        "a point moved a little, or its target is damaged or seen at a flat angle",
-        "Look at {points:the target|the targets}; leave {points:the point|points} out if you do not trust "
-        "{points:it|them}.",
+        "a point moved a little, is damaged, or is seen at a flat angle",
+        "Look at {points:it|them} in the photographs; leave out what you do not trust.",
     ),
     Kind(
         "image_points_identical",
