@@ -58,7 +58,7 @@ SPOILED: tuple[tuple[Spoil, str], ...] = (
     (lambda n, e: (n.with_control(["1"], np.zeros((1, 2))), e), r"coordinates \(1, 2\)"),
     (lambda n, e: (n.with_scale_bar("1", "1", 1.0, 0.1), e), "scale bar 1 - 1: length 1"),
     (lambda n, e: (n.with_scale_bar("1", "2", np.nan, 0.1), e), "scale bar 1 - 2: length nan"),
-    (lambda n, e: (e, n), "Estimate and Network, expected a Network and an Estimate"),  # type: ignore
+    (lambda n, e: (e, n), "network is a Estimate, expected Network"),  # type: ignore
 )
 
 
@@ -102,14 +102,17 @@ def test_short_ways_of_saying_it_work() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: sfm.find_targets("a.jpg"), "photograph is str, expected an array"),  # type: ignore
+        (lambda: sfm.find_targets("a.jpg"), "photograph is 'a.jpg', expected an array"),  # type: ignore
         (lambda: sfm.find_targets(np.zeros((0, 5), np.uint8)), r"shape \(0, 5\)"),
-        (lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), codes=14), "codes 14, expected the name"),  # type: ignore
+        (lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), codes=14), "codes is 14, expected text"),  # type: ignore
         (
             lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), min_diameter_px=-1),
             "diameters from -1 to inf",
         ),
-        (lambda: sfm.fit_similarity(np.zeros((3, 2)), np.zeros((3, 2))), r"points \(3, 2\) and \(3, 2\)"),
+        (
+            lambda: sfm.fit_similarity(np.zeros((3, 2)), np.zeros((3, 2))),
+            r"source is an array of shape \(3, 2\), expected",
+        ),
         (lambda: sfm.fit_similarity(np.full((3, 3), np.nan), np.zeros((3, 3))), "NaN or infinity"),
         (lambda: sfm.run_survey("nowhere.toml"), r"nowhere\.toml"),
     ],

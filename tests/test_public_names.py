@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import inspect
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -272,9 +273,8 @@ def test_a_network_from_arrays_becomes_a_solution_as_the_page_on_python_shows(
     }
     page = (ROOT.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
     code = page.split("```python\n")[2].split("```")[0]
-    lens = "sfm.camera_from_values("
-    assert code.count(lens) == 1 and "solution.write(" in code
-    code = "\n".join("camera = lens" if lens in line else line for line in code.splitlines())
+    assert code.count("sfm.camera_from_values(") == 1 and "solution.write(" in code
+    code = re.sub(r"sfm\.camera_from_values\([^)]*\)[^)]*\)[^)]*\)", "lens", code)
     monkeypatch.chdir(tmp_path)
     given["lens"] = truth.cameras[0]
     exec(compile(code, "python.md", "exec"), given)

@@ -143,6 +143,6 @@ def run_plates(
         files=PhotographList(names, paths, of_camera, Path(".")), photographs=photographs, naming=naming,
     )  # fmt: skip
     clock = StageClock(SILENT)
-    oriented, matched, solution = _solve(survey, measured, 1, clock)
+    survey, measured, oriented, matched, solution = _solve(survey, measured, 1, clock)
     compared = compare_solution(solution, ALONE, clock, files=None)
     return assemble_result(survey, measured, oriented, matched, solution, compared, clock)

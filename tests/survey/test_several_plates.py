@@ -197,9 +197,9 @@ def test_points_are_numbered_on_and_found_in_one_photograph(monkeypatch: pytest.
     ("plates", "message"),
     [
         ((GRID, PlateFamily("checkerboard", 8, 10)), "looks alike when it is turned"),
-        ((GRID, replace(GRID, rows=10)), "are not told apart"),
-        ((BOARD, PlateFamily("charuco", 7, 10, (), "aruco5x5_50", 0.5)), "are not told apart"),
-        ((APRIL, replace(APRIL, first_tag=19)), "are not told apart"),
+        ((GRID, replace(GRID, rows=10)), "are not distinguished"),
+        ((BOARD, PlateFamily("charuco", 7, 10, (), "aruco5x5_50", 0.5)), "are not distinguished"),
+        ((APRIL, replace(APRIL, first_tag=19)), "are not distinguished"),
     ],
 )
 def test_plates_without_a_place_or_a_name_are_refused(plates: list[PlateFamily], message: str) -> None:
@@ -215,7 +215,7 @@ def test_plates_of_a_survey_must_be_complete(tmp_path: Path) -> None:
     for plate, message in (
         ('codes = "ring14"', "plate 2: codes = 'ring14' is no plate"),
         ('codes = "grid"\nrows = 5', "plate 2: targets.columns is missing"),
-        ('codes = "checkerboard"\nrows = 5\ncolumns = 6\npitch = 3.0', "are not told apart"),
+        ('codes = "checkerboard"\nrows = 5\ncolumns = 6\npitch = 3.0', "are not distinguished"),
     ):
         (tmp_path / "survey.toml").write_text(f"{text}[[plate]]\n{plate}\n", encoding="utf-8")
         with pytest.raises(SurveyFileError, match=message):

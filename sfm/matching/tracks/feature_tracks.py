@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
@@ -102,8 +103,8 @@ def find_tie_points(
     """
     if not photographs or len(natural) != len(photographs):
         raise GeometryError(
-            f"find_tie_points: {len(photographs)} photographs and natural points of {len(natural)}, expected "
-            "those of each"
+            f"find_tie_points: {counted(len(photographs), 'photograph')} and natural points of "
+            f"{len(natural)}, expected those of each"
         )
     m, fewest = len(photographs), min_rays if min_image_points == 0 else min(2, min_rays)
     tracks = link_features(

@@ -118,8 +118,13 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
         first: rays of one photograph, (k, 3).
         second: those of the other, (k, 3).
     """
-    first = first / np.linalg.norm(first, axis=1, keepdims=True)
-    second = second / np.linalg.norm(second, axis=1, keepdims=True)
+    known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(
+        axis=1
+    )  # of wide angles some have no ray
+    if known.sum() < MIN_COMMON:
+        return np.inf
+    first = first[known] / np.linalg.norm(first[known], axis=1, keepdims=True)
+    second = second[known] / np.linalg.norm(second[known], axis=1, keepdims=True)
     apart = np.zeros(len(first))
     for _ in range(TRIMMINGS):
         near = apart <= np.median(apart)
