@@ -84,8 +84,8 @@ def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Mea
     ("model", "f", "k1", "k2"),
     [
         (FISHEYE, 200.0, -0.03, 0.01),  # the corner is beyond 90 degrees
-        (FISHEYE, 230.0, 0.02, -0.005),
-        (FISHEYE, 360.0, 0.02, -0.005),  # 62 degrees
+        pytest.param(FISHEYE, 230.0, 0.02, -0.005, marks=pytest.mark.slow),
+        pytest.param(FISHEYE, 360.0, 0.02, -0.005, marks=pytest.mark.slow),  # 62 degrees
         ("opencv", 240.0, -0.05, 0.01),  # a central perspective of 59 degrees
         ("opencv", 336.0, -0.1, 0.03),
     ],
@@ -100,10 +100,10 @@ def test_the_image_points_tell_a_fisheye_from_a_wide_lens(
     assert len(of_kind(found.remarks, "fisheye_taken")) == (model == FISHEYE)
 
 
-def test_a_model_that_the_survey_states_stays(tmp_path: Path) -> None:
-    for model in ('model = "brown"', 'free = ["c"]'):
-        survey, _, found = oriented(tmp_path, lens(FISHEYE, 230.0, 0.02, -0.005), model)
-        assert survey.cameras[0].model == found.estimate.cameras[0].model == "brown"
+@pytest.mark.parametrize("model", ['model = "brown"', pytest.param('free = ["c"]', marks=pytest.mark.slow)])
+def test_a_model_that_the_survey_states_stays(tmp_path: Path, model: str) -> None:
+    survey, _, found = oriented(tmp_path, lens(FISHEYE, 230.0, 0.02, -0.005), model)
+    assert survey.cameras[0].model == found.estimate.cameras[0].model == "brown"
 
 
 def photograph(planes: list[Plane], camera: Camera, X0: FloatArray, R: FloatArray) -> FloatArray:

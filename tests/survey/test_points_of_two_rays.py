@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
@@ -110,6 +111,7 @@ def test_two_photographs_of_walls_make_a_survey_that_says_what_it_rests_on(tmp_p
         assert {row["rays"] for row in csv.DictReader(file)} == {"2"}
 
 
+@pytest.mark.slow
 def test_a_strip_of_which_most_is_in_two_photographs_is_covered_by_points_of_two_rays(tmp_path: Path) -> None:
     """Photographs overlap by 59 percent: 17 percent of one are in three, which carry the scale onwards."""
     rng = seed_of("strip")
