@@ -179,3 +179,10 @@ def test_no_two_rooms_import_one_another() -> None:
 
 def room_of(name: str) -> str:
     return name if MODULES[name].name == "__init__.py" else name.rpartition(".")[0]
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_a_module_that_runs_has_all_its_functions_by_then(name: str) -> None:
+    body = ast.parse(MODULES[name].read_text(encoding="utf-8")).body
+    runs = [isinstance(one, ast.If) and "__name__" in ast.unparse(one.test) for one in body]
+    assert not any(runs[:-1]), f"{name} calls its main function before the last ones are defined"

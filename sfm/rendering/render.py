@@ -324,10 +324,6 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     """Return the faces turned to the camera, from back to front (painter's algorithm).
 
@@ -432,3 +428,7 @@ def _centre_of_area(polygon: FloatArray) -> FloatArray:
     cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
     moment = ((p + q) * cross[..., None]).sum(axis=1)
     return np.asarray(polygon[:, 0] + moment / (3 * cross.sum(axis=1))[:, None])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
