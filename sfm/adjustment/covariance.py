@@ -21,7 +21,7 @@ from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
-from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian, unknowns_of
+from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
 from sfm.arguments import checked_arguments
@@ -150,11 +150,9 @@ class JointOnDemand:
         u = len(columns)
         T = np.zeros((p + u, u + p))
         T[np.arange(p), u + np.arange(p)] = 1.0
-        turned = angle_jacobian(m.optimum.state.M)[np.asarray(images, dtype=np.int64)]
-        for k in range(len(images)):
-            own = slice(p + 6 * k, p + 6 * k + 6)
-            T[own, 6 * k : 6 * k + 6] = np.eye(6)
-            T[p + 6 * k + 3 : p + 6 * k + 6, 6 * k + 3 : 6 * k + 6] = turned[k]
+        turned = exterior_jacobian(m.optimum.state.M[np.asarray(images, dtype=np.int64)])
+        for k, own in enumerate(turned):
+            T[p + 6 * k : p + 6 * k + 6, 6 * k : 6 * k + 6] = own
         return np.asarray(T @ found @ T.T)
 
 

@@ -19,7 +19,7 @@ from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_points, times_reduced
 from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.solvers.protocol import Inverse
-from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
+from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray
 from sfm.kernels.options import kernel
@@ -92,9 +92,7 @@ def marginal_covariance(
     points[fixed] = 0.0
     np.swapaxes(points, 1, 2)[fixed] = 0.0
     m, d = len(layout.exterior_free), len(G)
-    T = np.zeros((m, 6, 6))
-    T[:, :3, :3] = np.eye(3)
-    T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+    T = exterior_jacobian(optimum.state.M)
     of_exterior = np.moveaxis(F[:, : 6 * m].reshape(d, m, 6), 1, 0)
     exterior = _in_datum(cofactors.exterior, H[: 6 * m].reshape(m, 6, d), of_exterior, G)
     with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing holds

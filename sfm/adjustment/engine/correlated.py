@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.linearised import Linearised, linearise
-from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
+from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
 from sfm.adjustment.result import Covariance, ErrorCorrelation
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import rows_of
@@ -144,9 +144,7 @@ class CorrelatedPart:
         m = len(layout.exterior_free)
         reduced = self.influence.unknowns @ self.influence.of_reduced()
         D = variance * reduced.T @ self.middle @ reduced
-        T = np.zeros((m, 6, 6))
-        T[:, :3, :3] = np.eye(3)
-        T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+        T = exterior_jacobian(optimum.state.M)
         exterior = np.einsum("ipiq->ipq", D[: 6 * m, : 6 * m].reshape(m, 6, m, 6))
         return replace(
             covariance,

@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dgeqrf, dorgqr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_jacobian
-from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions
+from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import kernel
@@ -199,7 +199,7 @@ def _seen_by_datum(
     ]
     for p, j in enumerate(weighted.point):
         rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])
-    J = exterior_jacobian(weighted, state)
+    J = exterior_jacobian(state.M[weighted.image])
     rows += [
         (J[e] @ exterior[i])[np.diagonal(weighted.exterior_weight[e]) > 0]
         for e, i in enumerate(weighted.image)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
+from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.network import Network
 
@@ -129,7 +129,7 @@ def weighted_terms(weighted: Weighted, layout: Unknowns, state: State) -> Weight
         return WeightedTerms(np.zeros((0, 6, 6)), np.zeros((0, 6)), none, np.zeros((s, s)), np.zeros(s), 0.0)
     free = layout.exterior_free[weighted.image]
     e = exterior_misclosure(weighted, state) * free
-    J = exterior_jacobian(weighted, state) * free[:, None, :]
+    J = exterior_jacobian(state.M[weighted.image]) * free[:, None, :]
     PJ = weighted.exterior_weight @ J
     dp = state.parameters[weighted.camera, weighted.parameter] - weighted.value
     rows, length = bar_rows(weighted, layout, state)
@@ -161,15 +161,6 @@ def exterior_misclosure(weighted: Weighted, state: State) -> FloatArray:
     return np.hstack(
         [state.position[weighted.image] - weighted.position, (angles + np.pi) % (2 * np.pi) - np.pi]
     )
-
-
-def exterior_jacobian(weighted: Weighted, state: State) -> FloatArray:
-    """Return the derivative of X0, omega, phi, kappa of observed photographs by X0, w, (e, 6, 6)."""
-    M = state.M[weighted.image]
-    J = np.zeros((len(M), 6, 6))
-    J[:, :3, :3] = np.eye(3)
-    J[:, 3:, 3:] = angle_jacobian(M)
-    return J
 
 
 def bar_directions(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:

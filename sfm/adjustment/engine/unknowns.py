@@ -234,6 +234,14 @@ def angle_jacobian(M: FloatArray) -> FloatArray:
     return T
 
 
+def exterior_jacobian(M: FloatArray) -> FloatArray:
+    """Return d (X0, omega, phi, kappa) / d (X0, w), see `angle_jacobian`, (m, 6, 6)."""
+    J = np.zeros((len(M), 6, 6))
+    J[:, :3, :3] = np.eye(3)
+    J[:, 3:, 3:] = angle_jacobian(M)
+    return J
+
+
 def start_weights(layout: Unknowns, state: State) -> FloatArray:
     """Return weight 1 for image points that can take part, 0 for others and those behind the camera, (k,)."""
     return (layout.active & ~behind_camera(layout.observations, state)).astype(float)

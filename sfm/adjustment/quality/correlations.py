@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
-from sfm.adjustment.engine.unknowns import angle_jacobian, interior_names
+from sfm.adjustment.engine.unknowns import exterior_jacobian, interior_names
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
@@ -121,9 +121,7 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
     H, F, G = optimum.motions.reduced, Q.F_reduced, Q.G
     # S Q S' of the S-transformation, the block of exterior by interior unknowns
     C = Q.mixed[:, :i] - H[own] @ F[:, inner] - (H[inner] @ F[:, own]).T + H[own] @ G @ H[inner].T
-    T = np.zeros((m, 6, 6))
-    T[:, :3, :3] = np.eye(3)
-    T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+    T = exterior_jacobian(optimum.state.M)
     C = T @ C.reshape(m, 6, i)
     exterior = np.einsum("mpp->mp", adjustment.cofactors.exterior)
     half = H[inner] @ F[:, inner]  # 0 but for null vectors that are none of the motions of the network
