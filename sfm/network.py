@@ -53,6 +53,11 @@ class ImagePoints:
         return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask], stated)
 
     @property
+    def median_sigma_px(self) -> float:
+        """Median standard deviation of the coordinates, px."""
+        return float(np.sqrt(np.median(np.diagonal(self.covariance, axis1=1, axis2=2))))
+
+    @property
     def stated_sigma(self) -> FloatArray:
         """Standard deviations of x and y, px; NaN where none was stated, (k, 2)."""
         sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))

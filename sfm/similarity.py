@@ -106,6 +106,15 @@ def fit_similarity(
     return Similarity(fitted, R, centre_t - fitted * R @ centre_s)
 
 
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """Return the rotation R with the largest trace of R' M, (3, 3): of M = sum b a', the best for b = R a.
+
+    Source: Umeyama (1991), IEEE Trans. PAMI 13(4), lemma.
+    """
+    U, _, Vt = np.linalg.svd(matrix)
+    return np.asarray((U * np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])) @ Vt)
+
+
 def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0) -> FloatArray:
     """Return how points move with shifts, small rotations about a centre and the scale, (n, 3, 7).
 

@@ -15,7 +15,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
 from sfm.remarks.remark import Remark, remark
-from sfm.similarity import Similarity, fit_similarity
+from sfm.similarity import Similarity, fit_similarity, nearest_rotation
 from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.exterior_table import ObservedExterior
 
@@ -129,8 +129,7 @@ def _by_angles(
 ) -> Similarity:
     """Return the similarity whose rotation is the mean that observed angles say (Horn 1987)."""
     observed = np.stack([rotation_from_angles(*one) for one in angles])
-    U, _, Vt = np.linalg.svd(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
-    R = (U * np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])) @ Vt
+    R = nearest_rotation(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
     w = weight / weight.sum()
     centre_s, centre_t = w @ source, w @ target
     spread_s, spread_t = (w @ ((x - c) ** 2).sum(axis=1) for x, c in ((source, centre_s), (target, centre_t)))

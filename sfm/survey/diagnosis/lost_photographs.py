@@ -109,7 +109,7 @@ def try_other_principal_distances(
         return found, ()
     free = all(camera.free[0] for camera in estimate.cameras)
     if lost < 2:  # one alone has a cause of its own
-        misfit = found is not None and free and found.rms_px > MISFIT * _stated_px(network)
+        misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
         held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
         best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))
         return (found if best is None else _restored(best, estimate)), ()
@@ -164,7 +164,10 @@ def _likeliest(
         likelihood = _log_likelihood(network, estimate, other)
         if _oriented(other) >= least and likelihood > likeliest:
             best, likeliest = other, likelihood
-            if _oriented(best) == len(network.images) and best.rms_px <= MISFIT * _stated_px(network):
+            if (
+                _oriented(best) == len(network.images)
+                and best.rms_px <= MISFIT * network.image_points.median_sigma_px
+            ):
                 break
     return best
 
@@ -172,11 +175,6 @@ def _likeliest(
 def _oriented(found: Orientation | None) -> int:
     """Return how many photographs are oriented."""
     return 0 if found is None else int(found.estimate.oriented.sum())
-
-
-def _stated_px(network: Network) -> float:
-    """Return the median standard deviation of the image coordinates, as weighted, px."""
-    return float(np.sqrt(np.median(np.diagonal(network.image_points.covariance, axis1=1, axis2=2))))
 
 
 def _restored(found: Orientation, estimate: Estimate) -> Orientation:

@@ -23,6 +23,7 @@ from sfm.errors import GeometryError
 from sfm.network import Network, rows_of
 from sfm.orientation.homography import rays_of
 from sfm.orientation.image_rays import image_tangents
+from sfm.similarity import nearest_rotation
 
 MIN_PARALLAX = 10.0  # standard deviations of image points, below which a depth is known to a tenth at best
 DISTANT = 0.9  # part of the points of a pair that may have no depth, as distant hills behind a near object;
@@ -50,8 +51,7 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     pairs = _conjugate_points(network)
     if not pairs:
         return
-    variance = np.median(np.diagonal(network.image_points.covariance, axis1=1, axis2=2))
-    needed = MIN_PARALLAX * float(np.sqrt(variance))
+    needed = MIN_PARALLAX * network.image_points.median_sigma_px
     parallax = _least_parallax(network, cameras, pairs)
     if parallax is None or not parallax.max() < needed:
         return
@@ -118,9 +118,7 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
         first: rays of one photograph, (k, 3).
         second: those of the other, (k, 3).
     """
-    known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(
-        axis=1
-    )  # of wide angles some have no ray
+    known = np.isfinite(first + second).all(axis=1)  # of wide angles some have no ray
     if known.sum() < MIN_COMMON:
         return np.inf
     first = first[known] / np.linalg.norm(first[known], axis=1, keepdims=True)
@@ -128,7 +126,6 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
     apart = np.zeros(len(first))
     for _ in range(TRIMMINGS):
         near = apart <= np.median(apart)
-        U, _, Vt = np.linalg.svd(second[near].T @ first[near])
-        R = (U * np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])) @ Vt
+        R = nearest_rotation(second[near].T @ first[near])
         apart = np.linalg.norm(first @ R.T - second, axis=1)
     return float(np.quantile(apart, DISTANT))
