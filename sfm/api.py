@@ -57,7 +57,7 @@ def run_survey(
         compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
         jobs: photographs measured at a time; as many as there are cores if not given.
         store: folder that keeps what was measured, so that a photograph is not measured twice.
-        progress: whether to draw a bar on a terminal, or what receives stages and photographs.
+        progress: whether to draw a bar on a terminal, or an object that receives stages and photographs.
 
     Raises:
         KolinearError: the survey cannot be run; the message says what to do.
@@ -340,7 +340,7 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
     """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
 
     Args:
-        note: is watching of a camera that could not be looked up, as without pycolmap.
+        note: receives the remark on a camera that could not be looked up, as without pycolmap.
     """
     from adapters.colmap.sensor_widths import sensor_width_mm
 

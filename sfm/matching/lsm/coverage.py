@@ -16,9 +16,6 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.network import ImagePoints
 
-# That are tried. Larger ones tell no more where they cover a photograph, and where the surface is curved they
-# measure its mean depth over them, in all photographs alike, which no residual shows.
-WINDOWS_PX = (15, 11)
 # Ratio of precisions for the same pixels up to which the windows that are preferred are taken.
 ALIKE = 1.1
 SHARED = 0.15  # part of the pixels of a point, or of a window, that others may have measured

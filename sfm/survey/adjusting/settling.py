@@ -119,7 +119,7 @@ def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) ->
     """Return the network with cameras of their own for the photographs that fit with them, others left out.
 
     Args:
-        task: what was adjusted; without tests nothing determines a photograph that does not fit.
+        task: what was adjusted; without tests nothing shows a photograph that does not fit.
         settled: the adjustment.
         start: approximate values, which what has left the adjustment starts from again.
         oriented: photographs that had an exterior orientation, (m,).

@@ -381,7 +381,7 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
     task, given = _judged(start, free, plates)
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.settled.adjustment
-        if alone.redundancy > 0:  # else nothing determines but what was stated
+        if alone.redundancy > 0:  # else there is only what was stated
             factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":

@@ -23,7 +23,7 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import ALIKE, WINDOWS_PX
+from sfm.matching.lsm.coverage import ALIKE
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
@@ -56,6 +56,9 @@ from sfm.survey.refining.windows import (
     match_windows,
 )
 
+# Sides of windows that are tried. Larger ones gain nothing where they cover a photograph, and where the
+# surface is curved they measure its mean depth over them, in all photographs alike, which no residual shows.
+WINDOWS_PX = (15, 11)
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
 FOCAL_NAMES = ("f", "fx", "fy")  # each of which holds both, where one of them is a camera's only one
 FIRST_RADIAL = {"k": "k1"}  # another name of the only coefficient
