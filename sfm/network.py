@@ -20,17 +20,30 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
+from sfm.observations.control import ObjectPoints
+from sfm.observations.exterior import ExteriorObservations
+from sfm.observations.interior import InteriorObservations
+from sfm.observations.kind import Kind
+from sfm.observations.scale_bars import ScaleBars
+
+__all__ = [
+    "Estimate",
+    "ExteriorObservations",
+    "ImagePoints",
+    "InteriorObservations",
+    "Kind",
+    "Mounts",
+    "Network",
+    "ObjectPoints",
+    "ScaleBars",
+    "empty_estimate",
+    "index_of",
+    "rows_of",
+    "without_given",
+]
 
 MAX_NAMES = 10  # in a message
 MAX_PAIRS_AT_ONCE = 4_000_000  # of photographs that are compared
-
-
-def _empty(*shape: int) -> FloatArray:
-    return np.zeros((0, *shape))
-
-
-def _no_index() -> IntArray:
-    return np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -73,74 +86,6 @@ class ImagePoints:
         )
 
 
-@dataclass(frozen=True)
-class ObjectPoints:
-    """Object points whose coordinates are known beforehand (control)."""
-
-    point: IntArray = field(default_factory=_no_index)  # index of the point, (n,)
-    xyz: FloatArray = field(default_factory=lambda: _empty(3))  # object unit, (n, 3)
-    covariance: FloatArray = field(
-        default_factory=lambda: _empty(3, 3)
-    )  # object unit^2; variance 0 = fixed, infinite = not known, (n, 3, 3)
-
-    def __len__(self) -> int:
-        return len(self.point)
-
-    @property
-    def complete(self) -> ObjectPoints:
-        """Those of which all three coordinates are known."""
-        known = np.isfinite(np.einsum("nii->ni", self.covariance)).all(axis=1)
-        return ObjectPoints(self.point[known], self.xyz[known], self.covariance[known])
-
-
-@dataclass(frozen=True)
-class ScaleBars:
-    """Measured distances between object points."""
-
-    start: IntArray = field(default_factory=_no_index)  # index of the first point, (b,)
-    end: IntArray = field(default_factory=_no_index)  # index of the second point, (b,)
-    length: FloatArray = field(default_factory=lambda: np.zeros(0))  # object unit, (b,)
-    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))  # object unit, (b,)
-
-    def __len__(self) -> int:
-        return len(self.start)
-
-
-@dataclass(frozen=True)
-class ExteriorObservations:
-    """Exterior orientation known beforehand (satellite positions, a calibrated rig)."""
-
-    image: IntArray = field(default_factory=_no_index)  # index of the photograph, (e,)
-    position: FloatArray = field(default_factory=lambda: _empty(3))  # X0, object unit, (e, 3)
-    angles: FloatArray = field(default_factory=lambda: _empty(3))  # omega, phi, kappa, rad, (e, 3)
-    covariance: FloatArray = field(
-        default_factory=lambda: _empty(6, 6)
-    )  # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
-
-    def __len__(self) -> int:
-        return len(self.image)
-
-
-@dataclass(frozen=True)
-class InteriorObservations:
-    """Parameters of interior orientation known beforehand, as from a calibration certificate."""
-
-    camera: IntArray = field(default_factory=_no_index)  # index of the camera, (p,)
-    parameter: IntArray = field(default_factory=_no_index)  # index among the camera's names, (p,)
-    value: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
-    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
-    correlation: FloatArray | None = None  # of all of them together; independent where not given, (p, p)
-
-    def __len__(self) -> int:
-        return len(self.camera)
-
-    def weight_of(self, rows: IntArray) -> FloatArray:
-        """Return the inverse of the covariance of some of the values, (r, r)."""
-        sigma = self.sigma[rows]
-        R = np.eye(len(rows)) if self.correlation is None else self.correlation[np.ix_(rows, rows)]
-        return np.asarray(np.linalg.inv(R) / np.outer(sigma, sigma))
-
-
 @dataclass(frozen=True, repr=False)
 class Network:
     """All that was measured in a survey.
@@ -165,6 +110,14 @@ class Network:
     scale_bars: ScaleBars = field(default_factory=ScaleBars)
     exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
     interior: InteriorObservations = field(default_factory=InteriorObservations)
+    observations: tuple[Kind, ...] = ()  # of further kinds
+    moment: IntArray | None = None  # when each photograph was taken, 0, 1, ...: those of one moment, by
+    # cameras of one rig, have one pose; each by itself if None, (m,)
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """All kinds of observations beside image points, empty ones included."""
+        return (self.control, self.exterior, self.interior, self.scale_bars, *self.observations)
 
     @classmethod
     def from_arrays(
@@ -325,6 +278,20 @@ class Network:
         return f"<Network: {', '.join(told)}>"
 
 
+@dataclass(frozen=True)
+class Mounts:
+    """Where the cameras of rigs are mounted: R_photograph = R_pose R, X0 = X_pose + R_pose X.
+
+    The pose of a rig is that of its reference camera, whose own position is 0 and own rotation the unit
+    matrix. So are those of a camera without a rig.
+    """
+
+    position: FloatArray  # projection centre of each camera in the axes of its rig, object unit, (a, 3)
+    rotation: FloatArray  # R of each camera, its image axes to those of its rig, (a, 3, 3)
+    free: BoolArray  # which of X, Y, Z and small rotations about the image axes are adjusted, (a, 6)
+    rig: tuple[str, ...]  # name of the rig of each camera; "" of those without, (a,)
+
+
 @dataclass(frozen=True, repr=False)
 class Estimate:
     """Interior and exterior orientation and object points; NaN where not yet determined.
@@ -339,6 +306,7 @@ class Estimate:
     position: FloatArray  # projection centres X0, object unit, (m, 3)
     rotation: FloatArray  # R of each photograph, image to object axes, (m, 3, 3)
     points: FloatArray  # object points, object unit, (n, 3)
+    mounts: Mounts | None = None  # of the cameras; None without rigs
 
     @property
     def oriented(self) -> BoolArray:
@@ -360,7 +328,13 @@ class Estimate:
 
 def without_given(network: Network) -> Network:
     """Return the network of the image points alone, with what is known of its cameras."""
-    return replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations())
+    return replace(
+        network,
+        control=ObjectPoints(),
+        scale_bars=ScaleBars(),
+        exterior=ExteriorObservations(),
+        observations=(),
+    )
 
 
 def rows_of(index: IntArray, count: int) -> list[IntArray]:

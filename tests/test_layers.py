@@ -21,6 +21,7 @@ LAYERS = (
             "sfm.camera",
             "sfm.distortion",
             "sfm.network",
+            "sfm.observations",
             "sfm.reduced_network",
             "sfm.network_check",
             "sfm.depth_reversal",

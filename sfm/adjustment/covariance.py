@@ -20,8 +20,8 @@ from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
-from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
-from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian, unknowns_of
+from sfm.adjustment.engine.observed import Observed, observed_of
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
 from sfm.arguments import checked_arguments
@@ -29,6 +29,7 @@ from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
+from sfm.observations.exterior import exterior_jacobian
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Marginal:
 
     adjustment: Adjustment
     layout: Unknowns
-    weighted: Weighted
+    observed: tuple[Observed, ...]
     optimum: Optimum
     cofactors: Cofactors
 
@@ -82,15 +83,15 @@ class Marginal:
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
         through = np.zeros((self.layout.reduced, len(rows)))
-        m = len(observations.camera)
-        of_photographs = through[: 6 * m].reshape(m, 6, len(rows))
+        m = observations.poses
+        of_poses = through[: 6 * m].reshape(m, 6, len(rows))
         of_interior = through[6 * m :][: b.Y_interior.shape[2]]
         inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
         for s, j in enumerate(points):
             seen = slice(observations.start[j], observations.start[j + 1])
             own = slice(3 * s, 3 * s + 3)
             rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
-            np.add.at(of_photographs[:, :, own], observations.image[seen], rays)
+            np.add.at(of_poses[:, :, own], observations.pose[seen], rays)
             of_interior[:, own] = b.Y_interior[j].T @ inverse[s]
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
@@ -145,14 +146,15 @@ class JointOnDemand:
         """
         with own_threads():
             m, p = self._marginal, 3 * len(points)
-            columns = (6 * np.asarray(images)[:, None] + np.arange(6)).ravel()
-            found = m.joint(columns, np.asarray(points))
-        u = len(columns)
-        T = np.zeros((p + u, u + p))
+            some = np.asarray(images, dtype=np.int64)
+            columns, J = m.layout.photograph_terms(m.optimum.state, some)
+            found = m.joint(columns.ravel(), np.asarray(points))
+        u, wide = columns.size, columns.shape[1]
+        T = np.zeros((p + 6 * len(some), u + p))
         T[np.arange(p), u + np.arange(p)] = 1.0
-        turned = exterior_jacobian(m.optimum.state.M[np.asarray(images, dtype=np.int64)])
+        turned = exterior_jacobian(m.optimum.state.M[some]) @ J
         for k, own in enumerate(turned):
-            T[p + 6 * k : p + 6 * k + 6, 6 * k : 6 * k + 6] = own
+            T[p + 6 * k : p + 6 * k + 6, wide * k : wide * k + wide] = own
         return np.asarray(T @ found @ T.T)
 
 
@@ -179,13 +181,13 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     layout, state = unknowns_of(
         network, estimate, use_control=use_control, image_sigma_factor=adjustment.image_sigma_factor
     )
-    weighted = weighted_of(network, layout, use_control=use_control)
+    observed = observed_of(network, layout, use_control=use_control)
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
-    optimum = optimum_at(problem_of(layout, weighted, resolved), state, weight)
+    optimum = optimum_at(problem_of(layout, observed, resolved), state, weight)
     if optimum is None:
-        motions_of(layout, weighted, state, resolved)  # says so if the datum is the reason
+        motions_of(layout, observed, state, resolved)  # says so if the datum is the reason
         raise GeometryError("adjustment: its normal equations cannot be solved")
-    return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout, cross=cross))
+    return Marginal(adjustment, layout, observed, optimum, cofactors(optimum, layout, cross=cross))
 
 
 @checked_arguments()

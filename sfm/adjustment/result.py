@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
@@ -55,6 +55,20 @@ class ErrorCorrelation:
         return self.alone + self.common - 1.0
 
 
+@dataclass(frozen=True)
+class ObservedResiduals:
+    """Residuals of the observations of one kind beside image points that took part in an adjustment."""
+
+    index: int  # of their kind among `Network.kinds`
+    rows: IntArray  # which of its observations took part, (n,)
+    difference: FloatArray  # computed minus observed, (n, d)
+    redundancy_numbers: FloatArray  # 0 to 1; NaN where a component was not observed, (n, d)
+    standardised: FloatArray  # Baarda's w for sigma0 = 1; NaN where a component has no check, (n, d)
+    count: int  # scalar observations
+    vPv: float
+    redundancy: float  # of all of them; NaN without covariance
+
+
 @dataclass(frozen=True, repr=False)
 class Adjustment:
     """Result of a least-squares adjustment of a network.
@@ -81,7 +95,7 @@ class Adjustment:
     sigma0: float  # a posteriori over a priori standard deviation of unit weight, `inflation` included
     redundancy: int  # observations and constraints minus unknowns
     unknowns: int  # all adjusted parameters
-    observations: int  # scalar observations used: image coordinates, weighted parameters, scale bars
+    observations: int  # scalar observations used: image coordinates and those of other kinds
     covariance: Covariance
     standardised: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # Baarda's w of each image
     # coordinate, v over its a priori standard deviation; of rejected ones as predicted, (k, 2)
@@ -92,8 +106,7 @@ class Adjustment:
 
     inflation: float = 1.0  # of standard deviations by an M-estimator, over those that v'Pv with its weights
     # gives; see `robust.inflation`; 1 with least squares
-    bar_redundancy: FloatArray = field(default_factory=lambda: np.zeros(0))  # redundancy number of each scale
-    # bar, 0 to 1; NaN where it took no part, (b,)
+    observed: tuple[ObservedResiduals, ...] = ()  # residuals of the observations beside image points
     image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))  # by which the stated standard
     # deviations of each image point were multiplied for its weight, (k,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)

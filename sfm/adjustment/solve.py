@@ -28,7 +28,7 @@ from sfm.adjustment.engine.iterate import (
     problem_of,
 )
 from sfm.adjustment.engine.local_frame import Local, local_of
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import count_of, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, unknowns_of
 from sfm.adjustment.quality.gross_errors.rejection import REJECTS, Run, find_optimum
 from sfm.adjustment.quality.gross_errors.robust import (
@@ -40,8 +40,8 @@ from sfm.adjustment.quality.gross_errors.robust import (
 from sfm.adjustment.quality.rank import rank_defect, undetermined_of
 from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import (
-    redundancy_of_bars,
     residual_weights,
+    residuals_of_observed,
     standardised_residuals,
 )
 from sfm.adjustment.result import Adjustment, Covariance
@@ -132,8 +132,8 @@ def adjust(
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
-    weighted = weighted_of(local.network, layout, use_control=use_control)
-    problem = problem_of(layout, weighted, local.datum)
+    observed = observed_of(local.network, layout, use_control=use_control)
+    problem = problem_of(layout, observed, local.datum)
     run = Run(problem, method, max_iterations, tolerance, exact=covariance or reject == "tau")
     with own_threads():
         optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha, without=without[layout.order])
@@ -173,8 +173,8 @@ def predict(
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
-    weighted = weighted_of(local.network, layout, use_control=use_control)
-    run = Run(problem_of(layout, weighted, local.datum), METHODS[0], 0, TOLERANCE, exact=True)
+    observed = observed_of(local.network, layout, use_control=use_control)
+    run = Run(problem_of(layout, observed, local.datum), METHODS[0], 0, TOLERANCE, exact=True)
     weight = layout.active.astype(float)
     with own_threads():
         optimum = optimum_at(run.problem, state, weight)
@@ -241,7 +241,7 @@ def _result(
     defect = rank_defect(optimum, layout)
     undetermined = undetermined_of(optimum, layout, network, estimate, weight, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
-    observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
+    observations = 2 * int((weight > 0).sum()) + count_of(run.problem.observed)
     if sigma0 is None:
         sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
     v = residuals(layout.observations, optimum.state)
@@ -256,7 +256,6 @@ def _result(
     back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
     back[layout.order] = np.arange(k)
     numbers = standardised = residual_weight = np.full((k, 2), np.nan)
-    of_bars = np.full(len(network.scale_bars), np.nan)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
         interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
@@ -264,8 +263,6 @@ def _result(
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
         result = without_held(result, layout, optimum)
-        kept = Q.border[layout.kept_start - 6 * m :, layout.kept_start - 6 * m :]
-        of_bars[layout.bars] = redundancy_of_bars(run.problem.weighted, layout, optimum.state, kept)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
         # that of image points whose photograph nothing holds overflows, if it is far enough away
@@ -302,7 +299,7 @@ def _result(
         residual_weights=residual_weight,
         weights=np.take(weight, back, axis=0),
         inflation=factor,
-        bar_redundancy=of_bars,
+        observed=tuple(residuals_of_observed(one, layout, optimum, Q) for one in run.problem.observed),
         datum_points=run.problem.datum.points,
         remarks=(*run.remarks, *_without_weight(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),

@@ -13,7 +13,7 @@ from sfm.display import agreeing, counted
 from sfm.files.plain_text import csv_text
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
-from sfm.report.findings.given_residuals import Given, bar_residuals, control_residuals
+from sfm.report.findings.given_residuals import given_of
 from sfm.report.html.page import render
 from sfm.report.numbers import general, significant
 from sfm.survey.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
@@ -78,7 +78,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
     bad = f"Not dependable: {figures}"
     verdict = judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad})
     unit = "object units" if found.targets is None else found.targets.unit
-    given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
+    given = given_of(after, unit)
     return render(
         "refinement.html",
         title=title,

@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.normals import new_space, normal_equations
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights, step, unknowns_of
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
@@ -62,7 +62,7 @@ def adjust_separately(
         Adjusted values, v'Pv, and whether it converged.
 
     Raises:
-        GeometryError: scale bars or weighted unknowns, which join points to one another.
+        GeometryError: scale bars or other observations, which join points to one another.
 
     Example:
         >>> adjust_separately(network, start).estimate.points  # doctest: +SKIP
@@ -70,11 +70,11 @@ def adjust_separately(
     Source: Nocedal and Wright, Numerical Optimization (2006), sec. 9.3 (block coordinate descent).
     """
     layout, state = unknowns_of(network, estimate, use_control=True)
-    weighted = weighted_of(network, layout, use_control=True)
-    if weighted.count:
+    observed = observed_of(network, layout, use_control=True)
+    if observed:
         raise GeometryError(
-            "separate adjustment: the network has scale bars or weighted unknowns, expected image points and "
-            "fixed control only (adjust takes the others)"
+            "separate adjustment: the network has scale bars or other observations, expected image points "
+            "and fixed control only (adjust takes the others)"
         )
     weight = start_weights(layout, state)
     vPv = float(sum_of_squares(layout.observations, state, weight))
@@ -82,7 +82,7 @@ def adjust_separately(
     for number in range(1, max_rounds + 1):
         before = vPv
         for move in (_points, _orientations):
-            normals = normal_equations(layout, weighted, state, weight, space=space)
+            normals = normal_equations(layout, observed, state, weight, space=space)
             reduced, points = move(normals.blocks, layout)
             state, vPv = _shorten(layout, state, weight, reduced, points, vPv)
         if before - vPv <= tolerance * before:
@@ -98,7 +98,7 @@ def _points(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
 
 def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Step of exterior and interior orientation, -U^-1 g, with the points held."""
-    m = len(layout.exterior_free)
+    m = len(layout.pose_free)
     U = np.zeros((layout.reduced, layout.reduced))
     g = np.zeros(layout.reduced)
     g[: 6 * m] = blocks.g.ravel()

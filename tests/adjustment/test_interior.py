@@ -11,7 +11,7 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.normals import normal_equations
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.dense import schur_complement
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
@@ -131,9 +131,9 @@ def test_normal_equations_equal_those_of_differences() -> None:
             for f in (-2, -1, 1, 2)
         ]
         J[:, s] = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * h)
-    weighted = weighted_of(network, layout, use_control=True)
+    observed = observed_of(network, layout, use_control=True)
     weight = start_weights(layout, state)
-    equations = normal_equations(layout, weighted, state, weight)
+    equations = normal_equations(layout, observed, state, weight)
     N = 100 * J.T @ J
     scale = 1 / np.sqrt(np.diagonal(N))
     S = schur_complement(equations, layout) / equations.parts.scale[:, None] / equations.parts.scale
@@ -279,8 +279,8 @@ def test_tables_of_groups_are_as_long_as_the_parameters() -> None:
 
 def gradient(network: Network, estimate: Estimate) -> FloatArray:
     layout, state = unknowns_of(network, estimate, use_control=False)
-    weighted = weighted_of(network, layout, use_control=False)
-    return normal_equations(layout, weighted, state, start_weights(layout, state)).parts.g
+    observed = observed_of(network, layout, use_control=False)
+    return normal_equations(layout, observed, state, start_weights(layout, state)).parts.g
 
 
 def test_gradient_vanishes_at_the_truth() -> None:

@@ -13,7 +13,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import new_space, normal_equations
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.solvers import choice, memory
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
@@ -37,12 +37,12 @@ def pair_by_pair(layout: Unknowns) -> DenseSolver:
 def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, float]:
     """Return the memory at the peak of factor and inverse, results apart, bytes, and what the solver says."""
     layout, state = unknowns_of(network, estimate, use_control=False)
-    weighted = weighted_of(network, layout, use_control=False)
+    observed = observed_of(network, layout, use_control=False)
     solver = way(layout)  # type: ignore[operator]
     equations = normal_equations(
-        layout, weighted, state, layout.active.astype(float), space=new_space(layout)
+        layout, observed, state, layout.active.astype(float), space=new_space(layout)
     )
-    motions = motions_of(layout, weighted, state, Datum("free").resolve(network))
+    motions = motions_of(layout, observed, state, Datum("free").resolve(network))
     with own_threads():
         for counted in (False, True):  # compiled at first
             if counted:

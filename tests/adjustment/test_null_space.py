@@ -12,7 +12,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import iterate
 from sfm.adjustment.engine.cofactors import cofactors, hat_complement, marginal_covariance
 from sfm.adjustment.engine.iterate import optimum_at, problem_of
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.fronts import fronts_of
@@ -105,7 +105,7 @@ def test_photographs_with_too_few_points_beside_two_networks_are_found_by_fronts
     """A test has left three photographs one point or two; more null vectors than are looked for at first."""
     network, start = together(halves("few", free))
     layout, state = unknowns_of(network, start, use_control=False)
-    weighted = weighted_of(network, layout, use_control=False)
+    observed = observed_of(network, layout, use_control=False)
     image, rays = layout.observations.image, np.diff(layout.observations.start)
     weight = np.ones(len(image))
     poor = np.array([3, 20, 50])
@@ -117,7 +117,7 @@ def test_photographs_with_too_few_points_beside_two_networks_are_found_by_fronts
     found = []
     for way in (in_fronts, DenseSolver):
         monkeypatch.setattr(iterate, "choose_solver", way)
-        problem = problem_of(layout, weighted, Datum(kind).resolve(network))
+        problem = problem_of(layout, observed, Datum(kind).resolve(network))
         optimum = optimum_at(problem, state, weight)
         assert optimum is not None
         further = MOTIONS + open_directions * len(poor)

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import collinearity, new_workspace, residuals
 from sfm.adjustment.engine.local_frame import shifted
 from sfm.adjustment.engine.motions import free_motions
-from sfm.adjustment.engine.unknowns import angle_jacobian, step, unknowns_of
+from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import angles_from_rotation
@@ -25,6 +25,7 @@ from sfm.network import (
     ObjectPoints,
     ScaleBars,
 )
+from sfm.observations.exterior import angle_jacobian
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, perturb, seed_of
 
@@ -176,7 +177,7 @@ def test_covariance_equals_the_inverse_of_the_whole(kind: str) -> None:
     keep = ~fixed
     G = np.zeros((u, 0))
     if kind in ("free", "bars"):
-        _, motions = free_motions(layout, state)
+        _, _, motions = free_motions(layout, state)
         G = np.zeros((u, 7 if kind == "free" else 6))
         G[first:] = motions.reshape(3 * n, 7)[:, : G.shape[1]]
     scale = 1 / np.sqrt(np.diagonal(N))[keep]

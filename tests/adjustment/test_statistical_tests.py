@@ -210,13 +210,3 @@ def test_tau_by_students_t() -> None:
     assert numbers.tau_critical(0.05, 1) == np.inf
     t = stats.t.ppf(0.975, 1)
     assert numbers.tau_critical(0.05, 2) == pytest.approx(t * np.sqrt(2) / np.sqrt(1 + t**2))
-
-
-def test_redundancy_of_bars_is_what_the_points_leave(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0], [0.0, 0.0, 9.0]])
-    monkeypatch.setattr(numbers, "bar_rows", lambda *_: (rows, None))
-    Q = np.diag([0.1, 0.05, 0.3])
-    weighted = stub(length_weight=np.array([2.0, 3.0, 1.0]))
-    nothing: Any = None
-    found = numbers.redundancy_of_bars(weighted, nothing, nothing, Q)
-    assert found == pytest.approx([1 - 2 * 0.4, 1 - 3 * 0.2, 0.0])

@@ -215,7 +215,8 @@ def test_kinds_of_observation_share_the_redundancy() -> None:
         d = a.estimate.points[j] - a.estimate.points[i]
         row = np.concatenate([-d, d]) / np.linalg.norm(d)
         own = row @ Q @ row / 1e-8
-        assert a.bar_redundancy[list(ends[0]).index(i)] == pytest.approx(1 - own, abs=1e-4)
+        of_bars = a.observed[-1].redundancy_numbers[:, 0]
+        assert of_bars[list(ends[0]).index(i)] == pytest.approx(1 - own, abs=1e-4)
         taken += own
     assert kinds.redundancy[4] == pytest.approx(3 - taken, abs=1e-3)
 

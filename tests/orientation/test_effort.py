@@ -11,7 +11,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.motions import motions_of
-from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
@@ -134,8 +134,8 @@ def test_control_takes_memory_in_proportion_to_its_points() -> None:
     network = replace(network, control=control)
     datum = Datum("control")
     layout, state = unknowns_of(network, truth, use_control=True)
-    weighted = weighted_of(network, layout, use_control=True)
+    observed = observed_of(network, layout, use_control=True)
     resolved = datum.resolve(network)
-    motions_of(layout, weighted, state, resolved)
-    peak = _peak_mib(lambda: motions_of(layout, weighted, state, resolved))
+    motions_of(layout, observed, state, resolved)
+    peak = _peak_mib(lambda: motions_of(layout, observed, state, resolved))
     assert peak < 30  # 3 n squared would be 155 MiB

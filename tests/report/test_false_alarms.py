@@ -12,6 +12,7 @@ from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark, of_kind
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.findings.given_remarks import given_remarks
+from sfm.report.findings.given_residuals import Given
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 
@@ -43,9 +44,7 @@ def test_a_bar_that_nothing_checks_is_no_contradiction() -> None:
     assert bars is not None
 
     def remarks(r: float) -> tuple[Remark, ...]:
-        given = replace(
-            found.given, bars=replace(bars, w=np.full(bars.w.shape, 5.7), r=np.full(bars.r.shape, r))
-        )
+        given = Given((replace(bars, w=np.full(bars.w.shape, 5.7), r=np.full(bars.r.shape, r)),))
         return of_kind(given_remarks(found.result, given, found.statistics, ()), "given_differs")
 
     assert remarks(0.8e-3) == ()

@@ -42,7 +42,7 @@ from sfm.report.findings.checks import (
     sigma0_of,
 )
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.given_residuals import bar_residuals, control_residuals, interior_residuals
+from sfm.report.findings.given_residuals import given_of
 from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
 from sfm.report.html.page import report_page
@@ -166,7 +166,7 @@ def test_a_false_calibration_certificate_is_noticed_where_it_shifts_points(
     result = result_of(
         adjust(replace(network, interior=certificate), truth, datum=Datum("free"), reject="none")
     )
-    found = interior_residuals(result)
+    found = given_of(result.adjustment, "m").interior
     assert found is not None and found.names == (f"c of camera {camera.name}",)
     v = -sigmas * sigma  # of the parameter, if the photographs had no error
     own = adjust(network, truth, datum=Datum("free"), reject="none")
@@ -446,7 +446,7 @@ def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network
     network, truth = synthetic
     errors = 3e-4 * np.array([1, -1, 1, -1, 1, -1])
     a = adjust(with_bars(network, truth, tuple(errors), 1e-4), truth, datum=Datum("free"))
-    bars = bar_residuals(a, "m")
+    bars = given_of(a, "m").bars
     assert bars is not None and np.abs(bars.w).max() < 5
     (said,) = of_kind(findings_of(result_of(a)).verdict.remarks, "given_sigmas")
     assert said.severity == "warning" and said.number("factor") > 1.5
@@ -474,7 +474,7 @@ def test_residuals_of_control_and_bars_are_adjusted_minus_given(
     network, truth = synthetic
     known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
     a = adjust(known, truth, datum=Datum("control"))
-    control, bars = control_residuals(a, "m"), bar_residuals(a, "m")
+    control, bars = given_of(a, "m").control, given_of(a, "m").bars
     assert control is not None and bars is not None
     np.testing.assert_allclose(control.difference, a.estimate.points[:6] - truth.points[:6] - 2e-4)
     np.testing.assert_allclose(control.w, control.difference / (1e-3 * np.sqrt(control.r)))
@@ -511,7 +511,7 @@ def test_w_of_given_values_is_standard_normal() -> None:
             scale_bars=ScaleBars(start, end, length + rng.normal(0, 3e-4, 4), np.full(4, 3e-4)),
         )
         a = adjust(one, truth, datum=Datum("control"), reject="none")
-        control, bars = control_residuals(a, "m"), bar_residuals(a, "m")
+        control, bars = given_of(a, "m").control, given_of(a, "m").bars
         assert control is not None and bars is not None
         w.append(np.concatenate([control.w.ravel(), bars.w.ravel()]))
         r.append(np.concatenate([control.r.ravel(), bars.r.ravel()]))
@@ -529,7 +529,7 @@ def test_the_worst_control_stands_in_the_text_with_residual_and_w(
     xyz = truth.points[:6].copy()
     xyz[3, 1] += 5e-3
     result = result_of(adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control")))
-    control = control_residuals(result.adjustment, "m")
+    control = given_of(result.adjustment, "m").control
     assert control is not None
     text = text_report(findings_of(result))
     section = text[text.index("Control, scale") :].splitlines()
@@ -548,7 +548,7 @@ def test_the_worst_control_stands_in_the_text_with_residual_and_w(
 def test_what_is_met_exactly_is_not_checked(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:
     network, truth = synthetic
     single = result_of(adjust(with_bars(network, truth, (0.3,), 1e-4), truth, datum=Datum("free")))
-    bars = bar_residuals(single.adjustment, "m")
+    bars = given_of(single.adjustment, "m").bars
     assert bars is not None and np.isnan(bars.w).all() and bars.r[0, 0] < 1e-6
     assert findings_of(single).verdict.level == "good"
     assert re.search(r"scale bar  1 - 11 .* m  0\.000  not checked", text_report(findings_of(single)))
@@ -565,7 +565,7 @@ def test_every_given_value_stands_in_its_table(synthetic: tuple[Network, Estimat
     network, truth = synthetic
     known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
     result = result_of(adjust(known, truth, datum=Datum("control")))
-    control = control_residuals(result.adjustment, "m")
+    control = given_of(result.adjustment, "m").control
     assert control is not None
     write_tables(findings_of(result), tmp_path)
     with (tmp_path / "given.csv").open(encoding="utf-8") as file:

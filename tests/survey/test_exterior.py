@@ -16,7 +16,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.given_residuals import exterior_residuals
+from sfm.report.findings.given_residuals import given_of
 from sfm.report.html.page import report_page
 from sfm.report.output import write_result
 from sfm.report.text.text_report import text_report
@@ -212,9 +212,10 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     table[3] = ",".join([name, repr(float(X) + 4 * SIGMA), *rest])  # that no test finds
     (tmp_path / "survey" / "exterior.csv").write_text("\n".join(table), encoding="utf-8")
     result = solved(path)
-    both = exterior_residuals(result)
-    assert both is not None
+    given = given_of(result.adjustment, result.length_unit)
+    both = given.of("projection centre"), given.of("rotation")
     found, angles = both
+    assert found is not None and angles is not None
     assert np.isnan(angles.sigma).all()
     e, k = np.unravel_index(np.nanargmax(np.abs(found.w)), found.w.shape)
     assert (found.names[e], k) == ("image 3", 0)
@@ -265,8 +266,9 @@ def test_exchanged_projection_centres_are_exchanged_again(tmp_path: Path) -> Non
 def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "redundancy")
     result = solved(path)
-    both = exterior_residuals(result)
-    assert both is not None
+    given = given_of(result.adjustment, result.length_unit)
+    both = given.of("projection centre"), given.of("rotation")
+    assert both[0] is not None
     path_of = (
         row
         for row in text_report(findings_of(result)).splitlines()

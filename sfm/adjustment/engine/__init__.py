@@ -1,6 +1,6 @@
 """How a network is adjusted; in the order of use.
 
-`unknowns` lays out what is solved for, `observed_unknowns` what of it was observed; `collinearity` is the
-formula of one image point, `accumulate` sums it into `normals`; `motions` are the null vectors that the datum
-holds; `iterate` goes to the optimum with one of `solvers`; `cofactors` are the covariance there.
+`unknowns` lays out what is solved for, `observed` what was observed beside image points; `collinearity` is
+the formula of one image point, `accumulate` sums it into `normals`; `motions` are the null vectors that the
+datum holds; `iterate` goes to the optimum with one of `solvers`; `cofactors` are the covariance there.
 """

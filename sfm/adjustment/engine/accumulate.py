@@ -25,16 +25,16 @@ RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
 class Blocks(NamedTuple):
     """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
 
-    U: FloatArray  # X0, w of each photograph by themselves, (m, 6, 6)
-    C: FloatArray  # X0, w of each photograph by the free parameters of its camera, (m, 6, f)
+    U: FloatArray  # X0, w of each pose by themselves, (poses, 6, 6)
+    C: FloatArray  # X0, w of the pose of each photograph by the free parameters of its camera, (m, 6, f)
     D: FloatArray  # free parameters of each camera by themselves, (a, f, f)
-    g: FloatArray  # right side of X0, w, (m, 6)
+    g: FloatArray  # right side of X0, w of each pose, (poses, 6)
     gi: FloatArray  # right side of the free parameters of each camera, (a, f)
     V: FloatArray  # object points before elimination, (n, 3, 3)
     gp: FloatArray  # right side of object points, (n, 3)
     L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
     y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
-    Y: FloatArray  # Y' of each image point by X0, w of its photograph; 0 for kept points, (k, 3, 6)
+    Y: FloatArray  # Y' of each image point by X0, w of its pose; 0 for kept points, (k, 3, 6)
     Y_interior: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
     Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
     K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
@@ -48,6 +48,8 @@ class Sums(NamedTuple):
 
     first: int  # photograph
     end: int  # photograph behind the last
+    U: FloatArray  # of each photograph; that of the blocks itself without rigs, (m, 6, 6)
+    g: FloatArray  # the same, (m, 6)
     D: FloatArray
     gi: FloatArray
     V: FloatArray
@@ -61,18 +63,18 @@ def add_photographs(
     observations: Observations,
     state: State,
     weight: FloatArray,
-    exterior_free: BoolArray,
+    pose_free: BoolArray,
     workspace: Workspace,
     sums: Sums,
     blocks: Blocks,
 ) -> float:
-    """Fill the blocks U, C, g, Y of some photographs and add to the sums over photographs.
+    """Fill U, g, C and Y of some photographs and add to the sums over photographs.
 
     Args:
         observations: image points.
         state: values of all parameters.
         weight: factor on the weight of each image point, (k,).
-        exterior_free: (m, 6).
+        pose_free: (poses, 6).
         workspace: of one image point.
         sums: which photographs, and the sums that they add to.
         blocks: of the photographs.
@@ -90,8 +92,8 @@ def add_photographs(
         A = sums.A[: 2 * abs(rays)]
         N = np.dot(A.T, A)
         vPv += N[RESIDUAL, RESIDUAL] if rays >= 0 else np.inf
-        _add_photograph(i, a, observations.free_count[a], N, exterior_free, sums, blocks)
-        _add_to_points(i, observations, weight, exterior_free, sums, blocks)
+        _add_photograph(i, a, observations.free_count[a], observations.pose_of[i], N, pose_free, sums, blocks)
+        _add_to_points(i, observations, weight, pose_free, sums, blocks)
     return vPv
 
 
@@ -129,18 +131,18 @@ def _derivatives(
 
 @kernel
 def _add_photograph(
-    i: int, a: int, f: int, N: FloatArray, exterior_free: BoolArray, sums: Sums, blocks: Blocks
+    i: int, a: int, f: int, pose: int, N: FloatArray, pose_free: BoolArray, sums: Sums, blocks: Blocks
 ) -> None:
     """Share out the sum (A r)'(A r) of photograph i; fixed unknowns keep their place with derivatives 0."""
     for p in range(6):
-        on = 1.0 if exterior_free[i, p] else 0.0
+        on = 1.0 if pose_free[pose, p] else 0.0
         for q in range(6):
-            blocks.U[i, p, q] = N[p, q] * on if exterior_free[i, q] else 0.0
-        blocks.g[i, p] = N[p, RESIDUAL] * on
+            sums.U[i, p, q] = N[p, q] * on if pose_free[pose, q] else 0.0
+        sums.g[i, p] = N[p, RESIDUAL] * on
         for q in range(f):
             blocks.C[i, p, q] = N[p, RESIDUAL + 1 + q] * on
-        if not exterior_free[i, p]:
-            blocks.U[i, p, p] = 1.0
+        if not pose_free[pose, p]:
+            sums.U[i, p, p] = 1.0
     for p in range(f):
         sums.gi[a, p] += N[RESIDUAL + 1 + p, RESIDUAL]
         for q in range(f):
@@ -152,14 +154,14 @@ def _add_to_points(
     i: int,
     observations: Observations,
     weight: FloatArray,
-    exterior_free: BoolArray,
+    pose_free: BoolArray,
     sums: Sums,
     blocks: Blocks,
 ) -> None:
     """Add B'B, B'r, W' of the image points of photograph i; B = -A of the projection centre."""
     a = observations.camera[i]
     f = observations.free_count[a]
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     row = 0
     for h in range(blocks.first[i], blocks.first[i + 1]):
         o = blocks.order[h]
@@ -190,12 +192,29 @@ def _add_to_points(
                 Yi[1, c] -= x1 * u + y1 * v
                 Yi[2, c] -= x2 * u + y2 * v
             for q in range(6):
-                if not exterior_free[i, q]:
+                if not pose_free[observations.pose_of[i], q]:
                     Y[0, q] = Y[1, q] = Y[2, q] = 0.0
         else:
             for p in range(3):
                 for q in range(6):
                     blocks.Y[o, p, q] = 0.0
+
+
+@kernel
+def sum_poses(observations: Observations, pose_free: BoolArray, sums: Sums, blocks: Blocks) -> None:
+    """Sum U and g of the photographs of each pose; fixed unknowns keep their place."""
+    blocks.U[:] = 0.0
+    blocks.g[:] = 0.0
+    for i in range(len(observations.pose_of)):
+        pose = observations.pose_of[i]
+        for p in range(6):
+            blocks.g[pose, p] += sums.g[i, p]
+            for q in range(6):
+                blocks.U[pose, p, q] += sums.U[i, p, q]
+    for pose in range(observations.poses):
+        for p in range(6):
+            if not pose_free[pose, p]:
+                blocks.U[pose, p, p] = 1.0
 
 
 @kernel
@@ -240,21 +259,21 @@ def eliminate_points(
         y[1] = (gp[1] - L[1, 0] * y[0]) / L[1, 1]
         y[2] = (gp[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
         for o in range(observations.start[j], observations.start[j + 1]):
-            _forward(j, blocks.L, blocks.y, blocks.Y[o], blocks.Yy, 6 * observations.image[o])
-        _forward(j, blocks.L, blocks.y, blocks.Y_interior[j], blocks.Yy, 6 * len(observations.camera))
+            _forward(j, blocks.L, blocks.y, blocks.Y[o], blocks.Yy, 6 * observations.pose[o])
+        _forward(j, blocks.L, blocks.y, blocks.Y_interior[j], blocks.Yy, 6 * observations.poses)
 
 
 @inlined
 def _keep(j: int, row: int, observations: Observations, kept_start: int, blocks: Blocks) -> None:
     """Move W' of a kept point to its rows K of the reduced system."""
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     blocks.held[j] = 0
     for p in range(3):
         for c in range(blocks.K.shape[1]):
             blocks.K[row + p, c] = 0.0
         for o in range(observations.start[j], observations.start[j + 1]):
             for q in range(6):
-                blocks.K[row + p, 6 * observations.image[o] + q] += blocks.Y[o, p, q]
+                blocks.K[row + p, 6 * observations.pose[o] + q] += blocks.Y[o, p, q]
                 blocks.Y[o, p, q] = 0.0
         for c in range(blocks.Y_interior.shape[2]):
             blocks.K[row + p, first + c] = blocks.Y_interior[j, p, c]
@@ -305,13 +324,15 @@ def gather_interior(
     observations: Observations, blocks: Blocks, border: FloatArray, corner: FloatArray, g: FloatArray
 ) -> None:
     """Write the blocks of photographs and cameras into border, corner and right side."""
-    first = 6 * len(observations.camera)
-    for i in range(len(observations.camera)):
-        a = observations.camera[i]
+    first = 6 * observations.poses
+    for i in range(observations.poses):
         for p in range(6):
             g[6 * i + p] = blocks.g[i, p]
+    for i in range(len(observations.camera)):
+        a, row = observations.camera[i], 6 * observations.pose_of[i]
+        for p in range(6):
             for q in range(observations.free_count[a]):
-                border[6 * i + p, observations.free_column[a, q] - first] = blocks.C[i, p, q]
+                border[row + p, observations.free_column[a, q] - first] += blocks.C[i, p, q]
     for a in range(len(observations.free_count)):
         for p in range(observations.free_count[a]):
             row = observations.free_column[a, p] - first

@@ -19,10 +19,11 @@ from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_points, times_reduced
 from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.solvers.protocol import Inverse
-from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
+from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.options import kernel
+from sfm.observations.exterior import exterior_jacobian
 
 ZERO = 1e-9  # variance over its limiting value below which a coordinate is one that the datum fixes
 
@@ -31,12 +32,12 @@ ZERO = 1e-9  # variance over its limiting value below which a coordinate is one 
 class Cofactors:
     """Cofactor matrices (covariance for sigma0 = 1) in the datum of the adjustment, and what makes more."""
 
-    exterior: FloatArray  # of X0, w of each photograph, any datum, (m, 6, 6)
-    border: FloatArray  # of interior unknowns and kept points, any datum, (i + 3 s, i + 3 s)
-    mixed: FloatArray  # of exterior by border unknowns, any datum, (6 m, i + 3 s)
+    exterior: FloatArray  # of X0, w of each pose, any datum, (poses, 6, 6)
+    border: FloatArray  # of interior unknowns, mounts and kept points, any datum, (i + 3 s, i + 3 s)
+    mixed: FloatArray  # of poses by border unknowns, any datum, (6 poses, i + 3 s)
     points: FloatArray  # of each object point, any datum, (n, 3, 3)
     limiting: FloatArray  # of each object point with the cameras fixed, (n, 3, 3)
-    cross: FloatArray  # of the object point by the photograph of each image point, any datum, (k, 3, 6)
+    cross: FloatArray  # of the object point by the pose of each image point, any datum, (k, 3, 6)
     cross_border: FloatArray  # of each object point by the border, any datum, (n, 3, i + 3 s)
     F_reduced: FloatArray  # (B'H)^-1 B'Q of the reduced unknowns, (d, reduced)
     F_points: FloatArray  # the same of object points, (n, d, 3)
@@ -91,15 +92,15 @@ def marginal_covariance(
     fixed = np.diagonal(points, axis1=1, axis2=2) <= ZERO * np.diagonal(cofactors.limiting, axis1=1, axis2=2)
     points[fixed] = 0.0
     np.swapaxes(points, 1, 2)[fixed] = 0.0
-    m, d = len(layout.exterior_free), len(G)
-    T = exterior_jacobian(optimum.state.M)
-    of_exterior = np.moveaxis(F[:, : 6 * m].reshape(d, m, 6), 1, 0)
-    exterior = _in_datum(cofactors.exterior, H[: 6 * m].reshape(m, 6, d), of_exterior, G)
+    first = layout.pose_free.size
+    columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
+    T = exterior_jacobian(optimum.state.M) @ J
+    exterior = _in_datum(_of_photographs(cofactors, columns), H[columns], np.moveaxis(F[:, columns], 1, 0), G)
     with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing holds
         exterior = T @ exterior @ np.swapaxes(T, 1, 2)
     interior = []
     for own in layout.interior_column:
-        Q = cofactors.border[np.ix_(own - 6 * m, own - 6 * m)]
+        Q = cofactors.border[np.ix_(own - first, own - first)]
         interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
     return Covariance(variance * points, variance * exterior, tuple(interior), variance * cofactors.limiting)
 
@@ -124,7 +125,7 @@ def hat_complement(
     # one layout whatever the parameters, so that one compiled form serves every network
     mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
     border, points = np.ascontiguousarray(Q.border), np.ascontiguousarray(Q.points)
-    count = 9 + workspace.Jp.shape[1]
+    count = 3 + workspace.A.shape[1]
     _complement(
         layout.observations, optimum.state, weight, Q.exterior, mixed, border, points, Q.cross,
         Q.cross_border, workspace, np.empty((2, count)), np.empty((count, count)), out,
@@ -159,6 +160,21 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
     return replace(
         covariance, points=points, exterior=exterior, interior=tuple(interior), points_limiting=limiting
     )
+
+
+def _of_photographs(cofactors: Cofactors, columns: IntArray) -> FloatArray:
+    """Return the cofactors of the unknowns of each photograph: of its pose and its mount, (m, u, u)."""
+    pose = columns[:, 0] // 6
+    own = cofactors.exterior[pose]
+    if columns.shape[1] == 6:
+        return own
+    poses = len(cofactors.exterior)
+    at = np.maximum(columns[:, 6:] - 6 * poses, 0)  # where a mount is fixed, J is 0
+    if not cofactors.border.size:
+        return np.pad(own, ((0, 0), (0, 6), (0, 6)))
+    mixed = cofactors.mixed.reshape(poses, 6, -1)[pose[:, None], :, at].swapaxes(1, 2)
+    mounts = cofactors.border[at[:, :, None], at[:, None]]
+    return np.block([[own, mixed], [np.swapaxes(mixed, 1, 2), mounts]])
 
 
 def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:
@@ -205,7 +221,7 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     for s, j in enumerate(layout.kept):
         own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         seen = slice(layout.observations.start[j], layout.observations.start[j + 1])
-        rays[seen] = np.swapaxes(mixed[layout.observations.image[seen], :, own], 1, 2)
+        rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, own], 1, 2)
         inner[j] = q.border[own]
     return rays, inner
 
@@ -237,11 +253,11 @@ def _complement(
     Q: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Fill I - J Q J' of each image point, J and Q of its own unknowns: X0, w, X, free interior ones."""
-    first = 6 * len(observations.camera)
+    """Fill I - J Q J' of each image point, J and Q of its own unknowns: pose, X, free ones of its camera."""
+    first = 6 * observations.poses
     for o in range(len(observations.image)):
-        i, j = observations.image[o], observations.point[o]
-        a = observations.camera[i]
+        i, j = observations.pose[o], observations.point[o]
+        a = observations.camera[observations.image[o]]
         f = observations.free_count[a]
         used = weight[o] > 0.0
         in_front = collinearity(o, observations, state, weight[o] if used else 1.0, workspace)

@@ -19,6 +19,8 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, observe
 from sfm.kernels.options import compiled, inlined, kernel
 
+CAMERA_UNKNOWNS = MAX_PARAMETERS + 6  # interior parameters and the mount of a camera
+
 
 class Observations(NamedTuple):
     """Image points in the order of their object points, as compiled code takes them."""
@@ -29,12 +31,16 @@ class Observations(NamedTuple):
     xy: FloatArray  # measured pixel, px, (k, 2)
     whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
     camera: IntArray  # camera of each photograph, (m,)
+    pose: IntArray  # pose of each image point: that of its photograph or of its rig, (k,)
+    pose_of: IntArray  # pose of each photograph, (m,)
+    poses: int  # how many there are
+    mounted: BoolArray  # cameras whose pose is that of a rig, beside its reference camera, (a,)
     model: IntArray  # number of the distortion model of each camera, (a,)
     frame: FloatArray  # centre (px), pixel size (mm), planes of residuals and affinity of each camera, (a, 6)
     interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
-    free_count: IntArray  # how many parameters of each camera are free, (a,)
-    free_index: IntArray  # which they are, (a, MAX_PARAMETERS)
-    free_column: IntArray  # their columns among the reduced unknowns, (a, MAX_PARAMETERS)
+    free_count: IntArray  # how many parameters of each camera and of its mount are free, (a,)
+    free_index: IntArray  # which they are, those of the mount from MAX_PARAMETERS on, (a, CAMERA_UNKNOWNS)
+    free_column: IntArray  # their columns among the reduced unknowns, (a, CAMERA_UNKNOWNS)
 
 
 class State(NamedTuple):
@@ -44,6 +50,10 @@ class State(NamedTuple):
     M: FloatArray  # object to image axes, (m, 3, 3)
     parameters: FloatArray  # interior orientation, (a, MAX_PARAMETERS)
     points: FloatArray  # X, (n, 3)
+    pose_position: FloatArray  # X0 of each pose; the same array as `position` without rigs, (poses, 3)
+    rig_from_object: FloatArray  # object axes to those of each pose, (poses, 3, 3)
+    mount_position: FloatArray  # X0 of each camera in the axes of its rig, (a, 3)
+    camera_from_rig: FloatArray  # axes of the rig to those of each camera, (a, 3, 3)
 
 
 class Workspace(NamedTuple):
@@ -52,7 +62,8 @@ class Workspace(NamedTuple):
     r: FloatArray  # weighted residual, (2,)
     Ju: FloatArray  # d r / d (u, v), px, (2, 2)
     Jp: FloatArray  # d r / d all interior parameters, (2, MAX_PARAMETERS)
-    A: FloatArray  # weighted d r / d (X0, w, all interior parameters), (2, 6 + MAX_PARAMETERS)
+    A: FloatArray  # weighted d r / d (X0, w of the pose, interior parameters, X, w of the mount),
+    # (2, 6 + CAMERA_UNKNOWNS)
     B: FloatArray  # weighted d r / d X, (2, 3)
 
 
@@ -63,7 +74,7 @@ def new_workspace() -> Workspace:
         np.empty(2),
         np.empty((2, 2)),
         np.zeros((2, MAX_PARAMETERS)),
-        np.zeros((2, 6 + MAX_PARAMETERS)),
+        np.zeros((2, 6 + CAMERA_UNKNOWNS)),
         np.empty((2, 3)),
     )
 
@@ -128,8 +139,31 @@ def collinearity(
     for s in range(observations.interior[a]):  # all, not only free ones: gathering them here would cost more
         workspace.A[0, 6 + s] = f00 * workspace.Jp[0, s]
         workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
+    if observations.mounted[a]:
+        _of_rig(a, observations.pose_of[i], state, workspace.A)
     in_front: bool = W < 0.0
     return in_front
+
+
+@inlined
+def _of_rig(a: int, pose: int, state: State, A: FloatArray) -> None:
+    """Turn derivatives by X0, w of a photograph into those by its pose, X_p, w_p, and by its mount, X, w_a.
+
+    X0 = X_p + R_p X and R = R_p R_a, so that dX0 = dX_p - R_p [X]x w_p + R_p dX and w = R_a' w_p + w_a.
+    """
+    R, M = state.rig_from_object[pose].T, state.camera_from_rig[a]
+    X, Y, Z = state.mount_position[a, 0], state.mount_position[a, 1], state.mount_position[a, 2]
+    for row in range(2):
+        x, y, z = A[row, 0], A[row, 1], A[row, 2]
+        b0 = x * R[0, 0] + y * R[1, 0] + z * R[2, 0]
+        b1 = x * R[0, 1] + y * R[1, 1] + z * R[2, 1]
+        b2 = x * R[0, 2] + y * R[1, 2] + z * R[2, 2]
+        w0, w1, w2 = A[row, 3], A[row, 4], A[row, 5]
+        mount = A[row, 6 + MAX_PARAMETERS :]
+        mount[0], mount[1], mount[2], mount[3], mount[4], mount[5] = b0, b1, b2, w0, w1, w2
+        A[row, 3] = w0 * M[0, 0] + w1 * M[1, 0] + w2 * M[2, 0] + Y * b2 - Z * b1
+        A[row, 4] = w0 * M[0, 1] + w1 * M[1, 1] + w2 * M[2, 1] + Z * b0 - X * b2
+        A[row, 5] = w0 * M[0, 2] + w1 * M[1, 2] + w2 * M[2, 2] + X * b1 - Y * b0
 
 
 def sum_of_squares(observations: Observations, state: State, weight: FloatArray) -> float:

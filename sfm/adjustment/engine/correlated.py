@@ -19,10 +19,11 @@ from scipy.spatial.distance import cdist
 
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.linearised import Linearised, linearise
-from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
+from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance, ErrorCorrelation
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import rows_of
+from sfm.observations.exterior import exterior_jacobian
 
 POINTS_AT_ONCE = 2000
 
@@ -141,11 +142,11 @@ class CorrelatedPart:
     def added_to(self, covariance: Covariance, variance: float, optimum: Optimum) -> Covariance:
         """Return the marginal covariance with what correlation adds, of variance factor sigma0^2."""
         layout = self.influence.linear.layout
-        m = len(layout.exterior_free)
         reduced = self.influence.unknowns @ self.influence.of_reduced()
         D = variance * reduced.T @ self.middle @ reduced
-        T = exterior_jacobian(optimum.state.M)
-        exterior = np.einsum("ipiq->ipq", D[: 6 * m, : 6 * m].reshape(m, 6, m, 6))
+        columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
+        T = exterior_jacobian(optimum.state.M) @ J
+        exterior = D[columns[:, :, None], columns[:, None]]
         return replace(
             covariance,
             points=covariance.points + variance * self.points,

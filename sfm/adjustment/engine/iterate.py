@@ -26,8 +26,9 @@ from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
 from sfm.adjustment.engine.null_space import on_sound_points, with_further
-from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_vPv
+from sfm.adjustment.engine.observed import Observed, couples_poses, vPv_of
 from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
 from sfm.conventions import FloatArray
@@ -69,7 +70,7 @@ class Problem:
     """Constants of all steps and rounds of an adjustment."""
 
     layout: Unknowns  # order of the unknowns
-    weighted: Weighted  # observed unknowns
+    observed: tuple[Observed, ...]  # observations beside image points
     datum: ResolvedDatum
     space: Space  # for the normal equations, used again and again
     solver: Solver  # of the reduced normal equations
@@ -102,10 +103,11 @@ class Step(Move):
         return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
 
 
-def problem_of(layout: Unknowns, weighted: Weighted, datum: ResolvedDatum) -> Problem:
+def problem_of(layout: Unknowns, observed: tuple[Observed, ...], datum: ResolvedDatum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses the solver of the normal equations."""
     keep_freed_memory()
-    return Problem(layout, weighted, datum, new_space(layout), choose_solver(layout))
+    solver = DenseSolver(layout) if couples_poses(observed) else choose_solver(layout)
+    return Problem(layout, observed, datum, new_space(layout), solver)
 
 
 def iterate(
@@ -191,7 +193,7 @@ def iterate(
 
 def _refuse(problem: Problem, state: State) -> NoReturn:
     """Say why the normal equations of the start values cannot be solved."""
-    motions_of(problem.layout, problem.weighted, state, problem.datum)  # if the datum is the reason
+    motions_of(problem.layout, problem.observed, state, problem.datum)  # if the datum is the reason
     raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
 
 
@@ -233,11 +235,11 @@ def _solve(
         tolerance: |A dx| / |v| of convergence.
     """
     p, layout = problem, problem.layout
-    equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
+    equations = normal_equations(layout, p.observed, state, weight, damping=damping, space=p.space)
     if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
         return None
     try:
-        motions = motions_of(layout, p.weighted, state, on_sound_points(p.datum, equations.blocks.held))
+        motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.blocks.held))
     except GeometryError:  # the datum points have fallen together on the way
         return None
     if last is not None:
@@ -295,9 +297,9 @@ def _approach(
 
 
 def total(problem: Problem, state: State, weight: FloatArray) -> float:
-    """Return v'Pv of image points and observed unknowns; infinite if a point is behind a camera."""
+    """Return v'Pv of all observations; infinite if a point is behind a camera."""
     p = problem
-    return sum_of_squares(p.layout.observations, state, weight) + weighted_vPv(p.weighted, p.layout, state)
+    return sum_of_squares(p.layout.observations, state, weight) + vPv_of(p.observed, state)
 
 
 def _line_search(

@@ -80,10 +80,10 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     k, n, f = len(o.image), len(b.L), int(o.free_count.max(initial=0))
     A, B = np.zeros((k, 2, 6 + f)), np.zeros((k, 2, 3))
     _fill(o, optimum.state, weight, new_workspace(), A, B)
-    A[:, :, :6] *= layout.exterior_free[o.image][:, None]
+    A[:, :, :6] *= layout.pose_free[o.pose][:, None]
     B *= layout.point_free[o.point][:, None]
     column = np.concatenate(
-        [6 * o.image[:, None] + np.arange(6), o.free_column[o.camera[o.image], :f]], axis=1
+        [6 * o.pose[:, None] + np.arange(6), o.free_column[o.camera[o.image], :f]], axis=1
     )
     slot = np.full(n, -1)
     slot[layout.kept] = np.arange(len(layout.kept))

@@ -94,13 +94,13 @@ def _renumbered(
 ) -> tuple[Network, Estimate, ResolvedDatum]:
     """Return them with the points in another order."""
     place = np.argsort(order)
-    bars = network.scale_bars
     own = replace(
         network,
         points=tuple(network.points[j] for j in order),
         image_points=replace(network.image_points, point=place[network.image_points.point]),
-        control=replace(network.control, point=place[network.control.point]),
-        scale_bars=replace(bars, start=place[bars.start], end=place[bars.end]),
+        control=network.control.renumbered(place),
+        scale_bars=network.scale_bars.renumbered(place),
+        observations=tuple(kind.renumbered(place) for kind in network.observations),
     )
     if datum.points is not None:
         datum = datum._replace(points=datum.points[order])
@@ -132,7 +132,8 @@ def shifted(network: Network, estimate: Estimate, by: FloatArray) -> tuple[Netwo
     """Return a network and an estimate with all object coordinates changed by a shift, object unit, (3,)."""
     moved = replace(
         network,
-        control=replace(network.control, xyz=network.control.xyz + by),
-        exterior=replace(network.exterior, position=network.exterior.position + by),
+        control=network.control.shifted(by),
+        exterior=network.exterior.shifted(by),
+        observations=tuple(kind.shifted(by) for kind in network.observations),
     )
     return moved, replace(estimate, position=estimate.position + by, points=estimate.points + by)

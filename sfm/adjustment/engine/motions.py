@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dgeqrf, dorgqr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions
-from sfm.adjustment.engine.unknowns import Unknowns, exterior_jacobian
+from sfm.adjustment.engine.observed import Observed, reduced_rows
+from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import kernel
@@ -71,23 +71,27 @@ class Motions:
         return reduced - self.reduced @ t, points - self.points @ t
 
 
-def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: ResolvedDatum) -> Motions:
+def motions_of(
+    layout: Unknowns, observed: tuple[Observed, ...], state: State, datum: ResolvedDatum
+) -> Motions:
     """Return the motions that the observations leave open and the constraints that the datum puts on them.
 
     Args:
         layout: order of the unknowns.
-        weighted: observed unknowns.
+        observed: observations beside image points.
         state: where the motions are taken; lengths are scaled by the size of the network.
         datum: kind and points.
 
     Raises:
         GeometryError: the chosen datum points cannot carry the datum.
     """
-    exterior, points = free_motions(layout, state)
-    inner = layout.kept_start - exterior[..., 0].size
-    kept = points[layout.kept].reshape(-1, 7)
-    H = np.vstack([exterior.reshape(-1, 7), np.zeros((inner, 7)), kept])
-    seen = _seen_by_datum(layout, weighted, state, exterior, points)
+    poses, mounts, points = free_motions(layout, state)
+    H = np.zeros((layout.reduced, 7))
+    H[: layout.pose_free.size] = poses.reshape(-1, 7)
+    own = layout.mount_column >= 0
+    H[layout.mount_column[own]] = mounts[own]
+    H[layout.kept_start :] = points[layout.kept].reshape(-1, 7)
+    seen = _seen_by_datum(layout, observed, state, H, mounts[~own & layout.rigged], points)
     if len(seen):
         # U would have a column for every row, of which control alone brings three a point
         _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
@@ -125,21 +129,24 @@ def carriers(layout: Unknowns, datum: ResolvedDatum) -> BoolArray:
     return free if datum.points is None else free & datum.points
 
 
-def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:
-    """Return the seven similarity motions as changes of X0, w (m, 6, 7) and of points (n, 3, 7).
+def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the seven similarity motions as changes of poses, mounts and points.
 
-    Shifts, turns and scale about the centre of the network, the latter two over its size, so that all
-    seven are of the same order.
+    Of X, w of poses and of mounts, (poses, 6, 7) and (a, 6, 7), and of X of points, (n, 3, 7). Shifts, turns
+    and scale are about the centre of the network, the latter two over its size, so that all seven are of the
+    same order.
     """
     cloud = state.points[layout.point_on]
     centre = cloud.sum(axis=0) / len(cloud)
     # root mean square distance from the centre, as `mean_distance`
     size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
-    exterior, points = np.zeros((len(state.position), 6, 7)), np.zeros((len(state.points), 3, 7))
-    _fill_motions(state.position, centre, size, exterior)
+    poses, points = np.zeros((len(state.rig_from_object), 6, 7)), np.zeros((len(state.points), 3, 7))
+    _fill_motions(state.pose_position, centre, size, poses)
     _fill_motions(state.points, centre, size, points)
-    exterior[:, 3:, 3:6] = state.M / size
-    return exterior, points
+    poses[:, 3:, 3:6] = state.rig_from_object / size
+    mounts = np.zeros((len(state.camera_from_rig), 6, 7))
+    mounts[:, :3, 6] = state.mount_position / size
+    return poses, mounts, points
 
 
 @kernel
@@ -185,27 +192,30 @@ def _regular_inverse(BH: FloatArray) -> FloatArray:
 
 def _seen_by_datum(
     layout: Unknowns,
-    weighted: Weighted,
+    observed: tuple[Observed, ...],
     state: State,
-    exterior: FloatArray,
+    H: FloatArray,
+    fixed_mounts: FloatArray,
     points: FloatArray,
 ) -> FloatArray:
-    """Return what each motion does to fixed and observed unknowns and distances, one row for each."""
-    if layout.all_free and weighted.count == 0:
+    """Return what each motion does to fixed and observed unknowns and to observations, one row for each."""
+    if layout.all_free and not observed:
         return np.zeros((0, 7))
+    pose_on = np.zeros(len(layout.pose_free), dtype=bool)
+    pose_on[layout.observations.pose_of[layout.image_on]] = True
+    poses = H[: layout.pose_free.size].reshape(-1, 6, 7)
     rows = [
         points[~layout.point_free & layout.point_on[:, None]],
-        exterior[~layout.exterior_free & layout.image_on[:, None]],
+        poses[~layout.pose_free & pose_on[:, None]],
+        fixed_mounts,
     ]
-    for p, j in enumerate(weighted.point):
-        rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])
-    J = exterior_jacobian(state.M[weighted.image])
-    rows += [
-        (J[e] @ exterior[i])[np.diagonal(weighted.exterior_weight[e]) > 0]
-        for e, i in enumerate(weighted.image)
-    ]
-    if len(weighted.start):
-        direction, _ = bar_directions(weighted, layout, state)
-        difference = points[layout.kept[weighted.end]] - points[layout.kept[weighted.start]]
-        rows.append(np.einsum("bp,bpd->bd", direction, difference))
+    for one in observed:
+        point = one.point
+        if point is not None:
+            J = one.kind.linearise(state).J[0]
+            moved = J @ points[point]
+        else:
+            columns, J, _ = reduced_rows(one, layout, state)
+            moved = J @ H[columns]
+        rows.append(moved[np.diagonal(one.weight, axis1=1, axis2=2) > 0])
     return np.concatenate([row.reshape(-1, 7) for row in rows])

@@ -26,9 +26,10 @@ from sfm.adjustment.engine.accumulate import (
     add_photographs,
     eliminate_points,
     gather_interior,
+    sum_poses,
 )
 from sfm.adjustment.engine.collinearity import Observations, State, new_workspace
-from sfm.adjustment.engine.observed_unknowns import Weighted, WeightedTerms, point_terms, weighted_terms
+from sfm.adjustment.engine.observed import Observed, Terms, terms_of
 from sfm.adjustment.engine.ordering import by_photograph
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
@@ -37,6 +38,7 @@ from sfm.kernels.threads import at_once
 
 HALVED = 8_000  # image points from which two halves of the photographs are summed by themselves; a thread of
 # its own takes 0.1 ms to start and saves 0.07 microseconds for each
+SUMMED = ("D", "gi", "V", "gp", "Y_interior")  # parts of `Sums` that both halves add to
 
 
 class Space(NamedTuple):
@@ -49,8 +51,9 @@ class Space(NamedTuple):
 class Parts(NamedTuple):
     """Reduced normal equations before Y Y' is taken off, without the exterior diagonal blocks."""
 
-    border: FloatArray  # X0, w by interior unknowns and kept points, (6 m, i + 3 s)
-    corner: FloatArray  # interior unknowns and kept points by themselves, (i + 3 s, i + 3 s)
+    border: FloatArray  # X0, w of poses by interior unknowns, mounts and kept points, (6 poses, i + 3 s)
+    corner: FloatArray  # those by themselves, (i + 3 s, i + 3 s)
+    coupled: FloatArray | None  # poses by one another, from observations of two; None without, (6 poses,) * 2
     g: FloatArray  # right side, reduced, (reduced,)
     scale: FloatArray  # 1/sqrt of the diagonal of U, (reduced,)
 
@@ -66,7 +69,7 @@ class Equations(NamedTuple):
 
 def normal_equations(
     layout: Unknowns,
-    weighted: Weighted,
+    observed: tuple[Observed, ...],
     state: State,
     weight: FloatArray,
     *,
@@ -77,7 +80,7 @@ def normal_equations(
 
     Args:
         layout: order of the unknowns.
-        weighted: observed unknowns.
+        observed: observations beside image points.
         state: values of all parameters.
         weight: factor on the weight of each image point, 0 = takes no part, shape (k,).
         damping: share of its diagonal added to the whole normal matrix (Marquardt); 0 for the truth.
@@ -85,20 +88,14 @@ def normal_equations(
     """
     space = new_space(layout) if space is None else space
     b = space.blocks
-    if len(weighted.point):
-        b.V[:], b.gp[:] = point_terms(weighted, state)
-    else:
-        b.V.fill(0.0)
-        b.gp.fill(0.0)
+    b.V.fill(0.0)
+    b.gp.fill(0.0)
+    terms = terms_of(observed, layout, state, b.V, b.gp)
     slot = np.full(len(state.points), -1, dtype=np.int64)
     slot[layout.kept] = np.arange(len(layout.kept))
     vPv = _sum_photographs(layout, state, weight, space)
     eliminate_points(layout.observations, layout.point_free, slot, layout.kept_start, 1 + damping, b)
-    terms = weighted_terms(weighted, layout, state)
-    if len(weighted.image):
-        np.add.at(b.U, weighted.image, terms.exterior)
-        np.add.at(b.g, weighted.image, terms.exterior_g)
-    return Equations(b, _parts(layout, weighted, terms, b), damping, vPv + terms.vPv)
+    return Equations(b, _parts(layout, terms, b), damping, vPv + terms.vPv)
 
 
 def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: Space) -> float:
@@ -107,45 +104,47 @@ def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: 
 
     def add(s: Sums) -> float:
         return float(
-            add_photographs(layout.observations, state, weight, layout.exterior_free, new_workspace(), s, b)
+            add_photographs(layout.observations, state, weight, layout.pose_free, new_workspace(), s, b)
         )
 
     if len(space.sums) == 1:
-        return add(space.sums[0])
-    half, other = space.sums
-    other.V.fill(0.0)
-    other.gp.fill(0.0)
-    vPv = at_once(lambda: add(half), lambda: add(other))
-    for total, part in zip(half[2:-1], other[2:-1], strict=True):
-        total += part
-    return sum(vPv)
+        vPv = add(space.sums[0])
+    else:
+        half, other = space.sums
+        other.V.fill(0.0)
+        other.gp.fill(0.0)
+        vPv = sum(at_once(lambda: add(half), lambda: add(other)))
+        for name in SUMMED:
+            total: FloatArray = getattr(half, name)
+            total += getattr(other, name)
+    if layout.rigged:
+        sum_poses(layout.observations, layout.pose_free, space.sums[0], b)
+    return vPv
 
 
-def _parts(layout: Unknowns, weighted: Weighted, terms: WeightedTerms, b: Blocks) -> Parts:
-    """Gather the blocks of interior unknowns, kept points and observed unknowns."""
+def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
+    """Gather the blocks of interior unknowns, kept points and observations beside image points."""
     first = 6 * len(b.U)
     inner = layout.kept_start - first
     border = np.zeros((first, layout.reduced - first))
     corner = np.zeros((layout.reduced - first, layout.reduced - first))
     g = np.zeros(layout.reduced)
     gather_interior(layout.observations, b, border, corner, g)
-    if len(weighted.column):
-        column = weighted.column - first
-        np.add.at(corner, (column[:, None], column[None]), weighted.interior_weight)
-        np.add.at(g, weighted.column, terms.interior_g)
     if len(layout.kept):
         border[:, inner:] = b.K[:, :first].T
         corner[:inner, inner:] = b.K[:, first : layout.kept_start].T
         corner[inner:, :inner] = b.K[:, first : layout.kept_start]
-        corner[inner:, inner:] = b.K[:, layout.kept_start :] + terms.kept
-        g[layout.kept_start :] = terms.kept_g + b.gp[layout.kept].ravel()
+        corner[inner:, inner:] = b.K[:, layout.kept_start :]
+        g[layout.kept_start :] = b.gp[layout.kept].ravel()
+    coupled = terms.add_to(b.U, border, corner, g)
+    if len(layout.kept):
         fixed = np.flatnonzero(~layout.point_free[layout.kept].ravel()) + inner
         border[:, fixed] = corner[fixed] = corner[:, fixed] = 0.0
         corner[fixed, fixed] = 1.0
         g[first + fixed] = 0.0
     diagonal = np.concatenate([np.diagonal(b.U, axis1=1, axis2=2).ravel(), corner.diagonal()])
     scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
-    return Parts(border, corner, g - b.Yy, scale)
+    return Parts(border, corner, coupled, g - b.Yy, scale)
 
 
 def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
@@ -167,6 +166,8 @@ def times_schur(equations: Equations, layout: Unknowns, x: FloatArray) -> FloatA
     product = np.empty_like(x)
     product[:first] = (b.U @ x[:first].reshape(len(b.U), 6, e)).reshape(first, e) + parts.border @ x[first:]
     product[first:] = parts.border.T @ x[:first] + parts.corner @ x[first:]
+    if parts.coupled is not None:
+        product[:first] += parts.coupled @ x[:first]
     np.negative(through, out=through)
     times_points(layout.observations, b, through, product)
     return product
@@ -192,36 +193,37 @@ def solve_transposed(L: FloatArray, h: FloatArray) -> FloatArray:
 
 def new_space(layout: Unknowns) -> Space:
     """Return space for the normal equations of a network."""
-    m, n, k = len(layout.exterior_free), len(layout.point_free), len(layout.order)
-    a = len(layout.interior_free)
-    f = max(len(free) for free in layout.interior_free)
+    m, n, k = len(layout.image_on), len(layout.point_free), len(layout.order)
+    a, poses = len(layout.interior_free), len(layout.pose_free)
+    f = int(layout.observations.free_count.max())
     order, first = by_photograph(layout.observations.image, m)
     most = int(np.diff(first).max())
     width = -(-(RESIDUAL + 1 + f) // 4) * 4  # whole vector registers
     b = Blocks(
-        U=np.empty((m, 6, 6)),
+        U=np.empty((poses, 6, 6)),
         C=np.empty((m, 6, f)),
         D=np.empty((a, f, f)),
-        g=np.empty((m, 6)),
+        g=np.empty((poses, 6)),
         gi=np.empty((a, f)),
         V=np.empty((n, 3, 3)),
         gp=np.empty((n, 3)),
         L=np.empty((n, 3, 3)),
         y=np.empty((n, 3)),
         Y=np.empty((k, 3, 6)),
-        Y_interior=np.empty((n, 3, layout.kept_start - 6 * m)),
+        Y_interior=np.empty((n, 3, layout.kept_start - 6 * poses)),
         Yy=np.empty(layout.reduced),
         K=np.zeros((3 * len(layout.kept), layout.reduced)),
         held=np.zeros(n, dtype=np.int64),
         order=order,
         first=first,
     )
-    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
+    U, g = (np.empty((m, 6, 6)), np.empty((m, 6))) if layout.rigged else (b.U, b.g)
+    sums = Sums(0, m, U, g, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
     if k < HALVED:
         return Space(b, (sums,))
-    own = (np.zeros_like(part) for part in sums[2:])
+    own = {name: np.zeros_like(getattr(sums, name)) for name in SUMMED}
     middle = int(np.searchsorted(first, k // 2))
-    other = Sums(middle, m, *own)
+    other = sums._replace(first=middle, A=np.zeros_like(sums.A), **own)
     return Space(b, (sums._replace(end=middle), other))
 
 
@@ -230,7 +232,7 @@ def step_points(
     observations: Observations, point_free: BoolArray, blocks: Blocks, dx: FloatArray, dX: FloatArray
 ) -> None:
     """Fill the step of the object points dX = -L^-T (y + Y'dx), dx of the reduced unknowns; 0 where fixed."""
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     for j in range(len(dX)):
         h0, h1, h2 = blocks.y[j, 0], blocks.y[j, 1], blocks.y[j, 2]
         for q in range(blocks.Y_interior.shape[2]):
@@ -239,7 +241,7 @@ def step_points(
             h1 += blocks.Y_interior[j, 1, q] * d
             h2 += blocks.Y_interior[j, 2, q] * d
         for o in range(observations.start[j], observations.start[j + 1]):
-            Y, column = blocks.Y[o], 6 * observations.image[o]
+            Y, column = blocks.Y[o], 6 * observations.pose[o]
             for q in range(6):
                 d = dx[column + q]
                 h0 += Y[0, q] * d
@@ -257,7 +259,7 @@ def step_points(
 @kernel
 def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out: FloatArray) -> None:
     """Fill out with Y' x: x of the reduced unknowns, (reduced, d), out of the object points, (n, 3, d)."""
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     out[:] = 0.0
     for j in range(len(out)):
         for p in range(3):
@@ -266,7 +268,7 @@ def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out
                 for e in range(x.shape[1]):
                     out[j, p, e] += z * x[first + q, e]
         for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
+            column = 6 * observations.pose[o]
             for p in range(3):
                 for q in range(6):
                     y = blocks.Y[o, p, q]
@@ -277,7 +279,7 @@ def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out
 @kernel
 def times_points(observations: Observations, blocks: Blocks, h: FloatArray, out: FloatArray) -> None:
     """Add Y h to out: h of the object points, (n, 3, d), out of the reduced unknowns, (reduced, d)."""
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     for j in range(len(h)):
         for p in range(3):
             for q in range(blocks.Y_interior.shape[2]):
@@ -285,7 +287,7 @@ def times_points(observations: Observations, blocks: Blocks, h: FloatArray, out:
                 for e in range(h.shape[2]):
                     out[first + q, e] += z * h[j, p, e]
         for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
+            column = 6 * observations.pose[o]
             for p in range(3):
                 for q in range(6):
                     y = blocks.Y[o, p, q]

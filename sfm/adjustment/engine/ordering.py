@@ -1,6 +1,6 @@
 """Image points of a network in the order that the compiled kernels go through them.
 
-Object points are eliminated one by one, so image points are stored object point by object point, photographs
+Object points are eliminated one by one, so image points are stored object point by object point, poses
 ascending; the derivatives are taken photograph by photograph, for which an index gives their places.
 """
 
@@ -10,14 +10,24 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.options import compiled
-from sfm.network import ImagePoints
 
 
-def by_point(k: ImagePoints, m: int, n: int) -> tuple[IntArray, IntArray]:
-    """Return the image points object point by object point (k,), and where each one starts (n + 1,)."""
-    order = _sorted(k.image, np.arange(len(k)), _starts(k.image, m))
-    start = _starts(k.point, n)
-    return _sorted(k.point, order, start), start
+def by_point(image: IntArray, point: IntArray, pose_of: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Return the image points object point by object point (k,), and where each one starts (n + 1,).
+
+    Args:
+        image: photograph of each image point, (k,).
+        point: object point of each, (k,).
+        pose_of: pose of each photograph; those of an object point ascend, (m,).
+        n: how many object points there are.
+    """
+    m = len(pose_of)
+    order = _sorted(image, np.arange(len(image)), _starts(image, m))
+    pose = pose_of[image]
+    if not np.array_equal(pose, image):
+        order = _sorted(pose, order, _starts(pose, m))
+    start = _starts(point, n)
+    return _sorted(point, order, start), start
 
 
 def by_photograph(image: IntArray, m: int) -> tuple[IntArray, IntArray]:

@@ -1,9 +1,11 @@
 """The unknowns of an adjustment: which there are, which are free, in what order, and how a step moves them.
 
-The reduced unknowns are [6 per photograph: X0, w | free interior parameters, camera by camera |
-3 per kept point]; all other object points are eliminated. Points at the ends of scale bars are kept,
-because an observed distance couples two points. Fixed unknowns keep their place with derivatives 0.
-A parameter that several cameras share stands in one column, that of the first of them.
+The reduced unknowns are blocks: [6 per pose: X0, w | free interior parameters, camera by camera | free
+parts of mounts, camera by camera | 3 per kept point]; all other object points are eliminated. A pose is
+that of a photograph, or of a rig at one moment; `photograph_terms` gives the orientation of a photograph by
+the unknowns, whichever they are. Points that observations couple with other unknowns are kept, as those at
+the ends of scale bars. Fixed unknowns keep their place with derivatives 0. A parameter that several cameras
+share stands in one column, that of the first of them.
 """
 
 from __future__ import annotations
@@ -12,21 +14,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.engine.collinearity import Observations, State, behind_camera
+from sfm.adjustment.engine.collinearity import CAMERA_UNKNOWNS, Observations, State, behind_camera
 from sfm.adjustment.engine.ordering import by_point, whitening_of
 from sfm.adjustment.result import scaled_covariance
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import turn
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Mounts, Network
+from sfm.observations.kind import POINT
 
 MIN_RAYS = 2  # per object point that is not known otherwise
-MIN_COS_PHI = 1e-8  # nearer to +-90 deg omega and kappa have no sigmas of their own
-MIN_POINTS = 3  # per photograph whose orientation is not known otherwise
+MIN_POINTS = 3  # per pose that is not known otherwise
+MOUNT_PARTS = ("X", "Y", "Z", "x rotation", "y rotation", "z rotation")
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,14 @@ class Unknowns:
     observations: Observations  # image points, grouped by object point
     order: IntArray  # index in network.image_points of each of observations, (k,)
     active: BoolArray  # image points of observations that can take part, (k,)
-    exterior_free: BoolArray  # (m, 6)
+    pose_free: BoolArray  # (poses, 6)
     interior_free: tuple[IntArray, ...]  # indices of the free parameters of each camera
     interior_column: tuple[IntArray, ...]  # their columns among the reduced unknowns
+    mount_column: IntArray  # columns of X, w of the mount of each camera, -1 where they are not free, (a, 6)
     point_free: BoolArray  # (n, 3)
     image_on: BoolArray  # photographs that take part, (m,)
     point_on: BoolArray  # object points that take part, (n,)
     kept: IntArray  # object points that stay among the reduced unknowns, (s,)
-    bars: IntArray  # scale bars of the network whose ends take part, (b,)
     reduced: int  # number of reduced unknowns, fixed ones included
     held: tuple[str, ...]  # photographs and points held because nothing determines them, in words
     held_defect: int  # rank defect that their unknowns would have had
@@ -54,25 +57,59 @@ class Unknowns:
         return self.reduced - 3 * len(self.kept)
 
     @property
+    def rigged(self) -> bool:
+        """Whether photographs share poses."""
+        return bool(self.observations.mounted.any())
+
+    @property
     def count(self) -> int:
         """Number of free unknowns."""
         return sum(self.counts)
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Numbers of free unknowns: exterior orientation, interior orientation, coordinates of points."""
-        interior = self.kept_start - self.exterior_free.size
-        return int(self.exterior_free.sum()), interior, int(self.point_free.sum())
+        """Numbers of free unknowns: poses and mounts, interior orientation, coordinates of points."""
+        mounts = int((self.mount_column >= 0).sum())
+        interior = self.kept_start - self.pose_free.size - mounts
+        return int(self.pose_free.sum()) + mounts, interior, int(self.point_free.sum())
 
     @property
     def all_free(self) -> bool:
         """Whether nothing is fixed or held."""
-        return bool(self.exterior_free.all() and self.point_free.all())
+        return bool(self.pose_free.all() and self.point_free.all()) and not self.rigged
 
     def reduced_free(self) -> BoolArray:
         """Return which of the reduced unknowns are free, (reduced,)."""
-        interior = np.ones(self.kept_start - self.exterior_free.size, dtype=bool)
-        return np.concatenate([self.exterior_free.ravel(), interior, self.point_free[self.kept].ravel()])
+        interior = np.ones(self.kept_start - self.pose_free.size, dtype=bool)
+        return np.concatenate([self.pose_free.ravel(), interior, self.point_free[self.kept].ravel()])
+
+    def photograph_terms(self, state: State, images: IntArray) -> tuple[IntArray, FloatArray]:
+        """Return the unknowns of the exterior orientation of photographs, and its derivatives by them.
+
+        Args:
+            state: values of all unknowns.
+            images: indices of photographs, (e,).
+
+        Returns:
+            Columns among the reduced unknowns, (e, u), and d (X0, w) / d unknowns, (e, 6, u); 0 where they
+            are fixed. Without rigs the unknowns are X0, w themselves.
+        """
+        o, e = self.observations, len(images)
+        pose = o.pose_of[images]
+        columns: IntArray = 6 * pose[:, None] + np.arange(6)
+        J = np.zeros((e, 6, 12 if self.rigged else 6))
+        J[:, :, :6] = np.eye(6)
+        if self.rigged:
+            a = o.camera[images]
+            R = np.swapaxes(state.rig_from_object[pose], 1, 2)
+            J[:, :3, 3:6] = -R @ skew(state.mount_position[a])
+            J[:, 3:, 3:6] = state.camera_from_rig[a]
+            own = self.mount_column[a]
+            J[:, :3, 6:9], J[:, 3:, 9:] = R, np.eye(3)
+            J[:, :, 6:] *= (own >= 0)[:, None]
+            columns = np.concatenate([columns, np.maximum(own, 0)], axis=1)
+        J[:, :, :6] *= self.pose_free[pose][:, None]
+        return columns, J
 
 
 def unknowns_of(
@@ -95,9 +132,10 @@ def unknowns_of(
     """
     k = network.image_points
     m, n = len(network.images), len(network.points)
-    exterior_free, exterior_known = np.ones((m, 6), dtype=bool), np.zeros((m, 6), dtype=bool)
+    pose_of, poses, mounts, mounted = _rigs_of(network, estimate)
+    pose_free, pose_known = np.ones((poses, 6), dtype=bool), np.zeros(poses, dtype=bool)
     point_free, point_known = np.ones((n, 3), dtype=bool), np.zeros((n, 3), dtype=bool)
-    position, rotation, points = estimate.position.copy(), estimate.rotation, estimate.points.copy()
+    points = estimate.points.copy()
 
     if use_control and len(network.control):
         control = network.control
@@ -108,12 +146,21 @@ def unknowns_of(
         points[control.point] = np.where((variance == 0) | ~np.isfinite(value), control.xyz, value)
     if len(network.exterior):
         variance = np.diagonal(network.exterior.covariance, axis1=1, axis2=2)
-        exterior_free[network.exterior.image] = variance > 0
-        exterior_known[network.exterior.image] = np.isfinite(variance)
+        image, fixed = network.exterior.image, (variance == 0).any(axis=1)
+        of_rig = image[fixed & mounted[network.camera[image]]]
+        if len(of_rig):
+            raise GeometryError(
+                f"photograph {network.images[of_rig[0]]}: its exterior orientation is fixed, expected "
+                "standard deviations, as its camera is mounted on a rig"
+            )
+        free = np.ones((m, 6), dtype=bool)
+        free[image] = variance > 0
+        np.logical_and.at(pose_free, pose_of, free)
+        pose_known[pose_of[image[np.isfinite(variance).all(axis=1)]]] = True
 
-    start = replace(estimate, position=position, points=points)
+    start = replace(estimate, points=points)
     active, seen, rays, held, held_defect = _hold_undetermined(
-        network, start, exterior_free, exterior_known, point_free, point_known
+        network, start, pose_of, pose_free, pose_known, point_free, point_known
     )
     if not seen.any():
         raise GeometryError("adjustment: no image point joins an oriented photograph and a determined point")
@@ -124,17 +171,23 @@ def unknowns_of(
     used = np.bincount(network.camera[image_on], minlength=len(counts)) > 0
     interior_free = tuple(f if u else f[:0] for f, u in zip(interior_free, used, strict=True))
     counts = np.where(used, counts, 0)
-    free_index = np.zeros((len(counts), MAX_PARAMETERS), dtype=np.int64)
+    free_index = np.zeros((len(counts), CAMERA_UNKNOWNS), dtype=np.int64)
     free_column = np.zeros_like(free_index)
-    columns, interior = _interior_columns(estimate.cameras, interior_free, 6 * m)
-    for a, (free, column) in enumerate(zip(interior_free, columns, strict=True)):
-        free_index[a, : len(free)] = free
-        free_column[a, : len(free)] = column
-    bars = np.flatnonzero(point_on[network.scale_bars.start] & point_on[network.scale_bars.end])
-    ends = np.concatenate([network.scale_bars.start[bars], network.scale_bars.end[bars]])
-    kept = np.unique(ends).astype(np.int64) if len(ends) else np.zeros(0, dtype=np.int64)
+    columns, interior = _interior_columns(estimate.cameras, interior_free, 6 * poses)
+    mount_free = mounts.free & (mounted & used)[:, None]
+    mount_column: IntArray = np.full(mount_free.shape, -1)
+    mount_unknowns = int(mount_free.sum())
+    mount_column[mount_free] = 6 * poses + interior + np.arange(mount_unknowns)
+    interior += mount_unknowns
+    has_interior = counts > 0
+    for a, (own, column) in enumerate(zip(interior_free, columns, strict=True)):
+        of_mount = np.flatnonzero(mount_free[a])
+        counts[a] += len(of_mount)
+        free_index[a, : counts[a]] = np.concatenate([own, MAX_PARAMETERS + of_mount])
+        free_column[a, : counts[a]] = np.concatenate([column, mount_column[a, of_mount]])
+    kept = _coupled_points(network, point_on)
 
-    order, rays_from = by_point(k, m, n)
+    order, rays_from = by_point(k.image, k.point, pose_of, n)
     covariance = k.covariance
     if image_sigma_factor is not None:
         covariance = scaled_covariance(covariance, image_sigma_factor)
@@ -145,9 +198,13 @@ def unknowns_of(
         xy=np.take(k.xy, order, axis=0).astype(float, copy=False),
         whitening=whitening_of(covariance, order),
         camera=np.ascontiguousarray(network.camera, dtype=np.int64),
+        pose=pose_of[np.take(k.image, order)],
+        pose_of=pose_of,
+        poses=poses,
+        mounted=mounted,
         model=np.array([camera.index for camera in estimate.cameras], dtype=np.int64),
         frame=np.array([camera.frame for camera in estimate.cameras]),
-        interior=np.where(counts > 0, [len(camera.names) for camera in estimate.cameras], 0),
+        interior=np.where(has_interior, [len(camera.names) for camera in estimate.cameras], 0),
         free_count=counts,
         free_index=free_index,
         free_column=free_column,
@@ -156,23 +213,22 @@ def unknowns_of(
         observations=observations,
         order=order,
         active=active[order],
-        exterior_free=exterior_free,
+        pose_free=pose_free,
         interior_free=interior_free,
         interior_column=columns,
+        mount_column=mount_column,
         point_free=point_free,
         image_on=image_on,
         point_on=point_on,
         kept=kept,
-        bars=bars,
-        reduced=6 * m + interior + 3 * len(kept),
+        reduced=6 * poses + interior + 3 * len(kept),
         held=held,
         held_defect=held_defect,
     )
     parameters = np.zeros((len(estimate.cameras), MAX_PARAMETERS))
     for a, camera in enumerate(estimate.cameras):
         parameters[a, : len(camera.parameters)] = camera.parameters
-    M = np.ascontiguousarray(np.swapaxes(rotation, 1, 2))
-    return layout, State(position, M, parameters, points)
+    return layout, _start_state(estimate, layout.observations, mounts, parameters, points)
 
 
 def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray) -> State:
@@ -184,17 +240,34 @@ def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray
         reduced: step of the reduced unknowns, shape (reduced,).
         points: step of the object points, kept ones included, shape (n, 3).
     """
-    m = len(state.position)
-    exterior = reduced[: 6 * m].reshape(m, 6)
-    M, parameters = np.empty_like(state.M), state.parameters.copy()
-    _turn(state.M, exterior, M)
+    poses = len(state.rig_from_object)
+    moved = reduced[: 6 * poses].reshape(poses, 6)
+    M, parameters = np.empty_like(state.rig_from_object), state.parameters.copy()
+    _turn(state.rig_from_object, moved, M)
     for a, (free, column) in enumerate(zip(layout.interior_free, layout.interior_column, strict=True)):
         parameters[a, free] += reduced[column]
-    return State(
-        state.position + exterior[:, :3],
-        M,
+    position = state.pose_position + moved[:, :3]
+    if not layout.rigged:
+        return State(
+            position,
+            M,
+            parameters,
+            state.points + points,
+            position,
+            M,
+            state.mount_position,
+            state.camera_from_rig,
+        )
+    column = layout.mount_column
+    of_mounts = np.where(column >= 0, reduced[column], 0.0)
+    camera_from_rig = np.empty_like(state.camera_from_rig)
+    _turn(state.camera_from_rig, of_mounts, camera_from_rig)
+    return _derived(
+        layout.observations,
         parameters,
         state.points + points,
+        (position, M),
+        (state.mount_position + of_mounts[:, :3], camera_from_rig),
     )
 
 
@@ -211,35 +284,11 @@ def estimate_of(state: State, estimate: Estimate) -> Estimate:
         camera.with_parameters(state.parameters[a, : len(camera.parameters)])
         for a, camera in enumerate(estimate.cameras)
     )
-    return Estimate(cameras, state.position, np.swapaxes(state.M, 1, 2).copy(), state.points)
-
-
-def angle_jacobian(M: FloatArray) -> FloatArray:
-    """Return d (omega, phi, kappa) / d w of small rotations in the image axes, R <- R exp([w]x).
-
-    Args:
-        M: object to image axes, shape (m, 3, 3).
-
-    Returns:
-        Derivatives, shape (m, 3, 3); huge where phi is near +-90 deg and omega is not separable.
-    """
-    _, phi, kappa = np.moveaxis(angles_from_rotation(np.swapaxes(M, 1, 2)), -1, 0)
-    sk, ck = np.sin(kappa), np.cos(kappa)
-    cos_phi = np.maximum(np.cos(phi), MIN_COS_PHI)
-    T = np.zeros(M.shape)
-    T[:, 0, 0], T[:, 0, 1] = ck / cos_phi, -sk / cos_phi
-    T[:, 1, 0], T[:, 1, 1] = sk, ck
-    T[:, 2, :2] = -np.sin(phi)[:, None] * T[:, 0, :2]
-    T[:, 2, 2] = 1.0
-    return T
-
-
-def exterior_jacobian(M: FloatArray) -> FloatArray:
-    """Return d (X0, omega, phi, kappa) / d (X0, w), see `angle_jacobian`, (m, 6, 6)."""
-    J = np.zeros((len(M), 6, 6))
-    J[:, :3, :3] = np.eye(3)
-    J[:, 3:, 3:] = angle_jacobian(M)
-    return J
+    mounts = estimate.mounts
+    if mounts is not None:
+        rotation = np.swapaxes(state.camera_from_rig, 1, 2).copy()
+        mounts = replace(mounts, position=state.mount_position, rotation=rotation)
+    return Estimate(cameras, state.position, np.swapaxes(state.M, 1, 2).copy(), state.points, mounts)
 
 
 def start_weights(layout: Unknowns, state: State) -> FloatArray:
@@ -249,13 +298,18 @@ def start_weights(layout: Unknowns, state: State) -> FloatArray:
 
 def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]]:
     """Return (parameter, camera or group of cameras) of each interior unknown, in order of columns."""
-    names = [("", "")] * (layout.kept_start - layout.exterior_free.size)
+    first = layout.pose_free.size
+    names = [("", "")] * (layout.kept_start - first)
     for camera, free, columns in zip(
         estimate.cameras, layout.interior_free, layout.interior_column, strict=True
     ):
         for s, column in zip(free, columns, strict=True):
             owner = camera.owner_of(s)
-            names[column - layout.exterior_free.size] = (camera.names[s], f"camera {owner}")
+            names[column - first] = (camera.names[s], f"camera {owner}")
+    for camera, columns in zip(estimate.cameras, layout.mount_column, strict=True):
+        for part, column in zip(MOUNT_PARTS, columns, strict=True):
+            if column >= 0:
+                names[column - first] = (part, f"mount of camera {camera.name}")
     return names
 
 
@@ -292,44 +346,129 @@ def _interior_columns(
 def _hold_undetermined(
     network: Network,
     estimate: Estimate,
-    exterior_free: BoolArray,
-    exterior_known: BoolArray,
+    pose_of: IntArray,
+    pose_free: BoolArray,
+    pose_known: BoolArray,
     point_free: BoolArray,
     point_known: BoolArray,
 ) -> tuple[BoolArray, IntArray, IntArray, tuple[str, ...], int]:
-    """Hold photographs and points with too few image points, until none is left; clears their free flags.
+    """Hold poses and points with too few image points, until none is left; clears their free flags.
 
-    Returns which image points take part, how many of each photograph and of each point, who is held, in
-    words, and the rank defect that these would have had.
+    Returns which image points take part, how many of the pose of each photograph and of each point, who is
+    held, in words, and the rank defect that these would have had.
     """
     k = network.image_points
-    m, n = len(network.images), len(network.points)
-    image_on, point_on = estimate.oriented.copy(), estimate.determined.copy()
-    held = [f"photograph {network.images[i]}: no start value" for i in np.flatnonzero(~image_on)]
+    n, poses = len(network.points), len(pose_free)
+    pose_on = np.bincount(pose_of[estimate.oriented], minlength=poses) > 0
+    point_on, pose = estimate.determined.copy(), pose_of[k.image]
+    held = [f"photograph {network.images[i]}: no start value" for i in np.flatnonzero(~pose_on[pose_of])]
     held += [f"point {network.points[j]}: no start value" for j in np.flatnonzero(~point_on)]
-    needs_points = exterior_free.any(axis=1) & ~exterior_known.all(axis=1)
+    needs_points = pose_free.any(axis=1) & ~pose_known
     needs_rays = point_free.any(axis=1) & ~point_known.all(axis=1)
     defect = 0
     while True:
-        active = image_on[k.image] & point_on[k.point]
+        active = pose_on[pose] & point_on[k.point]
         every = bool(active.all())
-        seen = np.bincount(k.image if every else k.image[active], minlength=m)
+        seen = np.bincount(pose if every else pose[active], minlength=poses)
         rays = np.bincount(k.point if every else k.point[active], minlength=n)
         lost_points = point_on & needs_rays & (rays < MIN_RAYS)
-        lost_images = image_on & needs_points & (seen < MIN_POINTS)
-        if not (lost_points.any() or lost_images.any()):
+        lost_poses = pose_on & needs_points & (seen < MIN_POINTS)
+        if not (lost_points.any() or lost_poses.any()):
             break
         held += [
             f"point {network.points[j]}: {counted(rays[j], 'ray')}, {MIN_RAYS} are needed"
             for j in np.flatnonzero(lost_points)
         ]
         held += [
-            f"photograph {network.images[i]}: {counted(seen[i], 'point')}, {MIN_POINTS} are needed"
-            for i in np.flatnonzero(lost_images)
+            f"photograph {network.images[i]}: {counted(seen[pose_of[i]], 'point')}, {MIN_POINTS} are needed"
+            for i in np.flatnonzero(lost_poses[pose_of])
         ]
-        defect += int((3 - 2 * rays[lost_points]).sum() + (6 - 2 * seen[lost_images]).sum())
+        defect += int((3 - 2 * rays[lost_points]).sum() + (6 - 2 * seen[lost_poses]).sum())
         point_on &= ~lost_points
-        image_on &= ~lost_images
-    exterior_free[~image_on] = False
+        pose_on &= ~lost_poses
+    pose_free[~pose_on] = False
     point_free[~point_on] = False
-    return active, seen, rays, tuple(held), defect
+    return active, seen[pose_of], rays, tuple(held), defect
+
+
+def _coupled_points(network: Network, point_on: BoolArray) -> IntArray:
+    """Return the points that observations couple with other unknowns, of those that take part, (s,)."""
+    found = [np.zeros(0, dtype=np.int64)]
+    for kind in network.kinds:
+        blocks = kind.blocks()
+        if len(kind) and len(blocks) > 1:
+            of_points = [block.at for block in blocks if block.of == POINT]
+            on = np.logical_and.reduce([point_on[index] for index in of_points])
+            found += [index[on] for index in of_points]
+    return np.unique(np.concatenate(found))
+
+
+def _rigs_of(network: Network, estimate: Estimate) -> tuple[IntArray, int, Mounts, BoolArray]:
+    """Return the pose of each photograph, how many there are, the mounts, and cameras with one beside 0.
+
+    Raises:
+        GeometryError: photographs of one moment that their cameras' rig does not join.
+    """
+    m, a = len(network.images), len(estimate.cameras)
+    mounts = estimate.mounts
+    if network.moment is None or mounts is None or not any(mounts.rig):
+        nowhere = Mounts(
+            np.zeros((a, 3)), np.tile(np.eye(3), (a, 1, 1)), np.zeros((a, 6), dtype=bool), ("",) * a
+        )
+        return np.arange(m), m, nowhere, np.zeros(a, dtype=bool)
+    moments, pose_of = np.unique(network.moment, return_inverse=True)
+    single = np.array([not rig for rig in mounts.rig])[network.camera]
+    rigs = np.unique(np.array(mounts.rig), return_inverse=True)[1][network.camera]
+    shared = np.bincount(pose_of)[pose_of] > 1
+    other = rigs != rigs[np.unique(pose_of, return_index=True)[1]][pose_of]
+    for i in np.flatnonzero(shared & (single | other)):
+        raise GeometryError(
+            f"photograph {network.images[i]}: its moment is that of others, expected those of one rig only"
+        )
+    at_reference = (mounts.position == 0).all(axis=1) & (mounts.rotation == np.eye(3)).all(axis=(1, 2))
+    return pose_of.astype(np.int64), len(moments), mounts, ~at_reference | mounts.free.any(axis=1)
+
+
+def _start_state(
+    estimate: Estimate, o: Observations, mounts: Mounts, parameters: FloatArray, points: FloatArray
+) -> State:
+    """Return the state of start values; the pose of a rig is that of its first oriented photograph."""
+    M = np.ascontiguousarray(np.swapaxes(estimate.rotation, 1, 2))
+    position, camera_from_rig = (
+        estimate.position.copy(),
+        np.ascontiguousarray(np.swapaxes(mounts.rotation, 1, 2)),
+    )
+    if not o.mounted.any():
+        return State(position, M, parameters, points, position, M, mounts.position, camera_from_rig)
+    first = np.full(o.poses, len(position), dtype=np.int64)
+    oriented = np.flatnonzero(estimate.oriented)
+    # the reference camera before others
+    order = oriented[np.argsort(o.mounted[o.camera[oriented]], kind="stable")]
+    first[o.pose_of[order[::-1]]] = order[::-1]
+    known = np.flatnonzero(first < len(position))
+    pose_position, rig_from_object = np.full((o.poses, 3), np.nan), np.full((o.poses, 3, 3), np.nan)
+    i = first[known]
+    a = o.camera[i]
+    rig_from_object[known] = mounts.rotation[a] @ M[i]
+    away = np.einsum("pba,pb->pa", rig_from_object[known], mounts.position[a])
+    pose_position[known] = position[i] - away
+    return _derived(
+        o, parameters, points, (pose_position, rig_from_object), (mounts.position, camera_from_rig)
+    )
+
+
+def _derived(
+    o: Observations,
+    parameters: FloatArray,
+    points: FloatArray,
+    poses: tuple[FloatArray, FloatArray],
+    mounts: tuple[FloatArray, FloatArray],
+) -> State:
+    """Return the state of poses and mounts, with the orientation of each photograph from both."""
+    (pose_position, rig_from_object), (mount_position, camera_from_rig) = poses, mounts
+    at = rig_from_object[o.pose_of]
+    position = pose_position[o.pose_of] + np.einsum("mba,mb->ma", at, mount_position[o.camera])
+    M = np.ascontiguousarray(camera_from_rig[o.camera] @ at)
+    return State(
+        position, M, parameters, points, pose_position, rig_from_object, mount_position, camera_from_rig
+    )

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
-from sfm.adjustment.engine.unknowns import exterior_jacobian, interior_names
+from sfm.adjustment.engine.unknowns import interior_names
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.kernels.threads import own_threads
+from sfm.observations.exterior import exterior_jacobian
 
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
@@ -116,13 +117,14 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
     marginal = marginal_of(adjustment, cross=False)
     layout, optimum, Q = marginal.layout, marginal.optimum, marginal.cofactors
     names = interior_names(layout, adjustment.estimate)
-    m, i = len(adjustment.network.images), len(names)
-    own, inner = slice(0, 6 * m), slice(6 * m, 6 * m + i)
+    first, i = layout.pose_free.size, len(names)
+    inner = slice(first, first + i)
     H, F, G = optimum.motions.reduced, Q.F_reduced, Q.G
     # S Q S' of the S-transformation, the block of exterior by interior unknowns
-    C = Q.mixed[:, :i] - H[own] @ F[:, inner] - (H[inner] @ F[:, own]).T + H[own] @ G @ H[inner].T
-    T = exterior_jacobian(optimum.state.M)
-    C = T @ C.reshape(m, 6, i)
+    of_poses = np.concatenate([Q.mixed[:, :i], Q.border[:, :i]])
+    C = of_poses - H @ F[:, inner] - (H[inner] @ F).T + H @ G @ H[inner].T
+    columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
+    C = exterior_jacobian(optimum.state.M) @ J @ C[columns]
     exterior = np.einsum("mpp->mp", adjustment.cofactors.exterior)
     half = H[inner] @ F[:, inner]  # 0 but for null vectors that are none of the motions of the network
     interior = np.diagonal(Q.border[:i, :i] - half - half.T + H[inner] @ G @ H[inner].T)

@@ -98,7 +98,7 @@ def words_of_motions(optimum: Optimum, layout: Unknowns) -> str:
     """
     sound = optimum.equations.blocks.held == 0  # other points do not move as the motions do
     d = optimum.motions.defect
-    generators = free_motions(layout, optimum.state)[1][sound].reshape(-1, 7)
+    generators = free_motions(layout, optimum.state)[2][sound].reshape(-1, 7)
     opened = optimum.motions.points[sound, :, :d].reshape(-1, d)
     V = np.linalg.qr(np.linalg.lstsq(generators, opened, rcond=None)[0])[0]  # (7, d)
     turns = _null_space(V[3:])  # those combinations that only shift
@@ -141,7 +141,9 @@ def _axes(directions: FloatArray) -> str:
 
 def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> list[tuple[str, str]]:
     """Return (parameter, of what) of each reduced unknown."""
-    names = [(part, f"photograph {image}") for image in network.images for part in EXTERIOR]
+    first = np.unique(layout.observations.pose_of, return_index=True)[1]
+    what = "rig at photograph" if layout.rigged else "photograph"
+    names = [(part, f"{what} {network.images[i]}") for i in first for part in EXTERIOR]
     names += interior_names(layout, estimate)
     names += [(axis, f"point {network.points[j]}") for j in layout.kept for axis in "XYZ"]
     return names

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed_unknowns import Weighted, bar_rows
+from sfm.adjustment.engine.cofactors import Cofactors
+from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.observed import Observed, Reduced, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.adjustment.result import ObservedResiduals
 from sfm.conventions import FloatArray
 from sfm.distributions import t_ppf
 
@@ -85,20 +87,59 @@ def standardised_of_given(
     return np.where(checked, Pv / np.sqrt(np.where(checked, PQP, 1.0)), np.nan), np.clip(r, 0.0, 1.0)
 
 
-def redundancy_of_bars(
-    weighted: Weighted, layout: Unknowns, state: State, cofactor: FloatArray
-) -> FloatArray:
-    """Return the redundancy number 1 - p a Q a' of each scale bar that took part, (b,).
+def residuals_of_observed(
+    one: Observed, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
+) -> ObservedResiduals:
+    """Return the residuals of observations of a kind, with their redundancy numbers and tests.
 
     Args:
-        weighted: observed unknowns.
+        one: observations of a kind.
         layout: order of the unknowns.
-        state: at the optimum.
-        cofactor: Q of the kept object points, in any datum, shape (3 s, 3 s).
+        optimum: undamped normal equations and their factor.
+        cofactors: of the same; None where they are not wanted, and numbers are NaN.
     """
-    rows, _ = bar_rows(weighted, layout, state)
-    taken = weighted.length_weight * ((rows @ cofactor) * rows).sum(axis=1)
-    return np.asarray(np.clip(1 - taken, 0.0, 1.0))
+    linear = one.kind.linearise(optimum.state)
+    shape = linear.difference.shape
+    l = linear.difference.reshape(one.weight.shape[:2])
+    vPv = float(np.einsum("na,nab,nb->", l, one.weight, l))
+    r, w, redundancy = np.full(shape, np.nan), np.full(shape, np.nan), float("nan")
+    if cofactors is not None:
+        if one.point is not None:
+            Q = linear.J[0] @ cofactors.points[one.point] @ np.swapaxes(linear.J[0], 1, 2)
+        else:
+            Q = _cofactors_of(reduced_rows(one, layout, optimum.state), optimum, cofactors)
+        w, r = (part.reshape(shape) for part in standardised_of_given(l, one.weight, Q))
+        redundancy = one.count - float(np.einsum("nab,nba->", one.weight, Q))
+    return ObservedResiduals(one.index, one.rows, linear.difference, r, w, one.count, vPv, redundancy)
+
+
+def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> FloatArray:
+    """Return J Q J' of observations by the reduced unknowns, (n, d, d); estimable, so in any datum."""
+    (columns, J, _), poses = rows, len(cofactors.exterior)
+    n, d, u = J.shape
+    outer = columns < 6 * poses
+    pose = np.where(outer, columns // 6, -1)
+    lone = pose.max(axis=1, initial=-1)
+    if (outer & (pose != lone[:, None])).any():  # several poses in one observation
+        found = np.empty((n, d, d))
+        for row in range(n):
+            right = np.zeros((d, len(optimum.equations.parts.scale)))
+            np.add.at(right, (np.arange(d)[:, None], columns[row]), J[row])
+            found[row] = right @ optimum.factor.solve(right.T)
+        return found
+    Q = np.zeros((n, u, u))
+    inner, part = np.where(outer, 0, columns - 6 * poses), np.where(outer, columns % 6, 0)
+    r, c = outer[:, :, None], outer[:, None]
+    if outer.any():
+        at = np.maximum(lone, 0)[:, None, None]
+        Q += np.where(r & c, cofactors.exterior[at, part[:, :, None], part[:, None]], 0.0)
+    if not outer.all():
+        Q += np.where(r | c, 0.0, cofactors.border[inner[:, :, None], inner[:, None]])
+        if outer.any():
+            mixed = cofactors.mixed.reshape(poses, 6, -1)[at, part[:, :, None], inner[:, None]]
+            mixed = np.where(r & ~c, mixed, 0.0)
+            Q += mixed + np.swapaxes(mixed, 1, 2)
+    return np.asarray(J @ Q @ np.swapaxes(J, 1, 2))
 
 
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)

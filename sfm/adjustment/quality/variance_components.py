@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.engine.observed_unknowns import exterior_misclosure, weighted_of
-from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -93,63 +91,19 @@ def by_camera(adjustment: Adjustment) -> VarianceComponents:
 def by_kind(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each kind of observation.
 
-    Kinds are image points, control points, exterior and interior orientation, and scale bars; those
-    that were not observed are left out. Redundancy numbers of all kinds add up to the redundancy.
+    Kinds are image points and those of `Network.kinds` that took part. Redundancy numbers of all kinds add
+    up to the redundancy.
     """
     a, network = adjustment, adjustment.network
-    use_control = a.datum == "control"
-    layout, state = unknowns_of(network, a.estimate, use_control=use_control)
-    w = weighted_of(network, layout, use_control=use_control)
     whole = np.zeros(len(a.rejected), dtype=np.int64)
     image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
-    cofactors = a.cofactors
-    Q_points, Q_exterior = cofactors.points[w.point], cofactors.exterior[w.image]
-    dX = state.points[w.point] - w.xyz
-    e = exterior_misclosure(w, state)
-    dp = state.parameters[w.camera, w.parameter] - w.value
-    slots = [
-        int(np.flatnonzero(layout.interior_free[c] == s)[0])
-        for c, s in zip(w.camera, w.parameter, strict=True)
-    ]
-    where = np.array(slots, dtype=np.int64)
-    Q_interior = np.zeros((len(where), len(where)))
-    for c in np.unique(w.camera):  # values of different cameras are not correlated
-        of_camera = np.flatnonzero(w.camera == c)
-        rows = where[of_camera]
-        Q_interior[np.ix_(of_camera, of_camera)] = cofactors.interior[c][np.ix_(rows, rows)]
-    bars = network.scale_bars
-    ends = a.estimate.points[bars.end[layout.bars]] - a.estimate.points[bars.start[layout.bars]]
-    length = np.linalg.norm(ends, axis=1) - w.length
-    kinds = [
-        (
-            "control points",
-            int((np.diagonal(w.point_weight, axis1=1, axis2=2) > 0).sum()),
-            float(np.einsum("pa,pab,pb->", dX, w.point_weight, dX)),
-            float(np.einsum("pab,pba->", w.point_weight, Q_points)),
-        ),
-        (
-            "exterior orientation",
-            int((np.diagonal(w.exterior_weight, axis1=1, axis2=2) > 0).sum()),
-            float(np.einsum("ea,eab,eb->", e, w.exterior_weight, e)),
-            float(np.einsum("eab,eba->", w.exterior_weight, Q_exterior)),
-        ),
-        (
-            INTERIOR,
-            len(w.column),
-            float(dp @ w.interior_weight @ dp),
-            float((w.interior_weight * Q_interior).sum()),
-        ),
-    ]
-    taken = len(length) - float(a.bar_redundancy[layout.bars].sum())
-    kinds.append(("scale bars", len(length), float(w.length_weight @ length**2), taken))
-    seen = [kind for kind in kinds if kind[1]]
-    own = np.array([kind[1] - kind[3] for kind in seen])
-    sigma0 = _root_ratio(np.array([kind[2] for kind in seen]), own, FEW_OF_A_KIND)
+    own = np.array([kind.redundancy for kind in a.observed])
+    sigma0 = _root_ratio(np.array([kind.vPv for kind in a.observed]), own, FEW_OF_A_KIND)
     return VarianceComponents(
-        (IMAGE_POINTS, *(kind[0] for kind in seen)),
+        (IMAGE_POINTS, *(network.kinds[kind.index].name for kind in a.observed)),
         np.concatenate([image.sigma0, sigma0]),
         np.concatenate([image.redundancy, own]),
-        np.concatenate([image.count, np.array([kind[1] for kind in seen], dtype=np.int64)]),
+        np.concatenate([image.count, np.array([kind.count for kind in a.observed], dtype=np.int64)]),
     )
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.observations.kind import is_observed
 from sfm.result import ControlCheck, SurveyResult
 
 LISTED = 10  # largest residuals
@@ -143,8 +143,8 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     image = 2 * int((~adjustment.rejected).sum())
     control = 0
     if adjustment.datum == "control":
-        control = int(observed(_variances(network.control.covariance)).sum())
-    exterior = int(observed(_variances(network.exterior.covariance)).sum())
+        control = int(is_observed(_variances(network.control.covariance)).sum())
+    exterior = int(is_observed(_variances(network.exterior.covariance)).sum())
     sigma = network.interior.sigma
     interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
     bars = adjustment.observations - image - control - exterior - interior

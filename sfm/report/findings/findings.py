@@ -103,7 +103,11 @@ def findings_of(result: SurveyResult) -> Findings:
     """Return everything that the reports say of a result."""
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
-    given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
+    given, check, size = (
+        given_of(a, result.length_unit),
+        checked_control(result),
+        object_size(a.estimate.points),
+    )
     consistency, edges = consistency_of(a), edges_of(result.photographs)
     geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
     calibrated = calibrated_cameras(result, interior)

@@ -10,15 +10,18 @@ Source: Baarda (1968), A testing procedure for use in geodetic networks.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sfm.adjustment.engine.observed_unknowns import inverse_of_observed
-from sfm.adjustment.quality.reliability import UNCONTROLLED, standardised_of_given
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import Estimate
+from sfm.observations.control import ObjectPoints
+from sfm.observations.exterior import ExteriorObservations
+from sfm.observations.interior import InteriorObservations
+from sfm.observations.scale_bars import ScaleBars
 from sfm.report.findings.precision import root_mean_square
-from sfm.result import SurveyResult
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class GivenValue:
 class GivenResiduals:
     """Residuals of given values of one kind; d = 3 coordinates or angles of a point or photograph, else 1."""
 
-    kind: str  # what the names stand for
+    kind: str  # name of one of them
     coordinates: tuple[str, ...]  # names of the coordinates or angles, (d,)
     names: tuple[str, ...]  # control point, both ends of a bar, parameter and camera, or photograph, (n,)
     units: tuple[str, ...]  # (n,)
@@ -52,9 +55,13 @@ class GivenResiduals:
     def observed(self) -> GivenResiduals | None:
         """Return those of which something was observed; None without any."""
         rows = np.flatnonzero(np.isfinite(self.sigma).any(axis=1))
+        return self.rows(rows) if len(rows) else None
+
+    def rows(self, rows: IntArray) -> GivenResiduals:
+        """Return some of them."""
         names, units = (tuple(words[k] for k in rows) for words in (self.names, self.units))
         values = (x[rows] for x in (self.given, self.difference, self.sigma, self.r, self.w))
-        return GivenResiduals(self.kind, self.coordinates, names, units, *values) if len(rows) else None
+        return GivenResiduals(self.kind, self.coordinates, names, units, *values)
 
     @property
     def checked(self) -> bool:
@@ -93,141 +100,123 @@ class GivenResiduals:
 
 @dataclass(frozen=True)
 class Given:
-    """Given values that took part beside the photographs; None for kinds without any."""
+    """Given values that took part beside the photographs, kind by kind."""
 
-    control: GivenResiduals | None
-    bars: GivenResiduals | None
-    interior: GivenResiduals | None
-    position: GivenResiduals | None  # projection centres
-    rotation: GivenResiduals | None  # angles, deg
+    kinds: tuple[GivenResiduals, ...]
 
     @property
-    def kinds(self) -> tuple[GivenResiduals, ...]:
-        """All kinds that there are."""
-        kinds = (self.control, self.bars, self.interior, self.position, self.rotation)
-        return tuple(kind for kind in kinds if kind is not None)
+    def control(self) -> GivenResiduals | None:
+        """Control points; None without any."""
+        return self.of(ObjectPoints.single)
+
+    @property
+    def bars(self) -> GivenResiduals | None:
+        """Scale bars; None without any."""
+        return self.of(ScaleBars.single)
+
+    @property
+    def interior(self) -> GivenResiduals | None:
+        """Observed parameters of interior orientation; None without any."""
+        return self.of(InteriorObservations.single)
+
+    def of(self, kind: str) -> GivenResiduals | None:
+        """Return the residuals of a kind, by the name of one of them; None without any."""
+        return next((one for one in self.kinds if one.kind == kind), None)
 
     @property
     def single_values(self) -> tuple[tuple[str, GivenValue], ...]:
-        """Kind and value of each scale bar and each observed parameter of interior orientation."""
-        kinds = (("scale bar", self.bars), ("interior", self.interior))
-        return tuple((name, one) for name, kind in kinds if kind is not None for one in kind.values)
+        """Kind and value of all but control points and photographs."""
+        tables = (ObjectPoints.single, CENTRE, ROTATION)
+        shown = [kind for kind in self.kinds if kind.kind not in tables]
+        short = {InteriorObservations.single: "interior"}
+        return tuple((short.get(kind.kind, kind.kind), one) for kind in shown for one in kind.values)
 
     @property
     def exterior(self) -> tuple[GivenResiduals, ...]:
         """Projection centres and angles, of the photographs of which something was observed."""
-        kinds = (kind.observed() for kind in (self.position, self.rotation) if kind is not None)
+        kinds = (kind.observed() for kind in self.kinds if kind.kind in (CENTRE, ROTATION))
         return tuple(kind for kind in kinds if kind is not None)
 
 
-def control_residuals(a: Adjustment, unit: str) -> GivenResiduals | None:
-    """Return by how much control differs from its given coordinates; None where control took no part."""
-    control = a.network.control
-    if a.datum != "control" or not len(control):
-        return None
-    variance = np.einsum("nii->ni", control.covariance)
-    difference = a.estimate.points[control.point] - control.xyz
-    weight, _ = inverse_of_observed(control.covariance)
-    w, r = standardised_of_given(difference, weight, a.cofactors.points[control.point])
-    return GivenResiduals(
-        kind="control point",
-        coordinates=("X", "Y", "Z"),
-        names=tuple(a.network.points[j] for j in control.point),
-        units=(unit,) * len(control),
-        given=np.where(np.isfinite(variance), control.xyz, np.nan),
-        difference=np.where(np.isfinite(variance), difference, np.nan),
-        sigma=np.where(np.isfinite(variance), np.sqrt(variance), np.nan),
-        r=r,
-        w=w,
+CENTRE, ROTATION = "projection centre", "rotation"
+
+
+class AdjustedValues(NamedTuple):
+    """Adjusted values, as `sfm.observations.kind.Values`."""
+
+    points: FloatArray
+    position: FloatArray
+    M: FloatArray
+    parameters: FloatArray
+    mount_position: FloatArray
+    camera_from_rig: FloatArray
+
+
+def values_of(estimate: Estimate) -> AdjustedValues:
+    """Return the values of an estimate as kinds of observations ask for them."""
+    cameras, mounts = estimate.cameras, estimate.mounts
+    parameters = np.full((len(cameras), max(len(camera.parameters) for camera in cameras)), np.nan)
+    for a, camera in enumerate(cameras):
+        parameters[a, : len(camera.parameters)] = camera.parameters
+    nowhere = np.zeros((len(cameras), 3)), np.tile(np.eye(3), (len(cameras), 1, 1))
+    position, rotation = nowhere if mounts is None else (mounts.position, mounts.rotation)
+    return AdjustedValues(
+        estimate.points,
+        estimate.position,
+        np.swapaxes(estimate.rotation, 1, 2),
+        parameters,
+        position,
+        np.swapaxes(rotation, 1, 2),
     )
 
 
-def bar_residuals(a: Adjustment, unit: str) -> GivenResiduals | None:
-    """Return by how much scale bars differ from their given lengths; None without scale bars."""
-    bars = a.network.scale_bars
-    if not len(bars):
-        return None
-    X, r = a.estimate.points, a.bar_redundancy
-    difference = np.linalg.norm(X[bars.end] - X[bars.start], axis=1) - bars.length
-    checked = r > UNCONTROLLED
-    w = np.where(checked, difference / (bars.sigma * np.sqrt(np.where(checked, r, 1.0))), np.nan)
-    return GivenResiduals(
-        kind="scale bar",
-        coordinates=("length",),
-        names=tuple(
-            f"{a.network.points[i]} - {a.network.points[j]}"
-            for i, j in zip(bars.start, bars.end, strict=True)
-        ),
-        units=(unit,) * len(bars),
-        given=bars.length[:, None],
-        difference=difference[:, None],
-        sigma=bars.sigma[:, None],
-        r=r[:, None],
-        w=w[:, None],
-    )
+def given_of(a: Adjustment, length_unit: str) -> Given:
+    """Return everything that was given beside the image points and took part.
 
-
-def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
-    """Return by how much weighted interior orientation differs from its given values; None without."""
-    adjustment, found = result.adjustment, result.adjustment.network.interior
-    names, units, parts = [], [], []
-    for a in np.unique(found.camera):
-        camera, Q = adjustment.estimate.cameras[a], adjustment.cofactors.interior[a]
-        column = {int(s): k for k, s in enumerate(np.flatnonzero(camera.free))}
-        rows = [
-            int(q)
-            for q in np.flatnonzero(found.camera == a)
-            if found.parameter[q] in column and 0 < found.sigma[q] < np.inf
-        ]
-        if not rows:
+    Args:
+        a: what `adjust` returned.
+        length_unit: of its coordinates.
+    """
+    found: list[GivenResiduals] = []
+    took_part = {one.index: one for one in a.observed}
+    for index, kind in enumerate(a.network.kinds):
+        if not len(kind) or (isinstance(kind, ObjectPoints) and a.datum != "control"):
             continue
-        own = found.parameter[rows]
-        names += [f"{camera.names[s]} of camera {camera.owner_of(s)}" for s in own]
-        units += [camera.units[s] for s in own]
-        at = [column[int(s)] for s in own]
-        cofactor = Q[np.ix_(at, at)] if len(Q) else np.full((len(at),) * 2, np.nan)
-        given, difference = found.value[rows], camera.parameters[own] - found.value[rows]
-        weight = found.weight_of(np.array(rows))
-        w, r = standardised_of_given(difference[None], weight[None], cofactor[None])
-        parts.append(np.stack([given, difference, found.sigma[rows], r[0], w[0]]))
-    if not parts:
-        return None
-    given, difference, sigma, r, w = np.hstack(parts)[:, :, None]
-    kind, words = "interior orientation", (tuple(names), tuple(units))
-    return GivenResiduals(kind, ("value",), *words, given, difference, sigma, r, w)
+        variance = np.diagonal(kind.covariances(), axis1=1, axis2=2)
+        known = np.isfinite(variance)
+        v = kind.linearise(values_of(a.estimate)).difference
+        r, w = np.full(v.shape, np.nan), np.full(v.shape, np.nan)
+        if index in took_part:
+            one = took_part[index]
+            r[one.rows], w[one.rows] = one.redundancy_numbers, one.standardised
+        part = GivenResiduals(
+            kind=kind.single,
+            coordinates=kind.components,
+            names=kind.names(a.network, a.estimate),
+            units=tuple(units[0] for units in kind.units(a.estimate, length_unit)),
+            given=np.where(known, kind.values, np.nan),
+            difference=np.where(known, v, np.nan),
+            sigma=np.sqrt(np.where(known, variance, np.nan)),
+            r=r,
+            w=w,
+        )
+        if isinstance(kind, ExteriorObservations):
+            found += _centre_and_rotation(part)
+        elif isinstance(kind, InteriorObservations):
+            found += [part.rows(took_part[index].rows)] if index in took_part else []
+        else:
+            found.append(part)
+    return Given(tuple(found))
 
 
-def exterior_residuals(result: SurveyResult) -> tuple[GivenResiduals, GivenResiduals] | None:
-    """Return by how much projection centres and angles (deg) differ from those observed; None without."""
-    a, seen = result.adjustment, result.adjustment.network.exterior
-    if not len(seen):
-        return None
-    variance = np.einsum("eii->ei", seen.covariance)
-    position, rotation = a.estimate.position[seen.image], a.estimate.rotation[seen.image]
-    angles = (angles_from_rotation(rotation) - seen.angles + np.pi) % (2 * np.pi) - np.pi
-    v = np.where(np.isfinite(variance), np.hstack([position - seen.position, angles]), 0.0)
-    weight, _ = inverse_of_observed(seen.covariance)
-    w, r = standardised_of_given(v, weight, a.cofactors.exterior[seen.image])
-    given = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
-    sigma = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
-    v = np.where(np.isfinite(variance), v, np.nan)
-    names = tuple(a.network.images[i] for i in seen.image)
-
-    def part(kind: str, coordinates: str, rows: slice, unit: str, factor: float) -> GivenResiduals:
-        values, differences, sigmas = (factor * x[:, rows] for x in (given, v, sigma))
-        units, axes = (unit,) * len(names), tuple(coordinates.split())
-        return GivenResiduals(kind, axes, names, units, values, differences, sigmas, r[:, rows], w[:, rows])
-
-    return (
-        part("projection centre", "X0 Y0 Z0", slice(0, 3), result.length_unit, 1.0),
-        part("rotation", "omega phi kappa", slice(3, 6), "deg", float(np.degrees(1.0))),
-    )
-
-
-def given_of(result: SurveyResult) -> Given:
-    """Return everything that was given with a standard deviation and took part."""
-    position, rotation = exterior_residuals(result) or (None, None)
-    a, unit = result.adjustment, result.length_unit
-    return Given(
-        control_residuals(a, unit), bar_residuals(a, unit), interior_residuals(result), position, rotation
-    )
+def _centre_and_rotation(part: GivenResiduals) -> list[GivenResiduals]:
+    """Return exterior orientation as projection centres and as angles in degrees."""
+    degrees, found = float(np.degrees(1.0)), []
+    for kind, axes, units, factor in (
+        (CENTRE, slice(0, 3), part.units, 1.0),
+        (ROTATION, slice(3, 6), ("deg",) * len(part.names), degrees),
+    ):
+        given, v, sigma = (factor * x[:, axes] for x in (part.given, part.difference, part.sigma))
+        r, w = part.r[:, axes], part.w[:, axes]
+        found.append(GivenResiduals(kind, part.coordinates[axes], part.names, units, given, v, sigma, r, w))
+    return found

@@ -15,7 +15,7 @@ from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import spread
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.given_residuals import GivenResiduals
+from sfm.report.findings.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
 from sfm.result import SurveyResult
 
@@ -123,9 +123,13 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "scale_bars": _scale_bars(findings),
         "weighted_interior": _given_values(given.interior, "parameter"),
         "observed_exterior": [
-            *_given_values(given.position, "image", "parameter"),
-            *_given_values(given.rotation, "image", "parameter"),
+            one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")
         ],
+        "further_observations": {
+            kind.kind: _given_values(kind, "name", "component")
+            for kind in given.kinds
+            if kind.kind in {further.single for further in adjustment.network.observations}
+        },
         "eccentricity": None
         if result.eccentricity is None
         else {

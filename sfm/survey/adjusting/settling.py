@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
@@ -17,6 +16,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
+from sfm.observations.kind import is_observed
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
@@ -149,7 +149,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
         return _tested(task, part, estimate, covariance=True, factor=factor, rejected=rejected)
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
-    weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
+    weighted = any(is_observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     others = len(part.scale_bars) or len(part.interior) or weighted
     if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points), task.factor)

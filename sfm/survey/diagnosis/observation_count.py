@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
+from sfm.observations.kind import is_observed
 
 MOTIONS = 7  # of a network whose position, attitude and scale the datum fixes
 
@@ -32,7 +32,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
     if datum == "control":
         outer = network.control.covariance, network.exterior.covariance
         variances = [np.einsum("nii->ni", covariance) for covariance in outer]
-        known = sum(int(((one == 0) | observed(one)).sum()) for one in variances)
+        known = sum(int(((one == 0) | is_observed(one)).sum()) for one in variances)
     else:
         known = MOTIONS
     given = len(network.scale_bars) + int((network.interior.sigma > 0).sum())

@@ -48,7 +48,7 @@ def choose_solver(layout: Unknowns) -> Solver:
         layout: order of the unknowns and the image points.
     """
     observations = layout.observations
-    m = len(observations.camera)
+    m = observations.poses
     if m <= SMALL:
         return DenseSolver(layout)
     rays = np.diff(observations.start).astype(float)
@@ -104,4 +104,4 @@ def _join(observations: Observations, points: IntArray, joined: AnyArray) -> Non
     for j in points:
         for s in range(observations.start[j], observations.start[j + 1]):
             for t in range(observations.start[j], observations.start[j + 1]):
-                joined[observations.image[s], observations.image[t]] = 1
+                joined[observations.pose[s], observations.pose[t]] = 1

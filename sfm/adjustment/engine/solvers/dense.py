@@ -200,6 +200,10 @@ def schur_complement(
         subtract_squares(pairs, layout.observations, b.Y, b.Y_interior, S)
         S *= parts.scale
         S *= parts.scale[:, None]
+    if parts.coupled is not None:
+        first = len(parts.coupled)
+        of_poses = np.tril(parts.coupled) * parts.scale[:first] * parts.scale[:first, None]
+        S[:first, :first] += of_poses.astype(dtype)
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T
 
@@ -346,13 +350,13 @@ def pick_columns(
     observations: Observations, products: FloatArray, start: int, YQ: FloatArray, YQ_border: FloatArray
 ) -> None:
     """Take the columns of the photographs that see each point, and those of the border."""
-    first = 6 * len(observations.camera)
+    first = 6 * observations.poses
     for h in range(len(products) // 3):
         j = start + h
         for p in range(3):
             for o in range(observations.start[j], observations.start[j + 1]):
                 for q in range(6):
-                    YQ[o, p, q] = products[3 * h + p, 6 * observations.image[o] + q]
+                    YQ[o, p, q] = products[3 * h + p, 6 * observations.pose[o] + q]
             for q in range(YQ_border.shape[2]):
                 YQ_border[j, p, q] = products[3 * h + p, first + q]
 
@@ -366,12 +370,12 @@ def _fill(
     first: int,
     rows: FloatArray,
 ) -> None:
-    start = 6 * len(observations.camera)
+    start = 6 * observations.poses
     for h in range(len(rows) // 3):
         j = first + h
         rows[3 * h : 3 * h + 3] = 0.0
         for o in range(observations.start[j], observations.start[j + 1]):
-            c = 6 * observations.image[o]
+            c = 6 * observations.pose[o]
             for p in range(3):
                 for q in range(6):
                     rows[3 * h + p, c + q] += Y[o, p, q] * scale[c + q]

@@ -144,7 +144,7 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
     place = np.empty(m, dtype=np.int64)
     place[photograph] = np.arange(m)
     earliest = np.full(n, m)
-    np.minimum.at(earliest, observations.point, place[observations.image])
+    np.minimum.at(earliest, observations.point, place[observations.pose])
     points = np.argsort(earliest, kind="stable")
     cuts = np.searchsorted(earliest[points], begins)
     later: list[list[IntArray]] = [[] for _ in order.groups]  # places that children bring
@@ -158,7 +158,7 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
         if order.parents[g] >= 0:
             later[order.parents[g]].append(rest)
             children[order.parents[g]].append(g)
-    local = np.empty(len(observations.image), dtype=np.int32)
+    local = np.empty(len(observations.pose), dtype=np.int32)
     where = np.empty(m, dtype=np.int32)
     fronts = []
     for g, (group, parent) in enumerate(zip(order.groups, order.parents, strict=True)):
@@ -192,7 +192,7 @@ def _operations(own: float, size: float) -> float:
 def _place(observations: Observations, points: IntArray, where: AnyArray, local: AnyArray) -> None:
     for j in points:
         for o in range(observations.start[j], observations.start[j + 1]):
-            local[o] = where[observations.image[o]]
+            local[o] = where[observations.pose[o]]
 
 
 class Dissection(NamedTuple):

@@ -77,7 +77,7 @@ class MultifrontalSolver:
     def bytes(self) -> float:
         """Memory of the factor and its inverse at the peak."""
         layout = self.layout
-        return self.fronts.bytes(layout.reduced - layout.exterior_free.size, search_bytes(layout))
+        return self.fronts.bytes(layout.reduced - layout.pose_free.size, search_bytes(layout))
 
     @cached_property
     def limit(self) -> float:
@@ -93,7 +93,7 @@ class MultifrontalSolver:
             GeometryError: the factor would not fit in memory.
         """
         memory.refuse_what_does_not_fit(
-            self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs", limit=self.limit
+            self.bytes, f"the unknowns of {len(self.layout.pose_free)} photographs", limit=self.limit
         )
         scale = equations.parts.scale
         Q = motions.orthonormal(scale)
@@ -140,7 +140,7 @@ class MultifrontalSolver:
         shift: float = 0.0,
     ) -> MultifrontalFactor | None:
         """Return the factor with some unknowns held; None if the matrix is not positive definite."""
-        first = self.layout.exterior_free.size
+        first = self.layout.pose_free.size
         added = np.full(self.layout.reduced, shift)
         added[holds] += 1.0
         eliminated = self._eliminate(equations, added[:first])

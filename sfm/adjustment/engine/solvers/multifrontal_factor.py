@@ -184,7 +184,7 @@ def _sum_pairs(
             for c in range(len(Q)):
                 u[p, c] = -Y_interior[j, p, c] if c < inner else 0.0
         for t in range(begin, end):
-            column = 6 * observations.image[t]
+            column = 6 * observations.pose[t]
             for p in range(3):
                 for q in range(6):
                     for c in range(len(Q)):
@@ -196,7 +196,7 @@ def _sum_pairs(
                     total += u[p, s] * Q[s, c]
                 uQ[p, c] = total
         for s in range(begin, end):
-            row = 6 * observations.image[s]
+            row = 6 * observations.pose[s]
             for p in range(3):
                 for q in range(6):
                     total = 0.0

@@ -36,7 +36,7 @@ class Pairs:
 
 def pairs_of(observations: Observations) -> Pairs:
     """Return where the rays of each object point lie among the tiles of photographs."""
-    tiles = -(-len(observations.camera) // TILE)
+    tiles = -(-observations.poses // TILE)
     cut = np.empty((len(observations.start) - 1, tiles + 1), dtype=np.int64)
     _cut(observations, cut)
     return Pairs(cut)
@@ -55,7 +55,7 @@ def subtract_squares(
         S: at least 6 m + i rows and columns.
     """
     flat = S.reshape(-1)
-    first, inner = 6 * len(observations.camera), Y_interior.shape[2]
+    first, inner = 6 * observations.poses, Y_interior.shape[2]
 
     def subtract(row: int, column: int) -> None:
         _subtract_tile(row, column, pairs.cut, observations, Y, flat, len(S))
@@ -79,7 +79,7 @@ def times_inverse(
         border: rows Y' of each object point by the interior unknowns, (n, 3, i).
         YQ: what is filled.
     """
-    _border_times(observations, border, Q[6 * len(observations.camera) :], YQ)
+    _border_times(observations, border, Q[6 * observations.poses :], YQ)
 
     def add(row: int, _: int) -> None:
         for column in range(pairs.tiles):
@@ -103,7 +103,7 @@ def _cut(observations: Observations, cut: IntArray) -> None:
     for j in range(len(cut)):
         o = observations.start[j]
         for tile in range(cut.shape[1]):
-            while o < observations.start[j + 1] and observations.image[o] < tile * TILE:
+            while o < observations.start[j + 1] and observations.pose[o] < tile * TILE:
                 o += 1
             cut[j, tile] = o
 
@@ -121,13 +121,13 @@ def _subtract_tile(
     """Take Y Y' off the blocks of the photographs of one tile by those of another that is not behind it."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
-            at = 6 * observations.image[s] * stride
+            at = 6 * observations.pose[s] * stride
             for t in range(cut[j, column], min(cut[j, column + 1], s + 1)):
-                subtract_pair(flat, at + 6 * observations.image[t], stride, Y, s, t)
+                subtract_pair(flat, at + 6 * observations.pose[t], stride, Y, s, t)
                 if (
-                    observations.image[s] == observations.image[t] and s != t
+                    observations.pose[s] == observations.pose[t] and s != t
                 ):  # a point measured twice in a photograph
-                    subtract_pair(flat, at + 6 * observations.image[t], stride, Y, t, s)
+                    subtract_pair(flat, at + 6 * observations.pose[t], stride, Y, t, s)
 
 
 @kernel
@@ -135,7 +135,7 @@ def subtract_border(observations: Observations, Y: FloatArray, Y_interior: Float
     """Take Y_interior Y' off the rows S of the interior unknowns."""
     for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
+            column = 6 * observations.pose[o]
             for c in range(len(S)):
                 z0, z1, z2 = Y_interior[j, 0, c], Y_interior[j, 1, c], Y_interior[j, 2, c]
                 for q in range(6):
@@ -157,7 +157,7 @@ def _add_tile(
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
             for t in range(cut[j, column], cut[j, column + 1]):
-                at = 6 * observations.image[t] * stride + 6 * observations.image[s]
+                at = 6 * observations.pose[t] * stride + 6 * observations.pose[s]
                 add_product(YQ, s, Y, t, flat, at, stride)
 
 
@@ -166,7 +166,7 @@ def _border_times(observations: Observations, Y_interior: FloatArray, Q: FloatAr
     """Fill YQ with what the rows Y_interior of the interior unknowns bring; Q their rows, (i, reduced)."""
     for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
+            column = 6 * observations.pose[o]
             for p in range(3):
                 for q in range(6):
                     total = 0.0

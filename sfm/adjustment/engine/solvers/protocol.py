@@ -19,11 +19,11 @@ from sfm.conventions import FloatArray
 class Inverse:
     """Elements of S^-1, in the units of the unknowns, 0 where they are fixed."""
 
-    exterior: FloatArray  # of X0, w of each photograph, (m, 6, 6)
-    mixed: FloatArray  # of exterior by border unknowns, (6 m, i + 3 s)
-    border: FloatArray  # of interior unknowns and kept points, (i + 3 s, i + 3 s)
+    exterior: FloatArray  # of X0, w of each pose, (poses, 6, 6)
+    mixed: FloatArray  # of poses by border unknowns, (6 poses, i + 3 s)
+    border: FloatArray  # of interior unknowns, mounts and kept points, (i + 3 s, i + 3 s)
     core: FloatArray  # Y'S^-1 Y of each object point, (n, 3, 3)
-    YQ: FloatArray  # Y'S^-1 of the object point by the photograph of each image point, (k, 3, 6)
+    YQ: FloatArray  # Y'S^-1 of the object point by the pose of each image point, (k, 3, 6)
     YQ_border: FloatArray  # Y'S^-1 of each object point by the border, (n, 3, i + 3 s)
 
 

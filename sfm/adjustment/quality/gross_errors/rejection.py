@@ -16,6 +16,7 @@ import numpy as np
 from sfm.adjustment.engine.cofactors import cofactors, hat_complement
 from sfm.adjustment.engine.collinearity import Observations, State, behind_camera, residuals
 from sfm.adjustment.engine.iterate import Optimum, Problem, iterate, optimum_at
+from sfm.adjustment.engine.observed import count_of
 from sfm.adjustment.engine.unknowns import start_weights
 from sfm.adjustment.quality.gross_errors.robust import (
     huber_weights,
@@ -121,7 +122,7 @@ class Run:
         """Observations and constraints minus unknowns."""
         held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
-        observations = 2 * int((weight > 0).sum()) + self.problem.weighted.count
+        observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
         return observations - self.problem.layout.count + held
 
     def _iterate(self, state: State, weight: FloatArray, method: str, near: bool = False) -> Optimum:
@@ -246,7 +247,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         v = residuals(layout.observations, optimum.state)
         Q = cofactors(optimum, layout)
         complement = hat_complement(optimum, layout, Q, weight)
-        if run.problem.weighted.count:
+        if run.problem.observed:
             vPv, own = sum_of_squares(layout.observations, v, complement, weight > 0)
             redundancy = min(max(own, 1.0), redundancy)
         out, back = snoop(
@@ -294,7 +295,9 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     o, count = problem.layout.observations, len(state.points)
     suspect = np.bincount(o.point[changed], minlength=count) > 0
     suspect &= problem.layout.point_free.all(axis=1)
-    suspect[problem.weighted.point] = False
+    for one in problem.observed:
+        if one.point is not None:
+            suspect[one.point] = False
     rows = np.flatnonzero(used & suspect[o.point])
     ray = state.points[o.point[rows]] - state.position[o.image[rows]]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -336,7 +339,7 @@ def _reweight(
     ready = layout.active & ~behind_camera(layout.observations, optimum.state)
     if out is not None:
         ready &= ~out
-    count = 2 * int(ready.sum()) + run.problem.weighted.count
+    count = 2 * int(ready.sum()) + count_of(run.problem.observed)
     freedom, vague = run.redundancy(optimum, ready.astype(float)) / max(count, 1), 0
     for _ in range(REWEIGHTINGS):
         v = residuals(layout.observations, optimum.state)

@@ -1,0 +1,234 @@
+"""Observations beside image points in an adjustment: what each kind adds to its normal equations.
+
+Unified least squares: with the derivatives J of an observation by the unknowns of its blocks, its weight P
+and its difference l, computed minus observed, J'P J is added to N and J'P l to g. Observations of object
+points alone are added before these are eliminated; all others to the reduced normal equations. The kinds are
+those of `sfm.observations`; nothing here knows one of them.
+
+Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least
+squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm.adjustment.engine.collinearity import State
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.network import Network
+from sfm.observations.control import ObjectPoints
+from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse_of_observed
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Observations of one kind that take part in an adjustment."""
+
+    index: int  # of their kind among `Network.kinds`
+    kind: Kind  # those that take part, n of them
+    rows: IntArray  # which of the observations of the kind these are, (n,)
+    weight: (
+        FloatArray  # inverse covariance, 0 where not observed, (n, d, d); or of all together, (1, n d, n d)
+    )
+
+    @property
+    def components(self) -> BoolArray:
+        """Which components were observed, (n, d)."""
+        return np.reshape(np.diagonal(self.weight, axis1=1, axis2=2) > 0, (len(self.kind), -1))
+
+    @property
+    def count(self) -> int:
+        """How many scalar observations these are."""
+        return int(self.components.sum())
+
+    @property
+    def point(self) -> IntArray | None:
+        """Object point of each observation where it is all that they depend on; else None, (n,)."""
+        blocks = self.kind.blocks()
+        return blocks[0].at if len(blocks) == 1 and blocks[0].of == POINT else None
+
+    def vPv(self, state: State) -> float:
+        """Return v'Pv at some values of the unknowns."""
+        l = self.kind.linearise(state).difference.reshape(self.weight.shape[:2])
+        return float(np.einsum("na,nab,nb->", l, self.weight, l))
+
+
+class Reduced(NamedTuple):
+    """Derivatives of observations by the reduced unknowns."""
+
+    columns: IntArray  # of the reduced unknowns, (n, u)
+    J: FloatArray  # 0 where they are fixed, (n, d, u)
+    l: FloatArray  # computed minus observed, (n, d)
+
+
+def observed_of(network: Network, layout: Unknowns, *, use_control: bool) -> tuple[Observed, ...]:
+    """Return the observations of a network beside its image points that take part in its adjustment."""
+    found = []
+    for index, kind in enumerate(network.kinds):
+        if not len(kind) or (isinstance(kind, ObjectPoints) and not use_control):
+            continue
+        rows = np.flatnonzero(_takes_part(kind, layout))
+        if not len(rows):
+            continue
+        some = kind.select(rows)
+        together = some.weight_of_all()
+        weight = inverse_of_observed(some.covariances()) if together is None else together[None]
+        if weight.any():
+            found.append(Observed(index, some, rows, weight))
+    return tuple(found)
+
+
+def _takes_part(kind: Kind, layout: Unknowns) -> BoolArray:
+    """Return which observations have all their unknowns in an adjustment, and any that is free, (n,)."""
+    variance = np.diagonal(kind.covariances(), axis1=1, axis2=2)
+    on = ((variance > 0) & np.isfinite(variance)).any(axis=1)
+    free = np.zeros(len(kind), dtype=bool)
+    blocks = kind.blocks()
+    for of, index in blocks:
+        if of == POINT:
+            on &= layout.point_on[index]
+            free |= layout.point_free[index].any(axis=1)
+        elif of == PHOTOGRAPH:
+            on &= layout.image_on[index]
+            free |= layout.rigged | layout.pose_free[layout.observations.pose_of[index]].any(axis=1)
+        elif of == MOUNT:
+            free |= (layout.mount_column[index] >= 0).any(axis=1)
+        else:
+            free |= _parameter_columns(layout, index) >= 0
+    # a distance between two fixed points checks nothing, but it counts: its contradiction shows in sigma0
+    return on & (free | (len(blocks) > 1))
+
+
+def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
+    """Return the column of interior parameters (camera, parameter), -1 where they are not free, (n,)."""
+    columns = np.full(len(index), -1)
+    for row, (a, s) in enumerate(index):
+        where = np.flatnonzero(layout.interior_free[a] == s)
+        if len(where):
+            columns[row] = layout.interior_column[a][where[0]]
+    return columns
+
+
+def count_of(observed: tuple[Observed, ...]) -> int:
+    """Return how many scalar observations there are beside image points."""
+    return sum(one.count for one in observed)
+
+
+def vPv_of(observed: tuple[Observed, ...], state: State) -> float:
+    """Return v'Pv of the observations beside image points."""
+    return sum(one.vPv(state) for one in observed)
+
+
+def reduced_rows(one: Observed, layout: Unknowns, state: State) -> Reduced:
+    """Return the derivatives of observations of a kind by the reduced unknowns, kept points included."""
+    linear = one.kind.linearise(state)
+    columns, parts = [], []
+    for block, J in zip(one.kind.blocks(), linear.J, strict=True):
+        at, by = _of_block(block, layout, state)
+        columns.append(at)
+        parts.append(J @ by)
+    found = Reduced(np.hstack(columns), np.concatenate(parts, axis=2), linear.difference)
+    return found if len(one.weight) == len(one.kind) else _together(found)
+
+
+def _together(found: Reduced) -> Reduced:
+    """Return observations that are correlated with one another as a single one."""
+    n, d, u = found.J.shape
+    J = np.zeros((n, d, n, u))
+    J[np.arange(n), :, np.arange(n)] = found.J
+    return Reduced(found.columns.reshape(1, n * u), J.reshape(1, n * d, n * u), found.l.reshape(1, n * d))
+
+
+def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, FloatArray]:
+    """Return the reduced unknowns of a block, (n, u), and its derivatives by them, (n, 1, 3 or 6, u)."""
+    if block.of == PHOTOGRAPH:
+        return layout.photograph_terms(state, block.at)
+    if block.of == POINT:
+        slot = np.searchsorted(layout.kept, block.at)
+        columns = layout.kept_start + 3 * slot[:, None] + np.arange(3)
+        return columns, np.eye(3) * layout.point_free[block.at][:, None]
+    if block.of == MOUNT:
+        columns = layout.mount_column[block.at]
+        return np.maximum(columns, 0), np.eye(6) * (columns >= 0)[:, None]
+    columns = _parameter_columns(layout, block.at)[:, None]
+    return np.maximum(columns, 0), (columns >= 0).astype(float)[:, :, None]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What observations that do not depend on an object point alone add to the reduced normal equations."""
+
+    rows: tuple[tuple[Reduced, FloatArray], ...]  # derivatives and J'P of each kind, (n, u, d)
+    vPv: float  # of all kinds
+
+    def add_to(
+        self, U: FloatArray, border: FloatArray, corner: FloatArray, g: FloatArray
+    ) -> FloatArray | None:
+        """Add J'P J and J'P l to the blocks of the reduced normal equations.
+
+        Args:
+            U: of poses by themselves, (poses, 6, 6).
+            border: of poses by the other reduced unknowns, (6 poses, b).
+            corner: of these by themselves, (b, b).
+            g: right side, (6 poses + b,).
+
+        Returns:
+            What couples poses with one another, (6 poses, 6 poses); None without.
+        """
+        first, coupled = 6 * len(U), None
+        for (columns, J, l), JP in self.rows:
+            N = JP @ J
+            np.add.at(g, columns, np.einsum("nud,nd->nu", JP, l))
+            r = np.broadcast_to(columns[:, :, None], N.shape)
+            c = np.broadcast_to(columns[:, None, :], N.shape)
+            there = N != 0
+            r, c, value = r[there], c[there], N[there]
+            inner, outer = (r >= first) & (c >= first), (r < first) & (c >= first)
+            np.add.at(corner, (r[inner] - first, c[inner] - first), value[inner])
+            np.add.at(border, (r[outer], c[outer] - first), value[outer])
+            of_poses = (r < first) & (c < first)
+            r, c, value = r[of_poses], c[of_poses], value[of_poses]
+            same = r // 6 == c // 6
+            np.add.at(U, (r[same] // 6, r[same] % 6, c[same] % 6), value[same])
+            if not same.all():
+                coupled = np.zeros((first, first)) if coupled is None else coupled
+                np.add.at(coupled, (r[~same], c[~same]), value[~same])
+        return coupled
+
+
+def terms_of(
+    observed: tuple[Observed, ...], layout: Unknowns, state: State, V: FloatArray, gp: FloatArray
+) -> Terms:
+    """Return what the observations add to the reduced normal equations; those of points alone to V and gp.
+
+    Args:
+        observed: kinds of observations.
+        layout: order of the unknowns.
+        state: values of all unknowns.
+        V: normal equations of each object point, added to, (n, 3, 3).
+        gp: right side of each object point, added to, (n, 3).
+    """
+    rows, vPv = [], 0.0
+    for one in observed:
+        point = one.point
+        if point is not None:
+            linear = one.kind.linearise(state)
+            l, J = linear.difference, linear.J[0]
+            JP = np.swapaxes(J, 1, 2) @ one.weight
+            np.add.at(V, point, JP @ J)
+            np.add.at(gp, point, np.einsum("nud,nd->nu", JP, l))
+        else:
+            found = reduced_rows(one, layout, state)
+            l = found.l
+            rows.append((found, np.swapaxes(found.J, 1, 2) @ one.weight))
+        vPv += float(np.einsum("na,nab,nb->", l, one.weight, l))
+    return Terms(tuple(rows), vPv)
+
+
+def couples_poses(observed: tuple[Observed, ...]) -> bool:
+    """Return whether observations depend on two photographs each, which only a full matrix has room for."""
+    return any(sum(block.of == PHOTOGRAPH for block in one.kind.blocks()) > 1 for one in observed)

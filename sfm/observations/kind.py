@@ -1,0 +1,129 @@
+"""A kind of observation beside image points: what was observed, how precisely, and what unknowns explain it.
+
+A kind is one class in one file of this package. The adjustment takes from it what its normal equations,
+redundancy numbers, tests and variance components need; the report takes its names and units.
+
+Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least squares).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, Self
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from sfm.network import Estimate, Network
+
+POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # sorts of unknowns
+
+
+class Values(Protocol):
+    """Values of all unknowns."""
+
+    @property
+    def points(self) -> FloatArray:
+        """Object points X, object unit, (n, 3)."""
+
+    @property
+    def position(self) -> FloatArray:
+        """Projection centres X0, object unit, (m, 3)."""
+
+    @property
+    def M(self) -> FloatArray:  # noqa: N802
+        """Object to image axes of each photograph, (m, 3, 3)."""
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Interior orientation of each camera, (a, parameters)."""
+
+    @property
+    def mount_position(self) -> FloatArray:
+        """Projection centre of each camera in the axes of its rig, object unit, (a, 3)."""
+
+    @property
+    def camera_from_rig(self) -> FloatArray:
+        """Axes of the rig to those of each camera, (a, 3, 3)."""
+
+
+class Block(NamedTuple):
+    """Unknowns of one sort, one for each observation."""
+
+    of: str  # POINT: X, 3 unknowns | PHOTOGRAPH: X0, w, 6 | MOUNT: of a camera, 6 | PARAMETER: of a camera, 1
+    at: IntArray  # index of the point, photograph or camera, (n,); of camera and parameter, (n, 2)
+
+
+class Linear(NamedTuple):
+    """Observations at some values of the unknowns."""
+
+    difference: FloatArray  # computed minus observed, (n, d)
+    J: tuple[FloatArray, ...]  # derivatives by the unknowns of each block, (n, d, 1, 3 or 6)
+
+
+class Kind(ABC):
+    """Observations of one kind: n of them, of d components each."""
+
+    name: ClassVar[str]  # "scale bars"
+    single: ClassVar[str]  # "scale bar"
+    components: ClassVar[tuple[str, ...]]  # names of the d components
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def covariances(self) -> FloatArray:
+        """Return that of the components of each; 0 = fixed, infinite = not observed, (n, d, d)."""
+
+    @property
+    @abstractmethod
+    def values(self) -> FloatArray:
+        """What was observed, in the units of `units`, (n, d)."""
+
+    @abstractmethod
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the unknowns that the observations depend on."""
+
+    @abstractmethod
+    def linearise(self, values: Values) -> Linear:
+        """Return computed minus observed and the derivatives at some values of the unknowns."""
+
+    @abstractmethod
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return what each observation is called in tables, (n,)."""
+
+    @abstractmethod
+    def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
+        """Return the units of the components of each observation, (n, d)."""
+
+    @abstractmethod
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the observations."""
+
+    def weight_of_all(self) -> FloatArray | None:
+        """Return the weight matrix of all components, (n d, n d); None where it is block diagonal."""
+        return None
+
+    def renumbered(self, place: IntArray) -> Self:
+        """Return the observations of a network with its points at other places; place of each, (n,)."""
+        return self
+
+    def shifted(self, by: FloatArray) -> Self:
+        """Return the observations for coordinates with a shift added, object unit, (3,)."""
+        return self
+
+
+def is_observed(variance: FloatArray) -> BoolArray:
+    """Return which variances belong to observed components: neither 0 (fixed) nor infinite (unknown)."""
+    return np.asarray((variance > 0) & np.isfinite(variance))
+
+
+def inverse_of_observed(covariance: FloatArray) -> FloatArray:
+    """Return inverse covariances over the observed components only, 0 elsewhere, (n, d, d)."""
+    weight = np.zeros(covariance.shape)
+    for p, Q in enumerate(covariance):
+        on = is_observed(np.diagonal(Q))
+        weight[p][np.ix_(on, on)] = np.linalg.inv(Q[np.ix_(on, on)])
+    return weight
