@@ -38,6 +38,7 @@ def reduce_network(
         network,
         images=tuple(name for name, keep in zip(network.images, images, strict=True) if keep),
         camera=network.camera[images],
+        moment=None if network.moment is None else network.moment[images],
         points=tuple(name for name, keep in zip(network.points, points, strict=True) if keep),
         image_points=replace(seen, image=image_index[seen.image], point=point_index[seen.point]),
         control=ObjectPoints(point_index[control.point[c]], control.xyz[c], control.covariance[c]),

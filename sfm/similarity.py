@@ -38,9 +38,11 @@ class Similarity:
         return self.scale * (np.asarray(points) @ self.rotation.T) + self.translation
 
     def apply_estimate(self, estimate: Estimate) -> Estimate:
-        """Return the estimate with points, positions and rotations in the target frame."""
+        """Return the estimate with points, positions, rotations and mounts in the target frame."""
+        mounts = estimate.mounts
         return replace(
             estimate,
+            mounts=None if mounts is None else replace(mounts, position=self.scale * mounts.position),
             position=self.apply(estimate.position),
             rotation=self.rotation @ estimate.rotation,
             points=self.apply(estimate.points),

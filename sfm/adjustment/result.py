@@ -31,6 +31,8 @@ class Covariance:
     interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order; the variance of one
     # that is not determined is infinite, (f, f)
     points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
+    mounts: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))  # of X, Y, Z (object unit) and
+    # omega, phi, kappa (rad) of each camera in its rig; 0 of reference cameras; none without rigs, (a, 6, 6)
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,11 @@ class Adjustment:
         """Covariance of independent errors for sigma0 = 1, which the weights of the adjustment mean."""
         c, unit = self.covariance if self.independent is None else self.independent, self.sigma0**2
         return Covariance(
-            c.points / unit, c.exterior / unit, tuple(Q / unit for Q in c.interior), c.points_limiting / unit
+            c.points / unit,
+            c.exterior / unit,
+            tuple(Q / unit for Q in c.interior),
+            c.points_limiting / unit,
+            c.mounts / unit,
         )
 
     @property

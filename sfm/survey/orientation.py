@@ -34,6 +34,7 @@ from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.rigs import mount_cameras
 
 ORIENTATION_POINTS = (
     400  # of natural texture that take part in the orientation, those with the most rays, and
@@ -94,6 +95,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         )
     elif not wrong_c:
         found = tell_second_objects(found, find_second_objects(network, found, _orient))
+    found = replace(found, estimate=mount_cameras(survey, network, found.estimate))
     return tell_lost_photographs(network, found, named=survey.tie_points is None)
 
 

@@ -102,7 +102,17 @@ def marginal_covariance(
     for own in layout.interior_column:
         Q = cofactors.border[np.ix_(own - first, own - first)]
         interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
-    return Covariance(variance * points, variance * exterior, tuple(interior), variance * cofactors.limiting)
+    columns, J = layout.mount_terms(optimum.state)
+    at = np.maximum(columns - first, 0)
+    of_mounts = cofactors.border[at[:, :, None], at[:, None]] if len(at) else np.zeros((0, 6, 6))
+    mounts = J @ _in_datum(of_mounts, H[columns], np.moveaxis(F[:, columns], 1, 0), G) @ np.swapaxes(J, 1, 2)
+    return Covariance(
+        variance * points,
+        variance * exterior,
+        tuple(interior),
+        variance * cofactors.limiting,
+        variance * mounts,
+    )
 
 
 def hat_complement(

@@ -147,10 +147,13 @@ class CorrelatedPart:
         columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
         T = exterior_jacobian(optimum.state.M) @ J
         exterior = D[columns[:, :, None], columns[:, None]]
+        columns, J = layout.mount_terms(optimum.state)
+        mounts = J @ D[columns[:, :, None], columns[:, None]] @ np.swapaxes(J, 1, 2)
         return replace(
             covariance,
             points=covariance.points + variance * self.points,
             exterior=covariance.exterior + T @ exterior @ np.swapaxes(T, 1, 2),
+            mounts=covariance.mounts + mounts,
             interior=tuple(
                 Q + D[np.ix_(own, own)]
                 for Q, own in zip(covariance.interior, layout.interior_column, strict=True)

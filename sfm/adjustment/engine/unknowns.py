@@ -25,6 +25,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import turn
 from sfm.network import Estimate, Mounts, Network
+from sfm.observations.exterior import exterior_jacobian
 from sfm.observations.kind import POINT
 
 MIN_RAYS = 2  # per object point that is not known otherwise
@@ -110,6 +111,22 @@ class Unknowns:
             columns = np.concatenate([columns, np.maximum(own, 0)], axis=1)
         J[:, :, :6] *= self.pose_free[pose][:, None]
         return columns, J
+
+    def mount_terms(self, state: State) -> tuple[IntArray, FloatArray]:
+        """Return the unknowns of the mounts of rigs, and d (X, Y, Z, omega, phi, kappa) by them.
+
+        Args:
+            state: values of all unknowns.
+
+        Returns:
+            Columns among the reduced unknowns, (a, 6), and derivatives, 0 where they are fixed, (a, 6, 6);
+            both empty without rigs.
+        """
+        if not self.rigged:
+            return np.zeros((0, 6), dtype=np.int64), np.zeros((0, 6, 6))
+        free = self.mount_column >= 0
+        J = exterior_jacobian(state.camera_from_rig) * free[:, None]
+        return np.where(free, self.mount_column, self.pose_free.size), J
 
 
 def unknowns_of(

@@ -124,7 +124,7 @@ def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) ->
         start: approximate values, which what has left the adjustment starts from again.
         oriented: photographs that had an exterior orientation, (m,).
     """
-    if task.reject == "none":
+    if task.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
         return None
     adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
     found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented, suspected=task.suspected)
@@ -272,7 +272,7 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
     xyz = np.full_like(estimate.points, np.nan)
     position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
-    return Estimate(part.cameras, position, rotation, xyz)
+    return Estimate(part.cameras, position, rotation, xyz, part.mounts)
 
 
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:

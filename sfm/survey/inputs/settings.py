@@ -35,6 +35,7 @@ MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
+MAX_RIGS, MAX_PATTERN = 100, 200  # rigs, and characters of the expression that finds a moment
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
 MAX_GLOBS = 1000  # of the photographs of all cameras
@@ -192,6 +193,16 @@ class DatumSettings(Section):
         "free"  # inner constraints, seven held coordinates, or control
     )
     points: Names = ()  # object points that carry a free or minimal datum; all if none are named
+
+
+class RigSettings(Section):
+    """[[rig]]: cameras mounted on one frame, whose photographs of one moment move together."""
+
+    name: Name  # what people call the rig; unique in the survey
+    cameras: Names  # names of its cameras; the first is the reference
+    # "order": the photographs of each camera in the order of their names; else a regular expression with one
+    # group, which is the moment, searched for in the names of photographs
+    moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
 
 
 class ControlSettings(Section):

@@ -49,6 +49,7 @@ from sfm.survey.inputs.settings import (
     ExteriorSettings,
     Head,
     PlateSettings,
+    RigSettings,
     Section,
     TargetSettings,
     TiePointSettings,
@@ -105,6 +106,7 @@ class Survey:
     control: KnownPoints | None = None
     exterior: ObservedExterior | None = None
     exif_sigma_m: tuple[float, float] | None = None  # in its place positions in EXIF data, see [exterior]
+    rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
     scale_bars: tuple[ScaleBar, ...] = ()
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
@@ -139,6 +141,7 @@ class Survey:
             "folder": Path(self.folder),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
             "targets": _section(TargetSettings, self.targets, f"{where}: targets"),
+            "rigs": tuple(_section(RigSettings, one, f"{where}: rig") for one in self.rigs),
             "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
             "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
@@ -199,6 +202,8 @@ class Survey:
             what.append(f"targets of codes {self.targets.codes}")
         if self.control is not None:
             what.append(counted(len(self.control.names), "control point"))
+        if self.rigs:
+            what.append(counted(len(self.rigs), "rig"))
         if self.scale_bars:
             what.append(counted(len(self.scale_bars), "scale bar"))
         return f"<Survey {self.name}: {', '.join(what)}, datum {self.datum.kind}>"
@@ -248,6 +253,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         control=read(read_control, file.control.file if file.control else None),
         exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
         exif_sigma_m=file.exif_sigma_m,
+        rigs=file.rigs,
         scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
         observations=read(read_image_points, file.observations.file if file.observations else None),
         diameters=read(read_diameters, file.targets.diameters),

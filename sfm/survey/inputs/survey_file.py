@@ -15,6 +15,7 @@ from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
+    MAX_RIGS,
     AdjustSettings,
     ApproximateSettings,
     CameraSettings,
@@ -25,6 +26,7 @@ from sfm.survey.inputs.settings import (
     Head,
     ObservationSettings,
     PlateSettings,
+    RigSettings,
     ScaleBarSettings,
     Section,
     TargetSettings,
@@ -46,6 +48,7 @@ class SurveyFile(Section):
     datum: DatumSettings = DatumSettings()
     control: ControlSettings | None = None
     exterior: ExteriorSettings | None = None
+    rigs: Annotated[tuple[RigSettings, ...], Field(strict=False, max_length=MAX_RIGS, alias="rig")] = ()
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
     observations: ObservationSettings | None = None
     approximate: ApproximateSettings = ApproximateSettings()

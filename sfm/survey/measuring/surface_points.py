@@ -119,6 +119,7 @@ def cover_photographs(
         replace(found.image_points, covariance=covariance).select(order),
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
+        moment=network.moment,
     )
     placed = replace(estimate, points=found.points)
     covering = _with_common_part(

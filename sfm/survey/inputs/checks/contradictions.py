@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from sfm.display import counted, listed
 from sfm.distortion.balanced import BALANCED, from_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.models import MODELS
@@ -25,6 +27,7 @@ from sfm.survey.inputs.settings import (
     CompareSettings,
     DatumSettings,
     ExteriorSettings,
+    RigSettings,
     ScaleBarSettings,
     TargetSettings,
     TiePointSettings,
@@ -34,6 +37,7 @@ from sfm.targets.codes.families import FAMILIES, is_table
 from sfm.targets.codes.plates import PLATES, TAGGED
 from sfm.targets.codes.tags import DICTIONARIES
 
+MAX_REPEATS = 3  # in the expression that finds a moment; a name of 255 characters is searched in 255^3 steps
 CALIBRATION_KEYS = {"calibration", "calibration_use"}
 
 
@@ -63,6 +67,10 @@ class SurveySettings(Protocol):
     @property
     def cameras(self) -> Sequence[CameraSettings]:
         """Its cameras."""
+
+    @property
+    def rigs(self) -> Sequence[RigSettings]:
+        """Cameras that are mounted on one frame."""
 
     @property
     def targets(self) -> TargetSettings:
@@ -137,6 +145,7 @@ def refuse_contradictions(survey: SurveySettings) -> None:
             raise SurveyFileError(
                 f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
             )
+    _refuse_contradictions_of_rigs(survey.rigs, survey.cameras, where)
     globs = sum(len(camera.images or ()) for camera in survey.cameras)
     if globs > MAX_GLOBS:
         raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are looked for")
@@ -311,3 +320,52 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     for key, values in (("fixed", fixed), ("weighted", weighted), ("start", start)):
         if camera.c_mm is not None and "c" in values:
             raise SurveyFileError(f"{at}: c_mm and {key}.c are both given, one is needed")
+
+
+def _refuse_contradictions_of_rigs(
+    rigs: Sequence[RigSettings], cameras: Sequence[CameraSettings], where: str
+) -> None:
+    """Raise SurveyFileError for rigs of unknown or shared cameras, or moments that nothing finds."""
+    known = {camera.name: camera for camera in cameras}
+    owner: dict[str, str] = {}
+    for rig in rigs:
+        here = f"{where}: rig {rig.name}"
+        if len(rig.cameras) < 2:
+            raise SurveyFileError(f"{here}: {counted(len(rig.cameras), 'camera')}, at least 2 are needed")
+        for name in rig.cameras:
+            if name not in known:
+                some = listed(sorted(known), most=10)
+                raise SurveyFileError(f"{here}: no camera is named '{name}'; cameras are {some}")
+            if name in owner:
+                raise SurveyFileError(
+                    f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
+                )
+            owner[name] = rig.name
+            if known[name].per_photograph or known[name].groups:
+                raise SurveyFileError(
+                    f"{here}: camera {name} has parameters of single photographs or groups; needed one "
+                    "interior orientation for each camera of a rig"
+                )
+        if rig.moment != "order":
+            _refuse_pattern(rig.moment, here)
+    if len({rig.name for rig in rigs}) < len(rigs):
+        raise SurveyFileError(f"{where}: two rigs have one name")
+
+
+def _refuse_pattern(pattern: str, where: str) -> None:
+    """Raise SurveyFileError for an expression without one group, or that could take forever on a name."""
+    try:
+        groups = re.compile(pattern).groups
+    except (re.error, OverflowError, RecursionError) as error:
+        raise SurveyFileError(f"{where}: moment = '{pattern}' is no regular expression: {error}") from None
+    if groups != 1:
+        raise SurveyFileError(
+            f"{where}: moment = '{pattern}' has {counted(groups, 'group')}, needed 1, such as "
+            "'left_([0-9]+)', or moment = 'order'"
+        )
+    bare = re.sub(r"\\.|\[[^\]]*\]", "x", pattern)  # without escaped characters and sets of them
+    if len(re.findall(r"[*+{]", bare)) > MAX_REPEATS or re.search(r"\)[*+{]", bare):
+        raise SurveyFileError(
+            f"{where}: moment = '{pattern}' repeats more than {MAX_REPEATS} parts, or a group, which could "
+            "take forever; needed a plain expression such as 'left_([0-9]+)'"
+        )

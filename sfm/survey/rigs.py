@@ -1,0 +1,188 @@
+"""Rigs of a survey: which photographs are of one moment, and where their cameras are mounted.
+
+The photographs are oriented one by one. Two of one moment then give the position of one camera in the axes of
+another, and all moments together its mount: the median of positions, and the rotation about which those of
+the moments scatter least. A photograph that could not be oriented alone is placed by its rig.
+
+Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.4.2 and 8.4; Hartley et al.
+(2013), Rotation averaging, Int. J. Comput. Vis. 103 (medians of rotations).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.conventions import FloatArray, IntArray
+from sfm.display import listed
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.network import Estimate, Mounts, Network
+from sfm.similarity import nearest_rotation
+from sfm.survey.inputs.settings import CameraSettings, RigSettings
+from sfm.survey.inputs.survey import Survey
+
+ROUNDS = 10  # of the mean of rotations; it moves by less than their scatter after two
+
+
+def with_moments(survey: Survey, network: Network) -> Network:
+    """Return the network with the moment of each photograph; as it is where the survey has no rigs.
+
+    Args:
+        survey: says which cameras make a rig and what tells the moment of a photograph.
+        network: with one camera for each of the survey's, in their order.
+
+    Raises:
+        SurveyFileError: no moment is told of a photograph of a rig, two photographs of one camera are of one
+            moment, or no moment has photographs of two cameras.
+    """
+    if not survey.rigs:
+        return network
+    key: list[object] = [(name,) for name in network.images]
+    number = {camera.name: a for a, camera in enumerate(survey.cameras)}
+    for rig in survey.rigs:
+        where = f"{survey.source}: rig {rig.name}"
+        of_rig = [number[name] for name in rig.cameras]
+        moment = _moments(rig, network.images, network.camera, of_rig, where)
+        first: dict[tuple[object, int], str] = {}
+        cameras = defaultdict(set)
+        for i, when in moment.items():
+            a = int(network.camera[i])
+            before = first.setdefault((when, a), network.images[i])
+            if before != network.images[i]:
+                raise SurveyFileError(
+                    f"{where}: photographs {before} and {network.images[i]} of camera "
+                    f"{survey.cameras[a].name} are of one moment, '{when}'; needed one of each camera"
+                )
+            cameras[when].add(a)
+            key[i] = (rig.name, when)
+        if moment and max(len(some) for some in cameras.values()) < 2:
+            some = listed([str(when) for when in cameras], most=3)
+            raise SurveyFileError(
+                f"{where}: no moment has photographs of two cameras; moments are {some}; correct moment"
+            )
+    order = {one: k for k, one in enumerate(dict.fromkeys(key))}
+    return replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
+
+
+def _moments(
+    rig: RigSettings, images: Sequence[str], camera: IntArray, of_rig: list[int], where: str
+) -> dict[int, object]:
+    """Return the moment of each photograph of a rig, by its index."""
+    own = [i for i in range(len(images)) if camera[i] in of_rig]
+    if rig.moment == "order":
+        counts = {a: int((camera == a).sum()) for a in of_rig}
+        if len(set(counts.values())) > 1:
+            said = ", ".join(f"{n} of {name}" for n, name in zip(counts.values(), rig.cameras, strict=True))
+            raise SurveyFileError(
+                f"{where}: moment = 'order' needs as many photographs of each camera, found {said}"
+            )
+        inside = [np.flatnonzero(camera == a).tolist() for a in of_rig]
+        return {i: k for some in inside for k, i in enumerate(sorted(some, key=lambda i: images[i]))}
+    pattern, found = re.compile(rig.moment), {}
+    for i in own:
+        match = pattern.search(images[i])
+        if match is None or match.group(1) is None:
+            raise SurveyFileError(f"{where}: moment = '{rig.moment}' does not match photograph '{images[i]}'")
+        found[i] = match.group(1)
+    return found
+
+
+def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estimate:
+    """Return the estimate with the mounts of the cameras of rigs, and all photographs of oriented moments.
+
+    Args:
+        survey: names the rigs.
+        network: with moments, see `with_moments`.
+        estimate: with photographs oriented one by one.
+
+    Raises:
+        GeometryError: a camera of a rig is oriented at no moment together with the others.
+    """
+    if network.moment is None:
+        return estimate
+    mounts = mounts_of(survey.rigs, survey.cameras, network, estimate)
+    return place_by_rigs(network, replace(estimate, mounts=mounts))
+
+
+def mounts_of(
+    rigs: Sequence[RigSettings], cameras: Sequence[CameraSettings], network: Network, estimate: Estimate
+) -> Mounts:
+    """Return the mounts that photographs oriented one by one give, those beside the reference cameras free.
+
+    Raises:
+        GeometryError: a camera of a rig is oriented at no moment together with the others.
+    """
+    a = len(cameras)
+    position, rotation = np.zeros((a, 3)), np.tile(np.eye(3), (a, 1, 1))
+    free, names = np.zeros((a, 6), dtype=bool), [""] * a
+    at: dict[tuple[int, int], int] = {}
+    if network.moment is not None:
+        for i in np.flatnonzero(estimate.oriented):
+            at[int(network.moment[i]), int(network.camera[i])] = int(i)
+    number = {camera.name: k for k, camera in enumerate(cameras)}
+    for rig in rigs:
+        known = [number[rig.cameras[0]]]
+        names[known[0]] = rig.name
+        left = [number[name] for name in rig.cameras[1:]]
+        while left:
+            pairs = {b: [(k, one) for k in known for one in _common(at, k, b)] for b in left}
+            b = max(left, key=lambda one: len(pairs[one]))
+            if not pairs[b]:
+                raise GeometryError(
+                    f"rig {rig.name}: camera {cameras[b].name} is oriented at no moment together with "
+                    f"{listed([cameras[k].name for k in known])}; more points that both see are needed"
+                )
+            relative = [_relative(estimate, position[k], rotation[k], i, j) for k, (i, j) in pairs[b]]
+            position[b] = np.median([t for t, _ in relative], axis=0)
+            rotation[b] = _middle(np.array([R for _, R in relative]))
+            free[b], names[b] = True, rig.name
+            known.append(b)
+            left.remove(b)
+    return Mounts(position, rotation, free, tuple(names))
+
+
+def _common(at: dict[tuple[int, int], int], a: int, b: int) -> list[tuple[int, int]]:
+    """Return the photographs of two cameras of the same moments."""
+    return [(i, at[when, b]) for (when, camera), i in at.items() if camera == a and (when, b) in at]
+
+
+def _relative(
+    estimate: Estimate, X: FloatArray, R: FloatArray, i: int, j: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return position and rotation of the camera of photograph j in the axes of the rig of photograph i."""
+    of_rig = estimate.rotation[i] @ R.T
+    origin = estimate.position[i] - of_rig @ X
+    return np.asarray(of_rig.T @ (estimate.position[j] - origin)), of_rig.T @ estimate.rotation[j]
+
+
+def _middle(R: FloatArray) -> FloatArray:
+    """Return the rotation from which others differ least, by the mean of those near their median, (3, 3)."""
+    angle = np.arccos(np.clip((np.einsum("iab,jab->ij", R, R) - 1) / 2, -1.0, 1.0))
+    middle = R[int(np.argmin(np.median(angle, axis=1)))]
+    for _ in range(ROUNDS):
+        away = np.arccos(np.clip((np.einsum("iab,ab->i", R, middle) - 1) / 2, -1.0, 1.0))
+        middle = nearest_rotation(R[away <= np.median(away)].sum(axis=0))
+    return np.asarray(middle)
+
+
+def place_by_rigs(network: Network, estimate: Estimate) -> Estimate:
+    """Return the estimate with all photographs of moments at which one at least is oriented."""
+    mounts = estimate.mounts
+    if network.moment is None or mounts is None:
+        return estimate
+    position, rotation = estimate.position.copy(), estimate.rotation.copy()
+    by_moment: dict[int, int] = {}
+    for i in np.flatnonzero(estimate.oriented):
+        by_moment.setdefault(int(network.moment[i]), int(i))
+    for j in np.flatnonzero(~estimate.oriented):
+        if int(network.moment[j]) in by_moment:
+            one = by_moment[int(network.moment[j])]
+            a, b = network.camera[one], network.camera[j]
+            of_rig = rotation[one] @ mounts.rotation[a].T
+            rotation[j] = of_rig @ mounts.rotation[b]
+            position[j] = position[one] + of_rig @ (mounts.position[b] - mounts.position[a])
+    return replace(estimate, position=position, rotation=rotation)
