@@ -33,10 +33,12 @@ def make_rig(
     """
     network, seen = make_network(rng, images=cameras * moments, points=points, free=free, cameras=cameras,
                                  planar=planar)  # fmt: skip
-    a = np.arange(cameras)
+    a, width = np.arange(cameras), 0.4 / max(cameras - 1, 1)
     mounts = Mounts(
-        np.stack([0.3 * a, 0.05 * np.sin(a), 0.04 * a], axis=1),
-        np.array([rotation_from_vector(np.array([0.02 * k, -0.06 * k, 0.3 * np.sin(k)])) for k in a]),
+        np.stack([width * a, 0.05 * np.sin(a), 0.04 * np.sin(2 * a)], axis=1),
+        np.array(
+            [rotation_from_vector(np.array([0.02 * np.sin(k), width * k / 4, 0.3 * np.sin(k)])) for k in a]
+        ),
         np.tile(a[:, None] > 0, (1, 6)),
         ("rig",) * cameras,
     )

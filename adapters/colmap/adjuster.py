@@ -26,6 +26,7 @@ from adapters.colmap.reconstruction import (
     estimate_of,
     reconstruction,
     residuals_of,
+    sensor_of,
 )
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
@@ -95,6 +96,7 @@ def adjust_with_colmap(
     refine = colmap_free(estimate.cameras)
     options = ceres_options(pycolmap, refine, len(network.images), threads, max_iterations)
     with quiet(pycolmap):
+        options.refine_sensor_from_rig = estimate.mounts is not None and bool(estimate.mounts.free.any())
         scene = reconstruction(pycolmap, network, estimate)
         config = adjustment_config(pycolmap, network, estimate, gauge)
         iterations, seconds, converged, message = 0, 0.0, False, ""
@@ -201,7 +203,6 @@ def ceres_options(
     """Ceres run to the end of double precision, with nearly undamped steps."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_principal_point, options.refine_extra_params = refine
-    options.refine_sensor_from_rig = False
     options.print_summary = False
     options.ceres.auto_select_solver_type = False
     options.ceres.min_num_residuals_for_cpu_multi_threading = 0
@@ -229,6 +230,10 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
     for k, camera in enumerate(estimate.cameras):
         if not camera.free.any():
             config.set_constant_cam_intrinsics(k + 1)
+    mounts = estimate.mounts
+    for k in range(0 if mounts is None else len(mounts.rig)):
+        if mounts is not None and mounts.rig[k] and not mounts.free[k].any():
+            config.set_constant_sensor_from_rig_pose(sensor_of(pycolmap, k))
     if gauge == "two_cameras":
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     elif gauge == "control":

@@ -5,7 +5,8 @@ Differences are converted here and nowhere else:
     pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
     numbers        cameras, photographs and points are numbered from 1 in COLMAP
-    rigs, frames   since COLMAP 4 a photograph belongs to a frame of a rig: here each to one of its own
+    rigs, frames   since COLMAP 4 a photograph belongs to a frame of a rig: a moment is a frame, and a
+                   photograph without a rig is alone in its frame
 
 pycolmap is handed in by adapters.colmap.adjuster, which alone imports it.
 
@@ -25,7 +26,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import BackendError
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Estimate, Mounts, Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
@@ -40,8 +41,8 @@ def reconstruction(
 ) -> Any:
     """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
     scene = pycolmap.Reconstruction()
-    for k, camera in enumerate(estimate.cameras):
-        scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
+    rigged = _add_cameras(pycolmap, scene, estimate)
+    frames: dict[int, Any] = {}
     seen = network.image_points
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
     determined = estimate.determined
@@ -54,10 +55,14 @@ def reconstruction(
         R = AXES @ estimate.rotation[i].T
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
         keypoints = seen.xy[rows] + HALF_PIXEL
-        image = pycolmap.Image(
-            name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
-        )
-        scene.add_image_with_trivial_frame(image, pose)
+        a = int(network.camera[i])
+        image = pycolmap.Image(name=network.images[i], keypoints=keypoints, camera_id=a + 1, image_id=i + 1)
+        if network.moment is None or a not in rigged:
+            scene.add_image_with_trivial_frame(image, pose)
+        else:
+            frames.setdefault(int(network.moment[i]), []).append((image, pose, a))
+    for images in frames.values():
+        _add_frame(pycolmap, scene, images, rigged)
     for j, rows in enumerate(rows_of(seen.point, len(network.points))):
         if not determined[j]:
             continue
@@ -69,6 +74,57 @@ def reconstruction(
         for element in track.elements:
             scene.add_observation(j + 1, element)
     return scene
+
+
+def _add_cameras(pycolmap: ModuleType, scene: Any, estimate: Estimate) -> dict[int, tuple[int, Any]]:
+    """Add cameras and rigs to a scene; the rig of each camera in one, and the camera from the rig."""
+    mounts = estimate.mounts
+    names = ("",) * len(estimate.cameras) if mounts is None else mounts.rig
+    found: dict[int, tuple[int, Any]] = {}
+    for k, camera in enumerate(estimate.cameras):
+        if names[k]:
+            scene.add_camera(colmap_camera(pycolmap, camera, k + 1))
+        else:
+            scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
+    if mounts is None:
+        return found
+    for number, name in enumerate(dict.fromkeys(filter(None, names))):
+        rig = pycolmap.Rig(rig_id=len(names) + number + 1)
+        on = [k for k, one in enumerate(names) if one == name]
+        reference = next(k for k in on if not mounts.position[k].any() and not mounts.free[k].any())
+        for k in (reference, *(k for k in on if k != reference)):
+            R = AXES @ mounts.rotation[k].T
+            from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[k])
+            sensor = sensor_of(pycolmap, k)
+            if k == reference:
+                rig.add_ref_sensor(sensor)
+            else:
+                rig.add_sensor(sensor, from_rig)
+            found[k] = rig.rig_id, from_rig
+        scene.add_rig(rig)
+    return found
+
+
+def _add_frame(
+    pycolmap: ModuleType, scene: Any, images: list[tuple[Any, Any, int]], rigged: dict[int, tuple[int, Any]]
+) -> None:
+    """Add the photographs of one moment to a scene: image, its pose and its camera."""
+    _, pose, camera = images[0]
+    rig, camera_from_rig = rigged[camera]
+    frame = pycolmap.Frame(frame_id=images[0][0].image_id, rig_id=rig)
+    for image, _, k in images:
+        frame.add_data_id(pycolmap.data_t(sensor_of(pycolmap, k), image.image_id))
+        image.frame_id = frame.frame_id
+    frame.rig_from_world = camera_from_rig.inverse() * pose
+    scene.add_frame(frame)
+    for image, _, _ in images:
+        scene.add_image(image)
+    scene.register_frame(frame.frame_id)
+
+
+def sensor_of(pycolmap: ModuleType, camera: int) -> Any:
+    """Return what COLMAP calls the camera of an index, as a sensor."""
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera + 1)
 
 
 def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
@@ -139,7 +195,21 @@ def estimate_of(scene: Any, start: Estimate) -> Estimate:
     R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
-    return Estimate(tuple(cameras), position, R, points)
+    return Estimate(tuple(cameras), position, R, points, _mounts_of(scene, start.mounts))
+
+
+def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
+    """Read the adjusted mounts back."""
+    if start is None:
+        return None
+    position, rotation = start.position.copy(), start.rotation.copy()
+    for rig in scene.rigs.values():
+        for sensor, from_rig in rig.non_ref_sensors.items():
+            pose = from_rig.matrix()
+            R = AXES @ pose[:, :3] @ AXES
+            rotation[sensor.id - 1] = R.T
+            position[sensor.id - 1] = -R.T @ AXES @ pose[:, 3]
+    return replace(start, position=position, rotation=rotation)
 
 
 def residuals_of(scene: Any, network: Network) -> FloatArray:

@@ -34,7 +34,7 @@ class ColmapCovariance:
 def covariance_with_colmap(
     network: Network, estimate: Estimate, *, gauge: str = "two_cameras"
 ) -> ColmapCovariance | None:
-    """Return COLMAP's covariances at a solution, None where COLMAP finds it singular.
+    """Return COLMAP's covariances at a solution, None of rigs and where COLMAP finds it singular.
 
     What COLMAP calls the covariance of a point is conditional on all photographs and cameras, too small
     by the share that these contribute. That of the interior orientation is marginal and does not depend
@@ -49,6 +49,8 @@ def covariance_with_colmap(
         BackendError: as for `adjust_with_colmap`.
     """
     pycolmap = load_pycolmap()
+    if estimate.mounts is not None:  # COLMAP 4.2 refuses photographs that are not of reference cameras
+        return None
     options = ceres_options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
     with quiet(pycolmap):
         scene = reconstruction(pycolmap, network, estimate)

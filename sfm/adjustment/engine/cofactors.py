@@ -104,7 +104,9 @@ def marginal_covariance(
         interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
     columns, J = layout.mount_terms(optimum.state)
     at = np.maximum(columns - first, 0)
-    of_mounts = cofactors.border[at[:, :, None], at[:, None]] if len(at) else np.zeros((0, 6, 6))
+    of_mounts = np.zeros((len(at), 6, 6))
+    if cofactors.border.size:
+        of_mounts = cofactors.border[at[:, :, None], at[:, None]]
     mounts = J @ _in_datum(of_mounts, H[columns], np.moveaxis(F[:, columns], 1, 0), G) @ np.swapaxes(J, 1, 2)
     return Covariance(
         variance * points,

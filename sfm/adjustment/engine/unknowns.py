@@ -126,7 +126,7 @@ class Unknowns:
             return np.zeros((0, 6), dtype=np.int64), np.zeros((0, 6, 6))
         free = self.mount_column >= 0
         J = exterior_jacobian(state.camera_from_rig) * free[:, None]
-        return np.where(free, self.mount_column, self.pose_free.size), J
+        return np.maximum(self.mount_column, 0), J
 
 
 def unknowns_of(

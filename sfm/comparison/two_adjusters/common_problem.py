@@ -56,7 +56,11 @@ def common_problem(
     unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))
     # Nothing but image points: no control, scale bars or other observations.
     network = Network(
-        network.images, network.camera, network.points, ImagePoints(seen.image, seen.point, seen.xy, unit)
+        network.images,
+        network.camera,
+        network.points,
+        ImagePoints(seen.image, seen.point, seen.xy, unit),
+        moment=network.moment,
     )
     return network, start, conversions, freed
 

@@ -48,6 +48,7 @@ from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
 from sfm.report.findings.precision import Precision, precision_of, root_mean_square
 from sfm.report.findings.protocol import Protocol, check_coordinates, protocol_of
+from sfm.report.findings.rigs import Rig, rigs_of
 from sfm.report.findings.sharpness import edges_of, sharpness_remarks
 from sfm.report.findings.survey_remarks import (
     adjustment_remarks,
@@ -80,6 +81,7 @@ class Findings:
     interior: InteriorOrientation
     calibrated: tuple[CalibratedCamera, ...]  # where the cameras are the result
     given: Given
+    rigs: tuple[Rig, ...]
     check: CheckedControl | None  # control that took no part
     precision: Precision
     points: tuple[PointRow, ...]  # in the order of the network
@@ -137,6 +139,7 @@ def findings_of(result: SurveyResult) -> Findings:
         interior=interior,
         calibrated=calibrated,
         given=given,
+        rigs=rigs_of(a),
         check=check,
         precision=precision,
         points=points_of(result, precision, geometry),

@@ -116,6 +116,30 @@ def _figures(findings: Findings) -> dict[str, Any]:
             }
             for index, camera in enumerate(adjustment.estimate.cameras)
         ],
+        "rigs": [
+            {
+                "name": rig.name,
+                "reference": rig.reference,
+                "moments": rig.moments,
+                "mounts": [
+                    {"camera": mount.camera}
+                    | {
+                        name: {"value": or_none(value), "sigma": or_none(sigma)}
+                        for name, value, sigma, is_length in mount.values
+                        if is_length
+                    }
+                    | {
+                        "rotation_deg": {
+                            name: {"value": or_none(value), "sigma": or_none(sigma)}
+                            for name, value, sigma, is_length in mount.values
+                            if not is_length
+                        }
+                    }
+                    for mount in rig.mounts
+                ],
+            }
+            for rig in findings.rigs
+        ],
         "statistics": summary_of_statistics(findings),
         "consistency": summary_of_consistency(findings),
         "geometry": _geometry(findings),
