@@ -268,6 +268,9 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
+    if network.moment is not None:  # the other photographs of a moment determine its pose
+        shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
+        least = np.where(shared, 1, least)
     return _Prepared(
         Task(survey, datum, network, matched.min_rays, least, survey.reject, matched.suspected),
         estimate,

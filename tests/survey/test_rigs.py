@@ -1,0 +1,126 @@
+"""Surveys with rigs: moments from names, mounts from photographs oriented one by one, results."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.output import write_result
+from sfm.report.text.text_report import text_report
+from sfm.survey.inputs.settings import RigSettings
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.rigs import mounts_of, place_by_rigs
+from tests.rigs import make_rig
+from tests.synthetic import seed_of
+
+RIG = '[[rig]]\nname = "stereo"\ncameras = ["camera 1", "camera 2"]\nmoment = "moment ([0-9]+)"\n'
+
+
+def written(folder: Path, network: Network, truth: Estimate, rig: str = RIG) -> Path:
+    """Write a survey of the image points of a network, with calibrated cameras."""
+    k = network.image_points
+    rows = [
+        f"{network.images[i]},{network.points[j]},{x!r},{y!r},0.1,0.1"
+        for i, j, (x, y) in zip(k.image, k.point, k.xy.tolist(), strict=True)
+    ]
+    (folder / "points.csv").write_text("\n".join(["image,point,x_px,y_px,sx_px,sy_px", *rows]), "utf-8")
+    lines = ['[survey]\nname = "rig"\nunit = "m"\n', rig, '[observations]\nfile = "points.csv"\n']
+    for camera in truth.cameras:
+        values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+        fixed = ", ".join(f"{name} = {value!r}" for name, value in values.items() if name != "c")
+        lines.append(
+            f'[[camera]]\nname = "{camera.name}"\nimages = "*{camera.name}"\nfree = []\n'
+            f"size_px = {list(camera.size_px)}\npixel_mm = {camera.pixel_mm.tolist()}\n"
+            f"c_mm = {values['c']!r}\nfixed = {{ {fixed} }}\n"
+        )
+    path = folder / "survey.toml"
+    path.write_text("\n".join(lines), "utf-8")
+    return path
+
+
+def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
+    """One photograph sees two points only: its rig places it. Base and angles are within their sigmas."""
+    network, truth = make_rig(seed_of("survey"), moments=6)
+    k = network.image_points
+    few = (k.image != 3) | (np.cumsum(k.image == 3) <= 2)
+    network = replace(network, image_points=k.select(few))
+    result = run_survey(read_survey(written(tmp_path, network, truth)))
+    found = findings_of(result)
+    assert len(result.adjustment.network.images) == 12
+    (rig,) = found.rigs
+    assert (rig.name, rig.reference, rig.moments) == ("stereo", "camera 1", 6)
+    (mount,) = rig.mounts
+    assert truth.mounts is not None
+    points = result.adjustment.estimate.points
+    order = [network.points.index(name) for name in result.adjustment.network.points]
+    size = np.linalg.norm(points - points.mean(axis=0)) / np.linalg.norm(
+        truth.points[order] - truth.points[order].mean(axis=0)
+    )
+    assert abs(mount.base / size - np.linalg.norm(truth.mounts.position[1])) < 4 * mount.base_sigma / size
+    write_result(found, tmp_path / "out")
+    (stored,) = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["rigs"]
+    assert stored["mounts"][0]["base"] == {"value": mount.base, "sigma": mount.base_sigma}
+    assert set(stored["mounts"][0]["rotation_deg"]) == {"omega", "phi", "kappa"}
+    assert "Rig stereo" in text_report(found)
+
+
+@pytest.mark.parametrize(
+    ("rig", "said"),
+    [
+        (RIG.replace("camera 2", "camera 3"), "rig stereo: no camera is named 'camera 3'"),
+        (RIG.replace(', "camera 2"', ""), "rig stereo: 1 camera, at least 2 are needed"),
+        (RIG.replace("moment (", "time ("), "does not match photograph 'moment 1 camera 1'"),
+        (RIG.replace("([0-9]+)", "[0-9]+"), "has 0 groups, needed 1"),
+        (RIG.replace("([0-9]+)", "([0-9+"), "is no regular expression"),
+        (RIG.replace("([0-9]+)", "(.*.*.*.*)x"), "repeats more than 3 parts"),
+        (RIG.replace("([0-9]+)", "([0-9]+)*"), "repeats more than 3 parts, or a group"),
+        (RIG.replace("moment ([0-9]+)", "(camera)"), "of camera camera 1 are of one moment, 'camera'"),
+        (RIG.replace("moment ([0-9]+)", "(.+)"), "no moment has photographs of two cameras"),
+        (RIG + RIG.replace("stereo", "other"), "camera camera 1 is on rig stereo already"),
+    ],
+)
+def test_wrong_rigs_are_refused_in_one_line(rig: str, said: str, tmp_path: Path) -> None:
+    network, truth = make_rig(seed_of("wrong"), moments=3, points=12)
+    with pytest.raises(SurveyFileError) as error:
+        run_survey(read_survey(written(tmp_path, network, truth, rig)))
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_moments_in_order_need_as_many_photographs(tmp_path: Path) -> None:
+    network, truth = make_rig(seed_of("order"), moments=3, points=12)
+    k = network.image_points
+    less = replace(network, image_points=k.select(k.image != 5))
+    rig = RIG.replace("moment ([0-9]+)", "order")
+    with pytest.raises(SurveyFileError, match="found 3 of camera 1, 2 of camera 2"):
+        run_survey(read_survey(written(tmp_path, less, truth, rig)))
+    survey = read_survey(written(tmp_path, network, truth, rig))
+    assert run_survey(survey).adjustment.estimate.mounts is not None
+
+
+def test_mounts_are_those_of_most_moments() -> None:
+    """Three cameras; camera 3 is never oriented beside camera 1, and some photographs are wrong."""
+    network, truth = make_rig(seed_of("median"), cameras=3, moments=10, points=12)
+    assert truth.mounts is not None
+    position = truth.position.copy()
+    position[1::18] += 1.0
+    position[2::6] = np.nan  # camera 3 at every other moment, and camera 1 at the others
+    position[3::6] = np.nan
+    rigs = [RigSettings(name="rig", cameras=("camera 1", "camera 2", "camera 3"), moment="order")]
+    start = replace(truth, position=position, mounts=None)
+    found = mounts_of(rigs, truth.cameras, network, start)  # type: ignore[arg-type]
+    assert found.position == pytest.approx(truth.mounts.position, abs=1e-9)
+    assert found.rotation == pytest.approx(truth.mounts.rotation, abs=1e-9)
+    assert list(found.free.any(axis=1)) == [False, True, True]
+    placed = place_by_rigs(network, replace(start, mounts=found))
+    assert placed.position[3::6] == pytest.approx(truth.position[3::6], abs=1e-9)
+    lost = replace(start, position=np.where(np.arange(30)[:, None] % 3 == 2, np.nan, position))
+    with pytest.raises(GeometryError, match="camera camera 3 is oriented at no moment together with"):
+        mounts_of(rigs, truth.cameras, network, lost)  # type: ignore[arg-type]
