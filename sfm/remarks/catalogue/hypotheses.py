@@ -106,6 +106,16 @@ ROWS = (
         short="control points of another shape",
     ),
     Kind(
+        "rig_bumped",
+        "warning",
+        "{photographs:photograph} of {cameras} {photographs:contradicts|contradict} the rig, by up to "
+        "{distance} and {angle}, {shift} standard deviations: {photographs}.",
+        "the camera was moved on its rig, or photographed at another moment while rig or object moved",
+        "Leave {photographs:this photograph|these photographs} out; if the camera stayed at its new place, "
+        "give the later photographs a camera of their own.",
+        short="a camera that moved on its rig",
+    ),
+    Kind(
         "points_moved",
         SHIFT,  # a few points leave the RMS of all small
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."

@@ -11,6 +11,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
+from sfm.adjustment.hypotheses.rig_bumps import bump_remarks
 from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
@@ -194,6 +195,7 @@ def _solution(
             *_handedness(start.task.survey, solved.given),
             *_of_windows(survey, judged.causes),
             *judged.unchecked,
+            *bump_remarks(final, unit),
             *_of_windows(survey, explain_rejections(final, unit=unit, bodies=plates)),
             *contradicted(solved.c_held, judged.causes),
         ),

@@ -1,0 +1,76 @@
+"""A camera that was moved on its rig is found and named; rigs that kept theirs are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.hypotheses.rig_bumps import _scores, bump_remarks, find_bumps
+from sfm.adjustment.solve import adjust
+from sfm.camera import project
+from sfm.network import Estimate, Network
+from tests.rigs import make_rig
+from tests.synthetic import seed_of
+
+
+def bumped(network: Network, truth: Estimate, i: int, shift: np.ndarray) -> Network:
+    """Return the network with one photograph taken from another place."""
+    seen = network.image_points
+    rows = seen.image == i
+    camera, X = truth.cameras[network.camera[i]], truth.points[seen.point[rows]]
+    xy = seen.xy.copy()
+    for sign, at in ((1, truth.position[i] + shift), (-1, truth.position[i])):
+        xy[rows] += sign * project(camera, at, truth.rotation[i], X)
+    return replace(network, image_points=replace(seen, xy=xy))
+
+
+def scene(number: int, cameras: int) -> tuple[Network, Estimate]:
+    return make_rig(seed_of(f"bump {number}"), cameras=cameras, moments=8, points=25)
+
+
+@pytest.mark.parametrize(("cameras", "moved"), [(2, 7), (3, 4), (3, 6)])
+def test_a_bump_of_six_sigma_is_named(cameras: int, moved: int) -> None:
+    """The sixth photograph of camera 3 of 3 is the reference camera, which a third one shows."""
+    network, truth = scene(1, cameras)
+    a = adjust(network, truth, reject="none")
+    _, G = _scores(a, np.array([moved]))
+    C = np.linalg.inv(G[0][:, 0])
+    d = seed_of("direction").standard_normal(3)
+    d /= np.linalg.norm(d)
+    shift = 6 * np.sqrt(d @ C[:3, :3] @ d)
+    b = adjust(bumped(network, truth, moved, shift * d), truth, reject="none")
+    (found,) = find_bumps(b)
+    assert found.photograph == network.images[moved]
+    assert found.shift == pytest.approx(shift, rel=0.7)
+    (said,) = bump_remarks(b, "m")
+    assert said.kind == "rig_bumped" and said.names("photographs") == (network.images[moved],)
+
+
+def test_two_bumps_are_both_named() -> None:
+    network, truth = scene(2, 2)
+    shift = np.array([0.004, -0.003, 0.002])
+    both = bumped(bumped(network, truth, 3, shift), truth, 11, -2 * shift)
+    found = find_bumps(adjust(both, truth, reject="none"))
+    assert [one.photograph for one in found] == [network.images[11], network.images[3]]
+
+
+def test_rigs_that_kept_their_places_are_left_alone() -> None:
+    """30 of them at a level of 1 %: two alarms have a chance of 4 %, three of 0.3 %."""
+    alarms = sum(bool(find_bumps(adjust(*scene(k, 2), reject="none"))) for k in range(10, 40))
+    assert alarms <= 2
+
+
+def test_scores_are_those_of_an_adjustment_with_a_pose_of_its_own() -> None:
+    """The fall of v'Pv where the photograph leaves its rig is chi-square of the test."""
+    network, truth = scene(3, 2)
+    moved = bumped(network, truth, 5, np.array([1e-3, 0.0, 0.0]))
+    a = adjust(moved, truth, reject="none", tolerance=1e-9)
+    (found,) = find_bumps(a)
+    assert moved.moment is not None
+    free = replace(moved, moment=np.where(np.arange(16) == 5, 99, moved.moment))
+    start = replace(a.estimate, cameras=a.estimate.cameras)
+    b = adjust(free, start, reject="none", tolerance=1e-9)
+    fall = a.vPv - b.vPv
+    assert (found.sigmas * a.sigma0) ** 2 == pytest.approx(fall, rel=0.01)
