@@ -16,6 +16,7 @@ from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution
 # Of an image coordinate. Computed ones are exact to some 1e-15 of themselves, and to 1e-10 where errors of
 # control strain their network; measured ones to 1e-7 at best.
 ROUNDING = 1e-9
+MOTIONS = 7  # position, attitude and scale: what image points leave open
 # Standard deviation of an image coordinate that nobody beats: targets reach 1/100 px, computed images 1/1000.
 # Beside larger weights, control and bars of a usual survey would be lost in rounding. Source: Luhmann et al.
 # (2020), Close-Range Photogrammetry, sec. 5.4.2.
@@ -143,9 +144,8 @@ class Adjustment:
 
     @property
     def has_scale(self) -> bool:
-        """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
-        network = self.network
-        return self.datum == "control" or len(network.scale_bars) > 0 or len(network.control) >= 2
+        """Whether lengths are in the object unit: from what was given, or placed on control."""
+        return self.datum == "control" or self.expected_defect < MOTIONS or len(self.network.control) >= 2
 
     @property
     def vPv(self) -> float:

@@ -17,14 +17,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
-from sfm.similarity import nearest_rotation
+from sfm.observations.mounts import MountObservations
+from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import CameraSettings, RigSettings
 from sfm.survey.inputs.survey import Survey
 
+TINY = float(np.finfo(float).tiny)
 ROUNDS = 10  # of the mean of rotations; it moves by less than their scatter after two
 
 
@@ -65,7 +67,43 @@ def with_moments(survey: Survey, network: Network) -> Network:
                 f"{where}: no moment has photographs of two cameras; moments are {some}; correct moment"
             )
     order = {one: k for k, one in enumerate(dict.fromkeys(key))}
-    return replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
+    given = _given_mounts(survey)
+    loose = given.select(np.flatnonzero(np.trace(given.covariance, axis1=1, axis2=2) > 0))
+    return replace(
+        network,
+        moment=np.array([order[one] for one in key], dtype=np.int64),
+        observations=(*network.observations, loose) if len(loose) else network.observations,
+    )
+
+
+def _given_mounts(survey: Survey) -> MountObservations:
+    """Return the mounts that a survey gives.
+
+    Raises:
+        SurveyFileError: of a camera that is on no rig or the reference of one, not of all six values, or held
+            fixed in part.
+    """
+    number = {camera.name: a for a, camera in enumerate(survey.cameras)}
+    mounted = {name for rig in survey.rigs for name in rig.cameras[1:]}
+    cameras: list[int] = []
+    for table in survey.mounts:
+        for k, name in enumerate(table.names):
+            if name not in mounted:
+                some = listed(sorted(mounted))
+                raise SurveyFileError(
+                    f"{table.table.place(k)}: camera '{name}' is on no rig, or its reference; needed {some}"
+                )
+            sigma = table.sigma[k]
+            if not np.isfinite(sigma).all() or ((sigma == 0).any() and (sigma > 0).any()):
+                raise SurveyFileError(
+                    f"{table.table.place(k)}: camera '{name}': needed all six values, held fixed (sigma 0) "
+                    "together or none of them"
+                )
+            cameras.append(number[name])
+    value = np.concatenate([np.zeros((0, 6)), *(table.value for table in survey.mounts)])
+    sigma = np.concatenate([np.zeros((0, 6)), *(table.sigma for table in survey.mounts)])
+    covariance = np.eye(6) * sigma[:, None, :] ** 2
+    return MountObservations(np.array(cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance)
 
 
 def _moments(
@@ -105,6 +143,17 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
     if network.moment is None:
         return estimate
     mounts = mounts_of(survey.rigs, survey.cameras, network, estimate)
+    given = _given_mounts(survey)
+    if len(given):
+        a = given.camera
+        base, scale = np.linalg.norm(mounts.position[a], axis=1), 1.0
+        if survey.datum.kind != "control":  # which has a scale by itself
+            scale = float(np.median(np.linalg.norm(given.position, axis=1) / np.maximum(base, TINY)))
+        estimate = Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
+        position, rotation, free = scale * mounts.position, mounts.rotation.copy(), mounts.free.copy()
+        position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
+        rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
+        mounts = replace(mounts, position=position, rotation=rotation, free=free)
     return place_by_rigs(network, replace(estimate, mounts=mounts))
 
 

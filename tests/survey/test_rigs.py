@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.variance_components import by_kind
+from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
@@ -124,3 +126,46 @@ def test_mounts_are_those_of_most_moments() -> None:
     lost = replace(start, position=np.where(np.arange(30)[:, None] % 3 == 2, np.nan, position))
     with pytest.raises(GeometryError, match="camera camera 3 is oriented at no moment together with"):
         mounts_of(rigs, truth.cameras, network, lost)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-4])
+def test_given_mounts_give_the_scale(sigma: float, tmp_path: Path) -> None:
+    """Held fixed, or observed with a standard deviation; with residuals in the report then."""
+    network, truth = make_rig(seed_of("given mounts"), moments=5, points=25)
+    assert truth.mounts is not None
+    X = truth.mounts.position[1]
+    angles = np.degrees(angles_from_rotation(truth.mounts.rotation[1]))
+    cells = [*X.tolist(), *[sigma] * 3, *angles.tolist(), *[float(np.degrees(sigma))] * 3]
+    header = "camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg"
+    (tmp_path / "mounts.csv").write_text(f"{header}\ncamera 2,{','.join(map(repr, cells))}\n", "utf-8")
+    path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
+    result = run_survey(read_survey(path))
+    a = result.adjustment
+    assert a.has_scale and a.defect == a.expected_defect == 6
+    found = np.linalg.norm(np.ptp(a.estimate.points, axis=0))
+    exact = np.linalg.norm(np.ptp(truth.points[[network.points.index(n) for n in a.network.points]], axis=0))
+    assert found == pytest.approx(exact, rel=0.2)  # turned, so that its box is another
+    (mount,) = findings_of(result).rigs[0].mounts
+    assert mount.base == pytest.approx(np.linalg.norm(X), abs=1e-12 if sigma == 0 else 4 * sigma)
+    kinds = [kind.kind for kind in findings_of(result).given.kinds]
+    assert kinds == ([] if sigma == 0 else ["mount"])
+    if sigma:
+        assert by_kind(a).names == ("image points", "mounts")
+        assert by_kind(a).redundancy.sum() == pytest.approx(a.redundancy, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("camera 1,1,0,0,0,0,0,0,0,0,0,0,0", "camera 'camera 1' is on no rig, or its reference"),
+        ("camera 2,1,0,0,0,0,0,0,0,0,1,1,1", "needed all six values, held fixed .sigma 0. together"),
+        ("camera 2,1,0,0,1,1,1,,,,,,", "needed all six values"),
+    ],
+)
+def test_wrong_mounts_are_refused(row: str, said: str, tmp_path: Path) -> None:
+    network, truth = make_rig(seed_of("wrong mounts"), moments=3, points=12)
+    header = "camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg"
+    (tmp_path / "mounts.csv").write_text(f"{header}\n{row}\n", "utf-8")
+    path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
+    with pytest.raises(SurveyFileError, match=said):
+        run_survey(read_survey(path))

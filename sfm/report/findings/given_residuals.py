@@ -45,7 +45,7 @@ class GivenResiduals:
     kind: str  # name of one of them
     coordinates: tuple[str, ...]  # names of the coordinates or angles, (d,)
     names: tuple[str, ...]  # control point, both ends of a bar, parameter and camera, or photograph, (n,)
-    units: tuple[str, ...]  # (n,)
+    units: tuple[tuple[str, ...], ...]  # of each coordinate, (n, d)
     given: FloatArray  # (n, d)
     difference: FloatArray  # adjusted minus given, (n, d)
     sigma: FloatArray  # given standard deviation; NaN where not observed, 0 where fixed, (n, d)
@@ -59,7 +59,7 @@ class GivenResiduals:
 
     def rows(self, rows: IntArray) -> GivenResiduals:
         """Return some of them."""
-        names, units = (tuple(words[k] for k in rows) for words in (self.names, self.units))
+        names, units = tuple(self.names[k] for k in rows), tuple(self.units[k] for k in rows)
         values = (x[rows] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(self.kind, self.coordinates, names, units, *values)
 
@@ -80,7 +80,7 @@ class GivenResiduals:
             GivenValue(
                 self.names[k],
                 self.coordinates[d],
-                self.units[k],
+                self.units[k][d],
                 *(float(x[k, d]) for x in (self.given, self.difference, self.sigma, self.r, self.w)),
             )
             for k, d in np.argwhere(~np.isnan(self.sigma))
@@ -118,6 +118,12 @@ class Given:
     def interior(self) -> GivenResiduals | None:
         """Observed parameters of interior orientation; None without any."""
         return self.of(InteriorObservations.single)
+
+    @property
+    def further(self) -> tuple[GivenResiduals, ...]:
+        """Those that are neither control points, scale bars, interior nor exterior orientation."""
+        others = (ObjectPoints.single, ScaleBars.single, InteriorObservations.single, CENTRE, ROTATION)
+        return tuple(kind for kind in self.kinds if kind.kind not in others)
 
     def of(self, kind: str) -> GivenResiduals | None:
         """Return the residuals of a kind, by the name of one of them; None without any."""
@@ -193,7 +199,7 @@ def given_of(a: Adjustment, length_unit: str) -> Given:
             kind=kind.single,
             coordinates=kind.components,
             names=kind.names(a.network, a.estimate),
-            units=tuple(units[0] for units in kind.units(a.estimate, length_unit)),
+            units=kind.units(a.estimate, length_unit),
             given=np.where(known, kind.values, np.nan),
             difference=np.where(known, v, np.nan),
             sigma=np.sqrt(np.where(known, variance, np.nan)),
@@ -213,8 +219,8 @@ def _centre_and_rotation(part: GivenResiduals) -> list[GivenResiduals]:
     """Return exterior orientation as projection centres and as angles in degrees."""
     degrees, found = float(np.degrees(1.0)), []
     for kind, axes, units, factor in (
-        (CENTRE, slice(0, 3), part.units, 1.0),
-        (ROTATION, slice(3, 6), ("deg",) * len(part.names), degrees),
+        (CENTRE, slice(0, 3), tuple(units[:3] for units in part.units), 1.0),
+        (ROTATION, slice(3, 6), (("deg",) * 3,) * len(part.names), degrees),
     ):
         given, v, sigma = (factor * x[:, axes] for x in (part.given, part.difference, part.sigma))
         r, w = part.r[:, axes], part.w[:, axes]

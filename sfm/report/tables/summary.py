@@ -150,9 +150,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
             one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")
         ],
         "further_observations": {
-            kind.kind: _given_values(kind, "name", "component")
-            for kind in given.kinds
-            if kind.kind in {further.single for further in adjustment.network.observations}
+            kind.kind: _given_values(kind, "name", "component") for kind in given.further
         },
         "eccentricity": None
         if result.eccentricity is None

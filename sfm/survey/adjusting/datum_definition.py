@@ -43,13 +43,21 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
     return Similarity(scale, np.eye(3), (1 - scale) * centre).apply_estimate(estimate)
 
 
+def is_scaled(network: Network, estimate: Estimate) -> bool:
+    """Return whether scale bars, other observations or mounts held fixed give a network its scale."""
+    mounts = estimate.mounts
+    held = mounts is not None and bool((mounts.position.any(axis=1) & ~mounts.free[:, :3].any(axis=1)).any())
+    return bool(len(network.scale_bars) or len(network.observations) or held)
+
+
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
     """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
     control = network.control.complete
     points = estimate.points[control.point]
     fitted = fit_similarity(points, control.xyz)
-    placing = fit_similarity(points, control.xyz, scale=1.0) if len(network.scale_bars) else fitted
-    scale = fitted.scale if len(network.scale_bars) else 1.0
+    scaled = is_scaled(network, estimate)
+    placing = fit_similarity(points, control.xyz, scale=1.0) if scaled else fitted
+    scale = fitted.scale if scaled else 1.0
     names = tuple(network.points[j] for j in control.point)
     return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
 
@@ -75,8 +83,9 @@ def place_on_frame(
     if on.sum() < MIN_CONTROL:
         both = frame.oriented & estimate.oriented
         source, target = estimate.position[both], frame.position[both]
-    keep = len(network.scale_bars) > 0 or len(network.control) == MIN_CONTROL - 1
-    scale = object_scale(network, estimate) if len(network.control) and not len(network.scale_bars) else 1.0
+    scaled = is_scaled(network, estimate)
+    keep = scaled or len(network.control) == MIN_CONTROL - 1
+    scale = object_scale(network, estimate) if len(network.control) and not scaled else 1.0
     try:
         return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
     except GeometryError:  # too few of them, or on a line: the adjustment has kept what they say

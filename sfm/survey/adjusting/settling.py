@@ -150,7 +150,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(is_observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
-    others = len(part.scale_bars) or len(part.interior) or weighted
+    others = len(part.scale_bars) or len(part.interior) or len(part.observations) or weighted
     if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points), task.factor)
     return adjust_part(np.ones(len(part.image_points)))

@@ -174,8 +174,7 @@ def _solution(
     )
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
-    given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
-    unit = survey.unit if given else NO_SCALE
+    unit = survey.unit if final.has_scale else NO_SCALE
     report_step("testing the assumptions")
     plates = _plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)

@@ -71,11 +71,15 @@ class ObservedExterior:
         return _observed_exterior(table, table.values[:, :6], table.values[:, 6:])
 
 
-def read_observed_exterior(path: Path) -> ObservedExterior:
+def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior:
     """Read observed exterior orientations; images.csv of a result is welcome.
 
     Columns are image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]. An
     empty cell means not observed; no column of sigma, or a sigma of 0, means fixed.
+
+    Args:
+        path: the table.
+        of: what its first column names: photographs, or cameras, whose mounts these are.
 
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
@@ -87,7 +91,7 @@ def read_observed_exterior(path: Path) -> ObservedExterior:
     sigmas_of_angles = SIGMAS_OF_ANGLES if any(name in header for name in SIGMAS_OF_ANGLES) else ()
     angles = ANGLES if any(name in header for name in (*ANGLES, *sigmas_of_angles)) else ()
     columns = (*AXES, *sigmas_of_axes, *angles, *sigmas_of_angles)
-    aliases = (("photograph", "image"), ("X0", "X"), ("Y0", "Y"), ("Z0", "Z"))
+    aliases = ((of, "image"), ("photograph", "image"), ("X0", "X"), ("Y0", "Y"), ("Z0", "Z"))
     table = read_table(
         path,
         ("image",),

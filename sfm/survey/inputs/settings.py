@@ -203,6 +203,9 @@ class RigSettings(Section):
     # "order": the photographs of each camera in the order of their names; else a regular expression with one
     # group, which is the moment, searched for in the names of photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
+    # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
+    # the reference camera; sigma 0 = held fixed
+    mounts: Name | None = None
 
 
 class ControlSettings(Section):

@@ -107,6 +107,7 @@ class Survey:
     exterior: ObservedExterior | None = None
     exif_sigma_m: tuple[float, float] | None = None  # in its place positions in EXIF data, see [exterior]
     rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
+    mounts: tuple[ObservedExterior, ...] = ()  # of cameras of rigs, by their names, as far as they are given
     scale_bars: tuple[ScaleBar, ...] = ()
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
@@ -254,6 +255,11 @@ def survey_of_file(file: SurveyFile) -> Survey:
         exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
         exif_sigma_m=file.exif_sigma_m,
         rigs=file.rigs,
+        mounts=tuple(
+            read_observed_exterior(file.beside(rig.mounts), of="camera")
+            for rig in file.rigs
+            if rig.mounts is not None
+        ),
         scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
         observations=read(read_image_points, file.observations.file if file.observations else None),
         diameters=read(read_diameters, file.targets.diameters),

@@ -127,6 +127,7 @@ class SurveyFile(Section):
             self.targets.codes if is_table(self.targets.codes) else None,
             self.targets.diameters,
         ]
+        names += [rig.mounts for rig in self.rigs]
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]
