@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ from sfm.observations.kind import Kind
 from sfm.observations.scale_bars import ScaleBars
 
 __all__ = [
+    "AdjustedValues",
     "Estimate",
     "ExteriorObservations",
     "ImagePoints",
@@ -39,6 +41,7 @@ __all__ = [
     "empty_estimate",
     "index_of",
     "rows_of",
+    "values_of",
     "without_given",
 ]
 
@@ -324,6 +327,35 @@ class Estimate:
             f"<Estimate: {self.oriented.sum()} of {len(self.position)} photographs oriented, "
             f"{self.determined.sum()} of {len(self.points)} points, cameras {cameras}>"
         )
+
+
+class AdjustedValues(NamedTuple):
+    """Adjusted values, as `sfm.observations.kind.Values`."""
+
+    points: FloatArray
+    position: FloatArray
+    M: FloatArray
+    parameters: FloatArray
+    mount_position: FloatArray
+    camera_from_rig: FloatArray
+
+
+def values_of(estimate: Estimate) -> AdjustedValues:
+    """Return the values of an estimate as kinds of observations ask for them."""
+    cameras, mounts = estimate.cameras, estimate.mounts
+    parameters = np.full((len(cameras), max(len(camera.parameters) for camera in cameras)), np.nan)
+    for a, camera in enumerate(cameras):
+        parameters[a, : len(camera.parameters)] = camera.parameters
+    nowhere = np.zeros((len(cameras), 3)), np.tile(np.eye(3), (len(cameras), 1, 1))
+    position, rotation = nowhere if mounts is None else (mounts.position, mounts.rotation)
+    return AdjustedValues(
+        estimate.points,
+        estimate.position,
+        np.swapaxes(estimate.rotation, 1, 2),
+        parameters,
+        position,
+        np.swapaxes(rotation, 1, 2),
+    )
 
 
 def without_given(network: Network) -> Network:

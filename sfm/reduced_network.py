@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from sfm.conventions import BoolArray, IntArray
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, Network
+from sfm.observations.kind import PHOTOGRAPH, POINT, Kind
+
+K = TypeVar("K", bound=Kind)
 
 
 def reduce_network(
@@ -23,17 +27,21 @@ def reduce_network(
         image_points: image points to keep (those of dropped photographs and points go anyway), (k,).
 
     Returns:
-        Reduced network and estimate, counted anew; control and scale bars of dropped points are gone.
+        Reduced network and estimate, counted anew; observations of dropped points and photographs are gone.
     """
     image_index = np.cumsum(images) - 1
     point_index = np.cumsum(points) - 1
     seen = network.image_points.select(
         image_points & images[network.image_points.image] & points[network.image_points.point]
     )
-    control, bars, exterior = network.control, network.scale_bars, network.exterior
-    c = points[control.point]
-    e = images[exterior.image]
-    b = points[bars.start] & points[bars.end]
+
+    def kept(kind: K) -> K:
+        on = np.ones(len(kind), dtype=bool)
+        for of, at in kind.blocks():
+            if of in (POINT, PHOTOGRAPH):
+                on &= (points if of == POINT else images)[at]
+        return kind.select(on).renumbered(point_index, image_index)
+
     reduced = replace(
         network,
         images=tuple(name for name, keep in zip(network.images, images, strict=True) if keep),
@@ -41,13 +49,10 @@ def reduce_network(
         moment=None if network.moment is None else network.moment[images],
         points=tuple(name for name, keep in zip(network.points, points, strict=True) if keep),
         image_points=replace(seen, image=image_index[seen.image], point=point_index[seen.point]),
-        control=ObjectPoints(point_index[control.point[c]], control.xyz[c], control.covariance[c]),
-        scale_bars=ScaleBars(
-            point_index[bars.start[b]], point_index[bars.end[b]], bars.length[b], bars.sigma[b]
-        ),
-        exterior=ExteriorObservations(
-            image_index[exterior.image[e]], exterior.position[e], exterior.angles[e], exterior.covariance[e]
-        ),
+        control=kept(network.control),
+        scale_bars=kept(network.scale_bars),
+        exterior=kept(network.exterior),
+        observations=tuple(one for one in map(kept, network.observations) if len(one)),
     )
     return reduced, replace(
         estimate,

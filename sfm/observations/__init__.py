@@ -1,1 +1,22 @@
-"""Kinds of observations beside image points, one in each module; `kind` has what they share."""
+"""Kinds of observations beside image points, one in each module; `kind` has what they share.
+
+A kind that a survey gives as a table is one module and one row of TABLES. The adjustment, its tests and
+variance components, the survey file, the tables and the reports take everything they need from there.
+"""
+
+from __future__ import annotations
+
+from sfm.observations.antenna_positions import AntennaPositions
+from sfm.observations.coordinate_differences import CoordinateDifferences
+from sfm.observations.distances import Distances
+from sfm.observations.height_differences import HeightDifferences
+from sfm.observations.kind import TableKind
+from sfm.observations.zenith_angles import ZenithAngles
+
+TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
+    "distance": Distances,
+    "height difference": HeightDifferences,
+    "coordinate difference": CoordinateDifferences,
+    "zenith angle": ZenithAngles,
+    "antenna position": AntennaPositions,
+}

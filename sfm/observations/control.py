@@ -66,9 +66,9 @@ class ObjectPoints(Kind):
         """Return some of the points."""
         return replace(self, point=self.point[rows], xyz=self.xyz[rows], covariance=self.covariance[rows])
 
-    def renumbered(self, place: IntArray) -> Self:
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
         """Return them with the points at other places."""
-        return replace(self, point=place[self.point])
+        return replace(self, point=points[self.point])
 
     def shifted(self, by: FloatArray) -> Self:
         """Return them with a shift added to all coordinates."""

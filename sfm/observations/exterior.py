@@ -75,6 +75,10 @@ class ExteriorObservations(Kind):
             covariance=self.covariance[rows],
         )
 
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return them with the photographs at other places."""
+        return self if images is None else replace(self, image=images[self.image])
+
     def shifted(self, by: FloatArray) -> Self:
         """Return them with a shift added to all projection centres."""
         return replace(self, position=self.position + by)

@@ -106,13 +106,48 @@ class Kind(ABC):
         """Return the weight matrix of all components, (n d, n d); None where it is block diagonal."""
         return None
 
-    def renumbered(self, place: IntArray) -> Self:
-        """Return the observations of a network with its points at other places; place of each, (n,)."""
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return the observations of a network with its points and photographs at other places.
+
+        Args:
+            points: place of each object point, (n,).
+            images: place of each photograph, (m,); the same as before if None.
+        """
         return self
 
     def shifted(self, by: FloatArray) -> Self:
         """Return the observations for coordinates with a shift added, object unit, (3,)."""
         return self
+
+
+class TableKind(Kind):
+    """A kind that a survey gives as a table: names, then values, then their standard deviations."""
+
+    texts: ClassVar[tuple[str, ...]]  # columns of names: of photographs if "image", else of points
+    numbers: ClassVar[tuple[str, ...]] = ()  # columns of numbers without a standard deviation
+    in_degrees: ClassVar[bool] = False  # whether values are degrees in tables
+
+    @classmethod
+    def columns(cls) -> tuple[str, ...]:
+        """Return the columns of numbers: those without standard deviation, values, standard deviations."""
+        unit = "_deg" if cls.in_degrees else ""
+        values = tuple(f"{name}{unit}" for name in cls.components)
+        return (*cls.numbers, *values, *(f"s{name}" for name in values))
+
+    @classmethod
+    @abstractmethod
+    def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
+        """Return the observations of a table.
+
+        Args:
+            indices: of the photographs or points of each column of names, (n,) each.
+            value: `numbers` and values, object unit or rad, (n, q + d).
+            sigma: standard deviations of the values, (n, d).
+        """
+
+    def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
+        """Return the unit of lengths, or rad."""
+        return (("rad" if self.in_degrees else length_unit,) * len(self.components),) * len(self)
 
 
 def is_observed(variance: FloatArray) -> BoolArray:

@@ -77,6 +77,6 @@ class ScaleBars(Kind):
             sigma=self.sigma[rows],
         )
 
-    def renumbered(self, place: IntArray) -> Self:
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
         """Return them with the points at other places."""
-        return replace(self, start=place[self.start], end=place[self.end])
+        return replace(self, start=points[self.start], end=points[self.end])

@@ -24,6 +24,7 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
+from sfm.survey.adjusting.placing import place_on_observations
 from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
@@ -95,7 +96,10 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         )
     elif not wrong_c:
         found = tell_second_objects(found, find_second_objects(network, found, _orient))
-    found = replace(found, estimate=mount_cameras(survey, network, found.estimate))
+    estimate = mount_cameras(survey, network, found.estimate)
+    if survey.datum.kind != "control":
+        estimate = place_on_observations(network, estimate)
+    found = replace(found, estimate=estimate)
     return tell_lost_photographs(network, found, named=survey.tie_points is None)
 
 

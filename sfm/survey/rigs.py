@@ -25,13 +25,14 @@ from sfm.observations.mounts import MountObservations
 from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import CameraSettings, RigSettings
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.observation_tables import with_tables
 
 TINY = float(np.finfo(float).tiny)
 ROUNDS = 10  # of the mean of rotations; it moves by less than their scatter after two
 
 
-def with_moments(survey: Survey, network: Network) -> Network:
-    """Return the network with the moment of each photograph; as it is where the survey has no rigs.
+def with_survey_data(survey: Survey, network: Network) -> Network:
+    """Return the network with survey observations and, where the survey has rigs, moments of photographs.
 
     Args:
         survey: says which cameras make a rig and what tells the moment of a photograph.
@@ -41,6 +42,7 @@ def with_moments(survey: Survey, network: Network) -> Network:
         SurveyFileError: no moment is told of a photograph of a rig, two photographs of one camera are of one
             moment, or no moment has photographs of two cameras.
     """
+    network = with_tables(survey, network)
     if not survey.rigs:
         return network
     key: list[object] = [(name,) for name in network.images]
@@ -134,7 +136,7 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
 
     Args:
         survey: names the rigs.
-        network: with moments, see `with_moments`.
+        network: with moments, see `with_survey_data`.
         estimate: with photographs oriented one by one.
 
     Raises:

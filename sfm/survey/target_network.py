@@ -21,7 +21,7 @@ from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
-from sfm.survey.rigs import with_moments
+from sfm.survey.rigs import with_survey_data
 from sfm.targets.codes.plates import plates_of
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
@@ -107,7 +107,7 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
     bars = scale_bars((*survey.scale_bars, *plate_bars(survey, naming)), naming.names)
     if not survey.scale_bars and survey.control is None:
         bars = tag_bars(survey.targets, naming)
-    network = with_moments(survey, network)
+    network = with_survey_data(survey, network)
     return replace(network, control=control_points(survey.control, naming.names), scale_bars=bars)
 
 

@@ -37,9 +37,10 @@ def written(folder: Path, network: Network, truth: Estimate, rig: str = RIG) -> 
     lines = ['[survey]\nname = "rig"\nunit = "m"\n', rig, '[observations]\nfile = "points.csv"\n']
     for camera in truth.cameras:
         values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+        glob = f"*{camera.name}" if len(truth.cameras) > 1 else "*"
         fixed = ", ".join(f"{name} = {value!r}" for name, value in values.items() if name != "c")
         lines.append(
-            f'[[camera]]\nname = "{camera.name}"\nimages = "*{camera.name}"\nfree = []\n'
+            f'[[camera]]\nname = "{camera.name}"\nimages = "{glob}"\nfree = []\n'
             f"size_px = {list(camera.size_px)}\npixel_mm = {camera.pixel_mm.tolist()}\n"
             f"c_mm = {values['c']!r}\nfixed = {{ {fixed} }}\n"
         )

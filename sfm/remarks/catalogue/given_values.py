@@ -16,6 +16,13 @@ PULLED = (
 
 ROWS = (
     Kind(
+        "observations_unused",
+        "warning",
+        "{observations:survey observation} took no part: {observations}.",
+        "their points or photographs are not in the result",
+        "Correct the names, or look among the points that were left out.",
+    ),
+    Kind(
         "bar_left_out",
         "warning",
         "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length by the other given "

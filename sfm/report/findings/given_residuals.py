@@ -10,13 +10,12 @@ Source: Baarda (1968), A testing procedure for use in geodetic networks.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate
+from sfm.network import values_of
 from sfm.observations.control import ObjectPoints
 from sfm.observations.exterior import ExteriorObservations
 from sfm.observations.interior import InteriorObservations
@@ -147,35 +146,6 @@ class Given:
 CENTRE, ROTATION = "projection centre", "rotation"
 
 
-class AdjustedValues(NamedTuple):
-    """Adjusted values, as `sfm.observations.kind.Values`."""
-
-    points: FloatArray
-    position: FloatArray
-    M: FloatArray
-    parameters: FloatArray
-    mount_position: FloatArray
-    camera_from_rig: FloatArray
-
-
-def values_of(estimate: Estimate) -> AdjustedValues:
-    """Return the values of an estimate as kinds of observations ask for them."""
-    cameras, mounts = estimate.cameras, estimate.mounts
-    parameters = np.full((len(cameras), max(len(camera.parameters) for camera in cameras)), np.nan)
-    for a, camera in enumerate(cameras):
-        parameters[a, : len(camera.parameters)] = camera.parameters
-    nowhere = np.zeros((len(cameras), 3)), np.tile(np.eye(3), (len(cameras), 1, 1))
-    position, rotation = nowhere if mounts is None else (mounts.position, mounts.rotation)
-    return AdjustedValues(
-        estimate.points,
-        estimate.position,
-        np.swapaxes(estimate.rotation, 1, 2),
-        parameters,
-        position,
-        np.swapaxes(rotation, 1, 2),
-    )
-
-
 def given_of(a: Adjustment, length_unit: str) -> Given:
     """Return everything that was given beside the image points and took part.
 
@@ -195,14 +165,17 @@ def given_of(a: Adjustment, length_unit: str) -> Given:
         if index in took_part:
             one = took_part[index]
             r[one.rows], w[one.rows] = one.redundancy_numbers, one.standardised
+        units = kind.units(a.estimate, length_unit)
+        turned = np.array([[unit == "rad" for unit in row] for row in units])
+        factor = np.where(turned, np.degrees(1.0), 1.0)
         part = GivenResiduals(
             kind=kind.single,
             coordinates=kind.components,
             names=kind.names(a.network, a.estimate),
-            units=kind.units(a.estimate, length_unit),
-            given=np.where(known, kind.values, np.nan),
-            difference=np.where(known, v, np.nan),
-            sigma=np.sqrt(np.where(known, variance, np.nan)),
+            units=tuple(tuple("deg" if unit == "rad" else unit for unit in row) for row in units),
+            given=np.where(known, factor * kind.values, np.nan),
+            difference=np.where(known, factor * v, np.nan),
+            sigma=factor * np.sqrt(np.where(known, variance, np.nan)),
             r=r,
             w=w,
         )
@@ -216,13 +189,11 @@ def given_of(a: Adjustment, length_unit: str) -> Given:
 
 
 def _centre_and_rotation(part: GivenResiduals) -> list[GivenResiduals]:
-    """Return exterior orientation as projection centres and as angles in degrees."""
-    degrees, found = float(np.degrees(1.0)), []
-    for kind, axes, units, factor in (
-        (CENTRE, slice(0, 3), tuple(units[:3] for units in part.units), 1.0),
-        (ROTATION, slice(3, 6), (("deg",) * 3,) * len(part.names), degrees),
-    ):
-        given, v, sigma = (factor * x[:, axes] for x in (part.given, part.difference, part.sigma))
+    """Return exterior orientation as projection centres and as angles."""
+    found = []
+    for kind, axes in ((CENTRE, slice(0, 3)), (ROTATION, slice(3, 6))):
+        units = tuple(row[axes] for row in part.units)
+        given, v, sigma = (x[:, axes] for x in (part.given, part.difference, part.sigma))
         r, w = part.r[:, axes], part.w[:, axes]
         found.append(GivenResiduals(kind, part.coordinates[axes], part.names, units, given, v, sigma, r, w))
     return found

@@ -69,6 +69,7 @@ from sfm.survey.inputs.settings import CameraSettings, DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
+from sfm.survey.observation_tables import unused_observations
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
@@ -150,7 +151,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
 def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
     """Return the cameras of which texture shows that c differs among their photographs."""
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
-    if survey.tie_points is None or not differs:
+    if survey.tie_points is None or survey.rigs or not differs:
         return frozenset()
     return frozenset(one.name for one in survey.cameras if not one.says_what_is_free)
 
@@ -590,4 +591,5 @@ def _remarks(
         *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
         *datum_remarks(survey, adjustment.network, adjustment.datum),
+        *unused_observations(survey, adjustment.network),
     )

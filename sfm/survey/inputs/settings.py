@@ -8,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from sfm.distortion.models import MODELS
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
+from sfm.observations import TABLES
 
 
 def _pairs(value: Any) -> Any:
@@ -35,6 +36,7 @@ MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
+MAX_TABLES = 100  # of survey observations
 MAX_RIGS, MAX_PATTERN = 100, 200  # rigs, and characters of the expression that finds a moment
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
@@ -236,6 +238,16 @@ class ObservationSettings(Section):
     """[observations]: measured image points in place of photographs."""
 
     file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
+
+
+class ObservationTableSettings(Section):
+    """[[survey_observations]]: a table of observations beside photographs, as of tape, level or GNSS."""
+
+    # distance: from,to,length,slength | height difference: from,to,dZ,sdZ | coordinate difference:
+    # from,to,dX,dY,dZ,sdX,sdY,sdZ | zenith angle: from,to,zenith_deg,szenith_deg | antenna position:
+    # image,lever_x,lever_y,lever_z,X,Y,Z,sX,sY,sZ
+    kind: Literal[tuple(TABLES)]  # type: ignore[valid-type]
+    file: Name  # a table with the columns of its kind
 
 
 class ApproximateSettings(Section):

@@ -31,7 +31,7 @@ from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.rigs import with_moments
+from sfm.survey.rigs import with_survey_data
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
 
@@ -90,7 +90,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
     )
-    network = with_moments(survey, network)
+    network = with_survey_data(survey, network)
     times = Counter(zip(image.tolist(), point.tolist(), strict=True)) if merged.dropped else Counter()
     contradicting = tuple(
         LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))

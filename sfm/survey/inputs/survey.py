@@ -55,6 +55,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
+from sfm.survey.observation_tables import ObservationTable, read_observation_table
 from sfm.targets.codes.families import TargetFamily, code_family, is_table
 from sfm.targets.codes.rings import CodeFamily
 
@@ -109,6 +110,7 @@ class Survey:
     rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
     mounts: tuple[ObservedExterior, ...] = ()  # of cameras of rigs, by their names, as far as they are given
     scale_bars: tuple[ScaleBar, ...] = ()
+    tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
@@ -259,6 +261,10 @@ def survey_of_file(file: SurveyFile) -> Survey:
             read_observed_exterior(file.beside(rig.mounts), of="camera")
             for rig in file.rigs
             if rig.mounts is not None
+        ),
+        tables=tuple(
+            read_observation_table(one.kind, file.beside(one.file), file.source)
+            for one in file.observation_tables
         ),
         scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
         observations=read(read_image_points, file.observations.file if file.observations else None),

@@ -16,6 +16,7 @@ from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
     MAX_RIGS,
+    MAX_TABLES,
     AdjustSettings,
     ApproximateSettings,
     CameraSettings,
@@ -25,6 +26,7 @@ from sfm.survey.inputs.settings import (
     ExteriorSettings,
     Head,
     ObservationSettings,
+    ObservationTableSettings,
     PlateSettings,
     RigSettings,
     ScaleBarSettings,
@@ -51,6 +53,10 @@ class SurveyFile(Section):
     rigs: Annotated[tuple[RigSettings, ...], Field(strict=False, max_length=MAX_RIGS, alias="rig")] = ()
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
     observations: ObservationSettings | None = None
+    observation_tables: Annotated[
+        tuple[ObservationTableSettings, ...],
+        Field(strict=False, max_length=MAX_TABLES, alias="survey_observations"),
+    ] = ()
     approximate: ApproximateSettings = ApproximateSettings()
     adjust: AdjustSettings = AdjustSettings()
     compare: CompareSettings = CompareSettings()
@@ -128,6 +134,7 @@ class SurveyFile(Section):
             self.targets.diameters,
         ]
         names += [rig.mounts for rig in self.rigs]
+        names += [table.file for table in self.observation_tables]
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]

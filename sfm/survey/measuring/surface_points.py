@@ -36,6 +36,7 @@ from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
+from sfm.survey.rigs import with_survey_data
 
 # Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
 # several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine
@@ -119,8 +120,8 @@ def cover_photographs(
         replace(found.image_points, covariance=covariance).select(order),
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
-        moment=network.moment,
     )
+    covering = with_survey_data(survey, covering)
     placed = replace(estimate, points=found.points)
     covering = _with_common_part(
         covering, placed, found.image_points.covariance[order], survey.adjust.sigma_px

@@ -341,13 +341,14 @@ def _refuse_contradictions_of_rigs(
                     f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
                 )
             owner[name] = rig.name
-            if known[name].per_photograph or known[name].groups:
-                raise SurveyFileError(
-                    f"{here}: camera {name} has parameters of single photographs or groups; needed one "
-                    "interior orientation for each camera of a rig"
-                )
         if rig.moment != "order":
             _refuse_pattern(rig.moment, here)
+    for camera in cameras if rigs else ():
+        if camera.per_photograph or camera.groups:
+            raise SurveyFileError(
+                f"{where}: camera {camera.name} has parameters of single photographs or groups; needed one "
+                "interior orientation for each camera of a survey with rigs"
+            )
     if len({rig.name for rig in rigs}) < len(rigs):
         raise SurveyFileError(f"{where}: two rigs have one name")
 

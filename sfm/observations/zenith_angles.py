@@ -1,0 +1,29 @@
+"""Zenith angles from one object point to another, as by theodolite; Z is up."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.observations.point_pairs import PointPairs
+
+
+class ZenithAngles(PointPairs):
+    """Angles between Z and the direction from one object point to another."""
+
+    name: ClassVar[str] = "zenith angles"
+    single: ClassVar[str] = "zenith angle"
+    components: ClassVar[tuple[str, ...]] = ("zenith",)
+    in_degrees: ClassVar[bool] = True
+
+    @classmethod
+    def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return atan2(h, dZ) with the horizontal distance h, and its derivatives."""
+        tiny = np.finfo(float).tiny
+        h = np.maximum(np.hypot(d[:, 0], d[:, 1]), tiny)
+        square = np.maximum(h**2 + d[:, 2] ** 2, tiny)
+        along = d[:, 2] / (square * h)
+        J = np.stack([along * d[:, 0], along * d[:, 1], -h / square], axis=1)
+        return np.arctan2(h, d[:, 2])[:, None], J[:, None]

@@ -1,0 +1,152 @@
+"""Survey observations from tables: distances, heights, coordinate differences, zeniths, antennas."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.variance_components import by_kind
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.errors import SurveyFileError
+from sfm.network import Estimate, Network, values_of
+from sfm.observations import TABLES
+from sfm.observations.kind import PHOTOGRAPH, TableKind
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.output import write_result
+from sfm.similarity import Similarity
+from sfm.survey.inputs.survey import read_survey
+from tests.survey.test_rigs import written
+from tests.synthetic import make_network, seed_of
+
+SIGMA = {"zenith angle": 1e-4}  # rad; of lengths 0.1 mm
+
+
+def observed(kind: str, truth: Estimate, rng: np.random.Generator, count: int = 12) -> TableKind:
+    """Return observations of a kind with noise."""
+    of, n = TABLES[kind], len(truth.points)
+    d, sigma = len(of.components), SIGMA.get(kind, 1e-4)
+    indices: tuple[IntArray, ...] = tuple(
+        np.array(column)
+        for column in zip(*(rng.choice(n, 2, replace=False) for _ in range(count)), strict=True)
+    )
+    lever = np.zeros((count, 0))
+    if of.texts == ("image",):
+        indices = (np.arange(len(truth.position))[:count],)
+        count = len(indices[0])
+        lever = rng.uniform(-0.2, 0.2, (count, 3))
+    empty = of.of_table(indices, np.hstack([lever, np.zeros((count, d))]), np.full((count, d), sigma))
+    exact = empty.linearise(values_of(truth)).difference
+    noise = sigma * rng.standard_normal(exact.shape)
+    return of.of_table(indices, np.hstack([lever, exact + noise]), np.full((count, d), sigma))
+
+
+def network_of(name: str, kinds: tuple[str, ...] = tuple(TABLES)) -> tuple[Network, Estimate]:
+    rng = seed_of(name)
+    network, truth = make_network(rng, images=8, points=25, free=())
+    return replace(network, observations=tuple(observed(kind, truth, rng) for kind in kinds)), truth
+
+
+@pytest.mark.parametrize("kind", list(TABLES))
+def test_derivatives_are_those_of_differences(kind: str) -> None:
+    network, truth = network_of("derivatives", (kind,))
+    (one,) = network.observations
+    linear, h = one.linearise(values_of(truth)), 1e-6
+    for (of, at), J in zip(one.blocks(), linear.J, strict=True):
+        for axis in range(J.shape[2]):
+
+            def moved(step: float, of: str = of, at: IntArray = at, axis: int = axis) -> FloatArray:
+                points, position, rotation = truth.points.copy(), truth.position.copy(), truth.rotation.copy()
+                if of == PHOTOGRAPH and axis >= 3:
+                    turn = rotation_from_vector(step * np.eye(3)[axis - 3])
+                    rotation[at] = rotation[at] @ turn
+                else:
+                    row = np.flatnonzero(np.isin(np.arange(len(points)), at[:1]))
+                    (position if of == PHOTOGRAPH else points)[row, axis] += step
+                return one.linearise(
+                    values_of(replace(truth, points=points, position=position, rotation=rotation))
+                ).difference
+
+            slope = (moved(h) - moved(-h)) / (2 * h)
+            assert slope[0] == pytest.approx(J[0, :, axis], abs=2e-8)
+
+
+def test_all_kinds_at_once_have_the_scatter_that_is_stated() -> None:
+    """30 networks: chi-square of a point and of v'Pv; redundancy numbers add up."""
+    sums, vPv, redundancy = 0.0, [], 0
+    for k in range(30):
+        network, truth = network_of(f"all kinds {k}")
+        a = adjust(network, truth, reject="none", datum=Datum("free"), sigma_px=0.1)
+        assert a.converged and a.defect == a.expected_defect == 0
+        kinds = by_kind(a)
+        assert kinds.names[1:] == tuple(TABLES[kind].name for kind in TABLES)
+        assert kinds.redundancy.sum() == pytest.approx(a.redundancy, rel=1e-6)
+        dX = a.estimate.points[3] - truth.points[3]
+        sums += dX @ np.linalg.solve(a.covariance.points[3] / a.sigma0**2, dX)
+        vPv.append(a.vPv)
+        redundancy = a.redundancy
+    assert stats.chi2.ppf(0.001, 90) < sums < stats.chi2.ppf(0.999, 90)
+    assert stats.kstest(vPv, stats.chi2(redundancy).cdf).pvalue > 0.001
+
+
+def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
+    """From a free network in any attitude; an unknown point is named, and a gross error shows."""
+    network, truth = network_of("levelled", ("height difference", "distance"))
+    rows = {}
+    for kind, one in zip(("height difference", "distance"), network.observations, strict=True):
+        cells = [
+            f"{network.points[i]},{network.points[j]},{float(value)!r},1e-4"
+            for i, j, (value,) in zip(one.start, one.end, one.value, strict=True)  # type: ignore[attr-defined]
+        ]
+        rows[kind] = [",".join(("from", "to", *TABLES[kind].columns())), *cells]
+    rows["distance"].append("1,elsewhere,1.0,1e-4")
+    lines = ""
+    for name, table in rows.items():
+        file = f"{name.split()[0]}.csv"
+        (tmp_path / file).write_text("\n".join(table), "utf-8")
+        lines += f'[[survey_observations]]\nkind = "{name}"\nfile = "{file}"\n\n'
+    result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
+    a = result.adjustment
+    assert a.converged and a.expected_defect == 4 and a.has_scale
+    order = [network.points.index(name) for name in a.network.points]
+    Z, known = a.estimate.points[:, 2], truth.points[order, 2]
+    assert Z - Z.mean() == pytest.approx(known - known.mean(), abs=1e-3)
+    found = findings_of(result)
+    (said,) = [one for one in found.verdict.remarks if one.kind == "observations_unused"]
+    assert said.names("observations") == ("distance 1 - elsewhere",)
+    write_result(found, tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["further_observations"]
+    assert {name: len(values) for name, values in stored.items()} == {"height difference": 12, "distance": 12}
+
+
+def test_start_values_in_any_attitude_come_to_the_observations() -> None:
+    from sfm.survey.adjusting.placing import place_on_observations
+
+    network, truth = network_of("attitude", ("height difference", "antenna position"))
+    turned = Similarity(0.3, rotation_from_vector(np.array([2.0, -1.0, 0.5])), np.array([5.0, 1.0, 2.0]))
+    placed = place_on_observations(network, turned.apply_estimate(truth))
+    assert placed.points == pytest.approx(truth.points, abs=1e-3)
+    assert place_on_observations(replace(network, observations=()), truth) is truth
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("from,to,length,slength\n1,1,1.0,1e-3\n", "distance from 1 to itself"),
+        ("from,to,length,slength\n1,2,1.0,0\n", "more than 0, the standard deviation"),
+        ("from,to,length\n1,2,1.0\n", "no column slength"),
+    ],
+)
+def test_wrong_tables_are_refused(text: str, said: str, tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("tables"), images=3, points=12, free=())
+    (tmp_path / "tape.csv").write_text(text, "utf-8")
+    lines = '[[survey_observations]]\nkind = "distance"\nfile = "tape.csv"\n'
+    with pytest.raises(SurveyFileError, match=said):
+        read_survey(written(tmp_path, network, truth, lines))
