@@ -8,7 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-TIMED := adjustment matching resection textured viewer_page wide_matching
+TIMED := adjustment matching resection stereo textured viewer_page wide_matching
 
 .PHONY: demo test docs study bench mutate setup clean
 
