@@ -74,7 +74,7 @@ def _differing(given: Given) -> Iterator[Remark]:
     The shift is that of the adjusted value itself, |w| sqrt((1 - r) / r), a coordinate or a length of the
     object. The orientation of a photograph is neither, so that none is given there.
     """
-    for kind in (given.control, given.bars):
+    for kind in (given.control, given.bars, *given.further):
         worst = _beyond_chance(kind) if kind else None
         if kind and worst:
             shift = abs(worst.w) * np.sqrt((1 - worst.r) / worst.r)

@@ -1,0 +1,67 @@
+"""A new kind of observation is one file and one row, from which everything else takes it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.variance_components import by_kind
+from sfm.conventions import FloatArray
+from sfm.observations import TABLES
+from sfm.observations.point_pairs import PointPairs
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.output import write_result
+from sfm.report.text.text_report import text_report
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.observation_tables import read_observation_table
+from tests.survey.test_rigs import written
+from tests.synthetic import make_network, seed_of
+
+
+class Slopes(PointPairs):  # the file
+    """Slopes between object points: dZ over the distance."""
+
+    name: ClassVar[str] = "slopes"
+    single: ClassVar[str] = "slope"
+    components: ClassVar[tuple[str, ...]] = ("slope",)
+
+    @classmethod
+    def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return dZ / |d|, and its derivatives."""
+        length = np.linalg.norm(d, axis=1, keepdims=True)
+        slope = d[:, 2:] / length
+        return slope, ((np.array([0.0, 0.0, 1.0]) - slope * d / length) / length)[:, None]
+
+
+def test_a_new_kind_is_one_file_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TABLES, "slope", Slopes)  # the row
+    rng = seed_of("new kind")
+    network, truth = make_network(rng, images=6, points=20, free=())
+    pairs = np.array([rng.choice(20, 2, replace=False) for _ in range(10)])
+    exact, _ = Slopes.computed(truth.points[pairs[:, 1]] - truth.points[pairs[:, 0]])
+    noisy = exact[:, 0] + 1e-4 * rng.standard_normal(10)
+    noisy[4] += 2e-3
+    cells = [f"{i + 1},{j + 1},{float(v)!r},1e-4" for (i, j), v in zip(pairs.tolist(), noisy, strict=True)]
+    (tmp_path / "slopes.csv").write_text("\n".join(["from,to,slope,sslope", *cells]), "utf-8")
+    survey = read_survey(written(tmp_path, network, truth, ""))
+    table = read_observation_table("slope", tmp_path / "slopes.csv", "survey.toml")
+    result = run_survey(replace(survey, tables=(table,), datum=Datum("free")))
+    a = result.adjustment
+    assert by_kind(a).names == ("image points", "slopes") and a.expected_defect == 5
+    found = findings_of(result)
+    (slopes,) = found.given.further
+    worst = slopes.worst
+    assert worst is not None and worst.name == "{} - {}".format(*(pairs[4] + 1)) and abs(worst.w) > 10
+    assert "slope" in text_report(found)
+    assert {"given_differs", "given_contradicted"} & {one.kind for one in found.verdict.remarks}
+    write_result(found, tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["further_observations"]
+    assert len(stored["slope"]) == 10
+    assert "Observations: slope" in (tmp_path / "out" / "report.html").read_text("utf-8")
