@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, IntArray
 from sfm.network import Estimate, Network
-from sfm.observations.kind import PHOTOGRAPH, POINT, Kind
+from sfm.observations.kind import Kind
 
 K = TypeVar("K", bound=Kind)
 
@@ -36,11 +36,7 @@ def reduce_network(
     )
 
     def kept(kind: K) -> K:
-        on = np.ones(len(kind), dtype=bool)
-        for of, at in kind.blocks():
-            if of in (POINT, PHOTOGRAPH):
-                on &= (points if of == POINT else images)[at]
-        return kind.select(on).renumbered(point_index, image_index)
+        return kind.keep(points, images).renumbered(point_index, image_index)
 
     reduced = replace(
         network,

@@ -181,7 +181,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     layout, state = unknowns_of(
         network, estimate, use_control=use_control, image_sigma_factor=adjustment.image_sigma_factor
     )
-    observed = observed_of(network, layout, use_control=use_control)
+    observed = observed_of(network, layout, state, use_control=use_control)
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
     optimum = optimum_at(problem_of(layout, observed, resolved), state, weight)
     if optimum is None:

@@ -132,7 +132,7 @@ def adjust(
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
-    observed = observed_of(local.network, layout, use_control=use_control)
+    observed = observed_of(local.network, layout, state, use_control=use_control)
     problem = problem_of(layout, observed, local.datum)
     run = Run(problem, method, max_iterations, tolerance, exact=covariance or reject == "tau")
     with own_threads():
@@ -173,7 +173,7 @@ def predict(
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
-    observed = observed_of(local.network, layout, use_control=use_control)
+    observed = observed_of(local.network, layout, state, use_control=use_control)
     run = Run(problem_of(layout, observed, local.datum), METHODS[0], 0, TOLERANCE, exact=True)
     weight = layout.active.astype(float)
     with own_threads():

@@ -10,7 +10,13 @@ from sfm.observations.antenna_positions import AntennaPositions
 from sfm.observations.coordinate_differences import CoordinateDifferences
 from sfm.observations.distances import Distances
 from sfm.observations.height_differences import HeightDifferences
+from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import TableKind
+from sfm.observations.level_groups import LevelGroups
+from sfm.observations.lines import Lines
+from sfm.observations.planes import Planes
+from sfm.observations.plumb_lines import PlumbLines
+from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.zenith_angles import ZenithAngles
 
 TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
@@ -19,4 +25,10 @@ TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
     "coordinate difference": CoordinateDifferences,
     "zenith angle": ZenithAngles,
     "antenna position": AntennaPositions,
+    "horizontal direction": HorizontalDirections,
+    "plane": Planes,
+    "line": Lines,
+    "plumb line": PlumbLines,
+    "level": LevelGroups,
+    "rigid frame": RigidFrames,
 }

@@ -69,6 +69,7 @@ class Kind(ABC):
     name: ClassVar[str]  # "scale bars"
     single: ClassVar[str]  # "scale bar"
     components: ClassVar[tuple[str, ...]]  # names of the d components
+    needs_scale: ClassVar[bool] = False  # whether they mean nothing where the scale of the network is open
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -101,6 +102,30 @@ class Kind(ABC):
     @abstractmethod
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the observations."""
+
+    def met(self, values: Values) -> FloatArray:
+        """Return object points that meet the observations, near those of values, (n, 3).
+
+        What a motion of the network does to observations is asked there: offsets of nothing from a line would
+        have its errors determine the scale.
+        """
+        return values.points
+
+    def own_cofactor(self, values: Values) -> FloatArray | None:
+        """Return what parameters of their own take of the cofactors, (n, d, d); None without such."""
+        return None
+
+    def labels(self, network: Network) -> tuple[str, ...]:
+        """Return what the components are called in tables, (d,)."""
+        return self.components
+
+    def keep(self, points: BoolArray, images: BoolArray) -> Self:
+        """Return the observations of some points (n,) and photographs (m,) alone."""
+        on = np.ones(len(self), dtype=bool)
+        for of, at in self.blocks():
+            if of in (POINT, PHOTOGRAPH):
+                on &= (points if of == POINT else images)[at]
+        return self.select(on)
 
     def weight_of_all(self) -> FloatArray | None:
         """Return the weight matrix of all components, (n d, n d); None where it is block diagonal."""

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, read_table
 from sfm.network import Network
 from sfm.observations import TABLES
+from sfm.observations.groups import Group
 from sfm.observations.kind import TableKind
 from sfm.remarks.remark import Remark, remark
 
@@ -57,7 +59,7 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     of = TABLES[kind]
     columns = of.columns()
     table = read_table(path, of.texts, columns)
-    d = len(of.components)
+    d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
     if len(of.texts) > 1:
@@ -68,7 +70,7 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
                 )
     unit = np.pi / 180 if of.in_degrees else 1.0
     value = table.values[:, :-d].copy()
-    value[:, -d:] *= unit
+    value[:, len(of.numbers) :] *= unit
     return ObservationTable(kind, value, unit * sigma, table)
 
 
@@ -81,11 +83,28 @@ def with_tables(survey: Survey, network: Network) -> Network:
             continue
         rows = np.flatnonzero(known)
         number = {name: k for k, name in enumerate(_names(one, network))}
+        if issubclass(one.of, Group):
+            added += _groups(one, rows, number)
+            continue
         indices = tuple(
             np.array([number[column[row]] for row in rows], dtype=np.int64) for column in one.table.texts
         )
         added.append(one.of.of_table(indices, one.value[rows], one.sigma[rows]))
     return replace(network, observations=(*network.observations, *added)) if added else network
+
+
+def _groups(one: ObservationTable, rows: IntArray, number: Mapping[str, int]) -> list[TableKind]:
+    """Return the groups of a table that have enough points in a network, of rows with a point in it."""
+    names, points = one.table.texts
+    found: list[TableKind] = []
+    for name in dict.fromkeys(names[row] for row in rows):
+        own = np.array([row for row in rows if names[row] == name], dtype=np.int64)
+        point = np.array([number[points[row]] for row in own], dtype=np.int64)
+        assert issubclass(one.of, Group)
+        group = one.of.of_group(name, point, one.value[own], one.sigma[own], number)
+        if len(group):
+            found.append(group)
+    return found
 
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
@@ -103,7 +122,8 @@ def _names(one: ObservationTable, network: Network) -> tuple[str, ...]:
     return network.images if one.of.texts == ("image",) else network.points
 
 
-def _known(one: ObservationTable, network: Network) -> list[np.ndarray]:
+def _known(one: ObservationTable, network: Network) -> list[BoolArray]:
     """Return which names of each column are in a network, (n,) each."""
     names = set(_names(one, network))
-    return [np.array([name in names for name in column], dtype=bool) for column in one.table.texts]
+    columns = one.table.texts[1:] if one.of.texts[0] == "group" else one.table.texts
+    return [np.array([name in names for name in column], dtype=bool) for column in columns]

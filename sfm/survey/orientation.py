@@ -58,7 +58,8 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     refuse_too_large(measured.network)
     if survey.tie_points is not None:
         refuse_no_base(measured.network, measured.cameras)
-    network = replace(measured.network, scale_bars=ScaleBars())  # they are judged by the adjustment first
+    # they are judged by the adjustment first
+    network = replace(measured.network, scale_bars=ScaleBars(), observations=())
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None
 
@@ -98,7 +99,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         found = tell_second_objects(found, find_second_objects(network, found, _orient))
     estimate = mount_cameras(survey, network, found.estimate)
     if survey.datum.kind != "control":
-        estimate = place_on_observations(network, estimate)
+        estimate = place_on_observations(measured.network, estimate)
     found = replace(found, estimate=estimate)
     return tell_lost_photographs(network, found, named=survey.tie_points is None)
 

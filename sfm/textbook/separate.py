@@ -70,7 +70,7 @@ def adjust_separately(
     Source: Nocedal and Wright, Numerical Optimization (2006), sec. 9.3 (block coordinate descent).
     """
     layout, state = unknowns_of(network, estimate, use_control=True)
-    observed = observed_of(network, layout, use_control=True)
+    observed = observed_of(network, layout, state, use_control=True)
     if observed:
         raise GeometryError(
             "separate adjustment: the network has scale bars or other observations, expected image points "

@@ -131,7 +131,7 @@ def test_normal_equations_equal_those_of_differences() -> None:
             for f in (-2, -1, 1, 2)
         ]
         J[:, s] = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * h)
-    observed = observed_of(network, layout, use_control=True)
+    observed = observed_of(network, layout, state, use_control=True)
     weight = start_weights(layout, state)
     equations = normal_equations(layout, observed, state, weight)
     N = 100 * J.T @ J
@@ -279,7 +279,7 @@ def test_tables_of_groups_are_as_long_as_the_parameters() -> None:
 
 def gradient(network: Network, estimate: Estimate) -> FloatArray:
     layout, state = unknowns_of(network, estimate, use_control=False)
-    observed = observed_of(network, layout, use_control=False)
+    observed = observed_of(network, layout, state, use_control=False)
     return normal_equations(layout, observed, state, start_weights(layout, state)).parts.g
 
 

@@ -37,7 +37,7 @@ def pair_by_pair(layout: Unknowns) -> DenseSolver:
 def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, float]:
     """Return the memory at the peak of factor and inverse, results apart, bytes, and what the solver says."""
     layout, state = unknowns_of(network, estimate, use_control=False)
-    observed = observed_of(network, layout, use_control=False)
+    observed = observed_of(network, layout, state, use_control=False)
     solver = way(layout)  # type: ignore[operator]
     equations = normal_equations(
         layout, observed, state, layout.active.astype(float), space=new_space(layout)

@@ -105,7 +105,7 @@ def test_photographs_with_too_few_points_beside_two_networks_are_found_by_fronts
     """A test has left three photographs one point or two; more null vectors than are looked for at first."""
     network, start = together(halves("few", free))
     layout, state = unknowns_of(network, start, use_control=False)
-    observed = observed_of(network, layout, use_control=False)
+    observed = observed_of(network, layout, state, use_control=False)
     image, rays = layout.observations.image, np.diff(layout.observations.start)
     weight = np.ones(len(image))
     poor = np.array([3, 20, 50])

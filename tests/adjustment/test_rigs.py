@@ -48,7 +48,9 @@ def test_right_side_is_the_gradient_by_all_unknowns() -> None:
         v = residuals(layout.observations, step(layout, state, reduced, points))
         return float((v**2).sum() / 0.1**2)
 
-    equations = normal_equations(layout, observed_of(network, layout, use_control=False), state, weight)
+    equations = normal_equations(
+        layout, observed_of(network, layout, state, use_control=False), state, weight
+    )
     b = equations.blocks
     g = equations.parts.g + b.Yy
     none, h = np.zeros((len(truth.points), 3)), 1e-6

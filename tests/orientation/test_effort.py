@@ -134,7 +134,7 @@ def test_control_takes_memory_in_proportion_to_its_points() -> None:
     network = replace(network, control=control)
     datum = Datum("control")
     layout, state = unknowns_of(network, truth, use_control=True)
-    observed = observed_of(network, layout, use_control=True)
+    observed = observed_of(network, layout, state, use_control=True)
     resolved = datum.resolve(network)
     motions_of(layout, observed, state, resolved)
     peak = _peak_mib(lambda: motions_of(layout, observed, state, resolved))

@@ -26,6 +26,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.options import kernel
 
 TINY = float(np.finfo(float).tiny)
+SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 but for rounding
 DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 
 
@@ -99,6 +100,12 @@ def motions_of(
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
+    of_scale = [one.kind.name for one in observed if one.kind.needs_scale]
+    if of_scale and np.abs(open_motions[6]).max(initial=0.0) > SCALE_OPEN:
+        raise GeometryError(
+            f"{of_scale[0]}: nothing gives the network a scale, in which their standard deviations are; "
+            "add a scale bar, distances or control"
+        )
     if len(seen) or not layout.all_free:
         H = H @ open_motions * layout.reduced_free()[:, None]
         points = points @ open_motions * layout.point_free[:, :, None]
@@ -136,10 +143,7 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     and scale are about the centre of the network, the latter two over its size, so that all seven are of the
     same order.
     """
-    cloud = state.points[layout.point_on]
-    centre = cloud.sum(axis=0) / len(cloud)
-    # root mean square distance from the centre, as `mean_distance`
-    size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
+    centre, size = _extent(layout, state)
     poses, points = np.zeros((len(state.rig_from_object), 6, 7)), np.zeros((len(state.points), 3, 7))
     _fill_motions(state.pose_position, centre, size, poses)
     _fill_motions(state.points, centre, size, points)
@@ -147,6 +151,14 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     mounts = np.zeros((len(state.camera_from_rig), 6, 7))
     mounts[:, :3, 6] = state.mount_position / size
     return poses, mounts, points
+
+
+def _extent(layout: Unknowns, state: State) -> tuple[FloatArray, float]:
+    """Return centre and size of the points that take part."""
+    cloud = state.points[layout.point_on]
+    centre = cloud.sum(axis=0) / len(cloud)
+    # root mean square distance from the centre, as `mean_distance`
+    return centre, max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
 
 
 @kernel
@@ -216,6 +228,12 @@ def _seen_by_datum(
             moved = J @ points[point]
         else:
             columns, J, _ = reduced_rows(one, layout, state)
-            moved = J @ H[columns]
+            met = one.kind.met(state)
+            at = H
+            if met is not state.points:
+                at, kept = H.copy(), np.zeros((len(layout.kept), 3, 7))
+                _fill_motions(met[layout.kept], *_extent(layout, state), kept)
+                at[layout.kept_start :] = kept.reshape(-1, 7)
+            moved = J @ at[columns]
         rows.append(moved[np.diagonal(one.weight, axis1=1, axis2=2) > 0])
     return np.concatenate([row.reshape(-1, 7) for row in rows])

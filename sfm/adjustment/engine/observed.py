@@ -40,10 +40,12 @@ class Observed:
         """Which components were observed, (n, d)."""
         return np.reshape(np.diagonal(self.weight, axis1=1, axis2=2) > 0, (len(self.kind), -1))
 
+    own: int = 0  # parameters of their own, which are not among the unknowns
+
     @property
     def count(self) -> int:
-        """How many scalar observations these are."""
-        return int(self.components.sum())
+        """How many scalar observations these are, less parameters of their own."""
+        return int(self.components.sum()) - self.own
 
     @property
     def point(self) -> IntArray | None:
@@ -65,7 +67,9 @@ class Reduced(NamedTuple):
     l: FloatArray  # computed minus observed, (n, d)
 
 
-def observed_of(network: Network, layout: Unknowns, *, use_control: bool) -> tuple[Observed, ...]:
+def observed_of(
+    network: Network, layout: Unknowns, state: State, *, use_control: bool
+) -> tuple[Observed, ...]:
     """Return the observations of a network beside its image points that take part in its adjustment."""
     found = []
     for index, kind in enumerate(network.kinds):
@@ -78,7 +82,9 @@ def observed_of(network: Network, layout: Unknowns, *, use_control: bool) -> tup
         together = some.weight_of_all()
         weight = inverse_of_observed(some.covariances()) if together is None else together[None]
         if weight.any():
-            found.append(Observed(index, some, rows, weight))
+            taken = some.own_cofactor(state)
+            own = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
+            found.append(Observed(index, some, rows, weight, own))
     return tuple(found)
 
 

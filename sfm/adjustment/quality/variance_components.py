@@ -97,13 +97,16 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     a, network = adjustment, adjustment.network
     whole = np.zeros(len(a.rejected), dtype=np.int64)
     image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
-    own = np.array([kind.redundancy for kind in a.observed])
-    sigma0 = _root_ratio(np.array([kind.vPv for kind in a.observed]), own, FEW_OF_A_KIND)
+    found: dict[str, FloatArray] = {}
+    for one in a.observed:
+        name = network.kinds[one.index].name
+        found[name] = found.get(name, np.zeros(3)) + np.array([one.vPv, one.redundancy, one.count])
+    vPv, own, count = np.array(list(found.values())).reshape(-1, 3).T
     return VarianceComponents(
-        (IMAGE_POINTS, *(network.kinds[kind.index].name for kind in a.observed)),
-        np.concatenate([image.sigma0, sigma0]),
+        (IMAGE_POINTS, *found),
+        np.concatenate([image.sigma0, _root_ratio(vPv, own, FEW_OF_A_KIND)]),
         np.concatenate([image.redundancy, own]),
-        np.concatenate([image.count, np.array([kind.count for kind in a.observed], dtype=np.int64)]),
+        np.concatenate([image.count, count.astype(np.int64)]),
     )
 
 

@@ -170,7 +170,7 @@ def given_of(a: Adjustment, length_unit: str) -> Given:
         factor = np.where(turned, np.degrees(1.0), 1.0)
         part = GivenResiduals(
             kind=kind.single,
-            coordinates=kind.components,
+            coordinates=kind.labels(a.network),
             names=kind.names(a.network, a.estimate),
             units=tuple(tuple("deg" if unit == "rad" else unit for unit in row) for row in units),
             given=np.where(known, factor * kind.values, np.nan),

@@ -263,7 +263,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     frame = given_values(survey, network) if matched.given else None
     chosen = choose_free_parameters(
-        survey, replace(network, scale_bars=ScaleBars()), estimate, datum=datum.kind
+        survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum.kind
     )
     cameras = tuple(_with_own_c(one) if one.name in varying else one for one in chosen.cameras)
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
@@ -316,7 +316,7 @@ def _free_network(start: _Prepared) -> _Free | None:
     if _has_no_identity(task.survey):
         return None
     report_step("adjusting the image points alone")
-    network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations())
+    network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=())
     task = replace(task, network=network)
     if task.datum.kind == "control":
         free = replace(task.survey, datum=DatumSettings(kind="free"))
@@ -349,6 +349,7 @@ def _judged(
             control=network.control,
             scale_bars=network.scale_bars,
             exterior=network.exterior,
+            observations=network.observations,
         )
     if _has_no_identity(task.survey):
         return task, JudgedGiven(network, task.datum)
@@ -399,7 +400,8 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
         accepted = settled.accepted
         estimate = merge_estimate(estimate, settled.estimate, settled.images, settled.points)
         estimate = _completed(start.estimate, estimate, task, given)
-        if task.datum.kind != "control" and not len(task.network.scale_bars):
+        beside = len(task.network.scale_bars) + len(task.network.observations)
+        if task.datum.kind != "control" and not beside:
             ready = _with_given(settled, task.network)
     estimate = scale_to_bars(task.network, estimate, task.datum)
     if task.datum.kind == "control":

@@ -1,0 +1,142 @@
+"""Observations of a group of points that have parameters of their own: planes, lines, frames, directions.
+
+The parameters of a group are found anew from its points whenever the observations are linearised, and do not
+appear among the unknowns: with their derivatives H and the weight W, the derivatives by the points are
+(I - H (H'W H)^-1 H'W) Jx, which leaves minimum and covariance as they are with the parameters among them.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.6 (elimination of groups of
+parameters); Golub and Pereyra (1973), SIAM J. Numer. Anal. 10(2) (variable projection).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.observations.kind import POINT, Block, Linear, TableKind, Values
+
+if TYPE_CHECKING:
+    from sfm.network import Estimate, Network
+
+
+class Fit(NamedTuple):
+    """A group at some values of its points, its own parameters fitted."""
+
+    difference: FloatArray  # computed minus observed, (r, c)
+    Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
+    H: FloatArray  # derivatives by the own parameters, (r, c, h)
+
+
+@dataclass(frozen=True)
+class Group(TableKind):
+    """Observations of one group: r of them, of c components each, by p points."""
+
+    texts: ClassVar[tuple[str, ...]] = ("group", "point")
+    least: ClassVar[int]  # points that a group needs to say anything
+
+    group: str
+    point: IntArray  # indices of the points, (p,)
+    value: FloatArray  # one row for each observation, (r, c)
+    sigma: FloatArray  # (r, c)
+
+    @abstractmethod
+    def fit(self, X: FloatArray) -> Fit:
+        """Return the observations at coordinates of the points, (p, 3)."""
+
+    def __len__(self) -> int:
+        return int(len(self.point) >= self.least)
+
+    @property
+    def weights(self) -> FloatArray:
+        """Inverse variances of all components, (r c,)."""
+        return 1 / self.sigma.ravel() ** 2
+
+    def covariances(self) -> FloatArray:
+        """Return that of all components together, (1, r c, r c)."""
+        return np.diag(self.sigma.ravel() ** 2)[None][: len(self)]
+
+    @property
+    def values(self) -> FloatArray:
+        """What was observed, (1, r c)."""
+        return self.value.reshape(1, -1)[: len(self)]
+
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the points, each a block."""
+        return tuple(Block(POINT, self.point[k : k + 1][: len(self)]) for k in range(len(self.point)))
+
+    def linearise(self, values: Values) -> Linear:
+        """Return computed minus observed and the derivatives, the own parameters fitted."""
+        fit = self.fit(values.points[self.point])
+        d = fit.difference.size
+        Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
+        HW = H.T * self.weights
+        flat = Jx.reshape(d, -1)
+        Jx = (flat - H @ (np.linalg.pinv(HW @ H, hermitian=True) @ (HW @ flat))).reshape(Jx.shape)
+        return Linear(fit.difference.reshape(1, d), tuple(Jx[None, :, k] for k in range(Jx.shape[1])))
+
+    def own_cofactor(self, values: Values) -> FloatArray:
+        """Return H (H'W H)^-1 H', what the own parameters take of the redundancy, (1, r c, r c)."""
+        H = self.fit(values.points[self.point]).H.reshape(self.sigma.size, -1)
+        inverse = np.linalg.pinv(H.T @ (self.weights[:, None] * H), hermitian=True)
+        return np.asarray(H @ inverse @ H.T)[None]
+
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the name of the group."""
+        return (self.group,)[: len(self)]
+
+    def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
+        """Return the unit of each component."""
+        unit = "rad" if self.in_degrees else length_unit
+        return ((unit,) * self.sigma.size,)[: len(self)]
+
+    def labels(self, network: Network) -> tuple[str, ...]:
+        """Return what each component of the group is called, (r c,)."""
+        several = len(self.components) > 1
+        return tuple(
+            f"{network.points[j]}{f' {part}' if several else ''}"
+            for j in self.point[-len(self.value) :]
+            for part in self.components
+        )
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """Return the group, or nothing of it."""
+        if np.asarray(rows).size and (np.asarray(rows).dtype != bool or np.asarray(rows).any()):
+            return self
+        return replace(self, point=self.point[:0], value=self.value[:0], sigma=self.sigma[:0])
+
+    def keep(self, points: BoolArray, images: BoolArray) -> Self:
+        """Return the group with some points alone; nothing where too few are left."""
+        on = points[self.point]
+        rows = on[-len(self.value) :] if len(self.value) else on
+        if not on[: len(on) - len(rows)].all():  # a station
+            rows = np.zeros(len(rows), dtype=bool)
+        return replace(self, point=self.point[on], value=self.value[rows], sigma=self.sigma[rows])
+
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return the group with its points at other places."""
+        return replace(self, point=points[self.point])
+
+    @classmethod
+    def of_group(
+        cls, group: str, point: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
+    ) -> Self:
+        """Return the observations of one group of a table, its rows in order.
+
+        Args:
+            group: its name.
+            point: index of the point of each row, (r,).
+            value: object unit or rad, (r, c).
+            sigma: standard deviations, (r, c).
+            number: of each point of the network, by name.
+        """
+        return cls(group, point, value, sigma)
+
+    @classmethod
+    def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
+        """Groups are made one by one, see `of_group`."""
+        raise NotImplementedError

@@ -1,0 +1,52 @@
+"""Points that are rigid to one another: bars of several targets, scale crosses, probes, frames."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from sfm.conventions import FloatArray, rotation_from_vector, skew
+from sfm.observations.groups import Fit, Group
+
+
+class RigidFrames(Group):
+    """Coordinates of points in a system of their own, known up to a motion of it."""
+
+    name: ClassVar[str] = "rigid frames"
+    single: ClassVar[str] = "rigid frame"
+    components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
+    least: ClassVar[int] = 2
+
+    def fit(self, X: FloatArray) -> Fit:
+        """Return R'(X - t) - observed of the best motion R, t; H by it."""
+        W = self.weights.reshape(-1, 3)
+        R, t = _motion(self.value, X, W.mean(axis=1))
+        for _ in range(5):  # to the weights of single coordinates
+            local = (X - t) @ R
+            H = self._by_motion(local)
+            root = np.sqrt(W)
+            rows, l = root.reshape(-1, 1) * H.reshape(-1, 6), (root * (local - self.value)).ravel()
+            step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-12)[0], dtype=float)
+            t = t + R @ step[:3]
+            R = R @ rotation_from_vector(step[3:])
+        local = (X - t) @ R
+        Jx = np.zeros((len(X), 3, len(X), 3))
+        Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
+        return Fit(local - self.value, Jx, self._by_motion(local))
+
+    @staticmethod
+    def _by_motion(local: FloatArray) -> FloatArray:
+        """Return the derivatives of R'(X - t) by a shift and a turn in the system of the frame, (p, 3, 6)."""
+        H = np.zeros((len(local), 3, 6))
+        H[:, :, :3] = -np.eye(3)
+        H[:, :, 3:] = skew(local)
+        return H
+
+
+def _motion(source: FloatArray, target: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return R, t with target near R source + t, by weighted least squares."""
+    a, b = ((x * w[:, None]).sum(axis=0) / w.sum() for x in (source, target))
+    U, _, Vt = np.linalg.svd((target - b).T @ ((source - a) * w[:, None]))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R, b - R @ a
