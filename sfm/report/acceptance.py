@@ -1,94 +1,79 @@
-"""An acceptance test as table, JSON and page."""
+"""The page of an acceptance test."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
-from sfm.files.plain_text import csv_text, or_none
 from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.measurements import length_error_figure
 from sfm.report.figures.plots import plot
-from sfm.report.html.page import render
-from sfm.report.page_files import write_files
+from sfm.report.numbers import general, signed, significant
+from sfm.report.page import Column, Note, Page, Section, Table, facts
 
-COLUMNS = (
-    "line",
-    "from",
-    "to",
-    "length",
-    "sigma",
-    "measured",
-    "sigma_measured",
-    "error",
-    "limit",
-    "decision",
-)
-FILES = ("lengths.csv", "acceptance.json", "acceptance.html")
 PICTURE = (
     "Error of length measurement over length: bars are the expanded uncertainty of the calibration, lines "
     "the limit A + K L, at most B."
 )
 
 
-def write_acceptance(found: Acceptance, out: Path) -> Path:
-    """Write an acceptance test into a folder and return the path of its page.
-
-    Args:
-        found: the test.
-        out: the folder.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
-    """
-    text = json.dumps(acceptance_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
-    verdict = found.verdict
-    page = render(
-        "acceptance.html",
-        t=found,
-        title=found.name,
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        rows=acceptance_rows(found),
-        decisions=DECISIONS,
-        picture=plot("errors", PICTURE, length_error_figure(found)),
+def page(found: Acceptance) -> Page:
+    """Return the page: limit, decisions, and every length."""
+    a, lengths, u = found, found.lengths, found.unit
+    most = f", at most B = {significant(a.b)} {u}" if np.isfinite(a.b) else ""
+    limit = f"A + K L with A = {significant(a.a)} {u}, K = {general(a.k, 4)}{most}"
+    lines = len(set(lengths.line))
+    figures = facts(
+        [
+            ("Limit", limit),
+            ("Lengths", f"{len(a.error)} on {lines} lines"),
+            ("Largest error", f"{significant(a.largest)} {u}"),
+            *((one.capitalize(), f"{a.count(one)} lengths") for one in DECISIONS if a.count(one)),
+            ("Body diagonal", f"{general(a.diagonal, 6)} {u}"),
+        ]
     )
-    texts = (csv_text(COLUMNS, acceptance_rows(found)), text + "\n", page)
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
-
-
-def acceptance_rows(found: Acceptance) -> list[tuple[object, ...]]:
-    """Return the rows of lengths.csv."""
-    one = found.lengths
-    measured = one.length + found.error
-    return list(
-        zip(
-            *(one.line, one.start, one.end, one.length, one.sigma, measured, found.sigma, found.error),
-            *(found.limit, found.decision),
-            strict=True,
-        )
+    note = Note(
+        "Error of a length measurement: measured minus calibrated length. ISO 14253-1 with U = "
+        f"{general(a.coverage, 3)} sigma of the calibration: in and out are proven, undecided is what lies "
+        "within U of the limit. The scale of the result comes from other bars."
     )
-
-
-def acceptance_summary(found: Acceptance) -> dict[str, Any]:
-    """Return what acceptance.json holds: plain values only, None for what is not known."""
-    verdict = found.verdict
-    return {
+    columns = (
+        *(Column(name, name) for name in ("line", "from", "to")),
+        Column("calibrated", "length", u, ".9g"),
+        Column("sigma", "sigma", u, significant),
+        Column("measured", "measured", u, ".9g"),
+        Column("sigma", "sigma_measured", u, significant),
+        Column("error", "error", u, signed),
+        Column("limit", "limit", u, significant),
+        Column("decision", "decision"),
+    )
+    rows = zip(
+        *(lengths.line, lengths.start, lengths.end, lengths.length, lengths.sigma, lengths.length + a.error),
+        *(a.sigma, a.error, a.limit, a.decision),
+        strict=True,
+    )
+    summary = {
         "test": "VDI/VDE 2634 part 1",
-        "result": found.name,
-        "length_unit": found.unit,
-        **verdict.as_dict(),
-        "limit": {"A": found.a, "K": found.k, "B": or_none(found.b)},
-        "coverage": found.coverage,
-        "lines": len(set(found.lengths.line)),
-        "lengths": len(found.error),
-        **{one.replace(" ", "_"): found.count(one) for one in DECISIONS},
-        "largest_error": found.largest,
-        "rms_error": float(np.sqrt((found.error**2).mean())),
-        "body_diagonal": found.diagonal,
+        "result": a.name,
+        "length_unit": u,
+        **a.verdict.as_dict(),
+        "limit": {"A": a.a, "K": a.k, "B": a.b},
+        "coverage": a.coverage,
+        "lines": lines,
+        "lengths": len(a.error),
+        **{one.replace(" ", "_"): a.count(one) for one in DECISIONS},
+        "largest_error": a.largest,
+        "rms_error": float(np.sqrt((a.error**2).mean())),
+        "body_diagonal": a.diagonal,
     }
+    return Page(
+        "acceptance",
+        "Acceptance test, VDI/VDE 2634 part 1",
+        a.name,
+        a.verdict,
+        (
+            Section("Figures", (figures, note, plot("errors", PICTURE, length_error_figure(found)))),
+            Section("Lengths", (Table(columns, list(rows), "lengths"),)),
+        ),
+        summary=summary,
+    )

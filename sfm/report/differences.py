@@ -1,69 +1,151 @@
-"""The comparison of two results as differences.csv, comparison.json and comparison.html."""
+"""The page of the comparison of two results."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm.comparison.findings import verdict_of_comparison
-from sfm.comparison.significance import ResultComparison
+from sfm.comparison.significance import InteriorDifference, ResultComparison
 from sfm.conventions import FloatArray
 from sfm.display import counted
-from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
-from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
-from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, significant
-from sfm.report.page_files import write_files
+from sfm.report.numbers import finer_unit, fixed, significant
+from sfm.report.page import Column, Folded, Note, Page, Part, Section, Table, axes
 
-COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
-FILES = ("differences.csv", "comparison.json", "comparison.html")
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
     "the dots is the difference out of the plane."
 )
+VALUES = (Column(), Column("value", format=str), Column("unit"))
 
 
-def write_differences(found: ResultComparison, xyz: FloatArray, out: Path) -> Path:
-    """Write a comparison into a folder and return the path of its page.
+def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
+    """Return the page: verdict, figures, picture and tables.
 
     Args:
         found: the comparison.
         xyz: coordinates of the common points in the first result, object unit, (n, 3).
-        out: the folder.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
     """
+    first, second = found.names
+    known = [name for name, has in zip(found.names, found.has_sigma, strict=True) if has]
+    tested = int(np.isfinite(found.statistic).sum())
+    one_sided = len(known) == 1 and tested
+    note = Note("The other result has none, and counts as free of error in the test.") if one_sided else None
+    picture = None
+    if len(found.points) >= 3 and _longest(found.point_difference) > 0:
+        figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
+        picture = Section("Picture", (plot("differences", PICTURE, figure),))
+    columns = (
+        Column("point", "id"),
+        *axes("d", found.unit),
+        *axes("sd", found.unit),
+        Column("T", "T", format=significant),
+        Column("significant", "significant"),
+    )
     rows = [
-        (name, *d, *s, t, int(flag))
+        (name, *d, *s, t, flag)
         for name, d, s, t, flag in zip(
-            found.points,
-            found.point_difference,
-            found.point_sigma,
-            found.statistic,
-            found.significant,
+            *(found.points, found.point_difference, found.point_sigma, found.statistic, found.significant),
             strict=True,
         )
     ]
-    text = json.dumps(differences_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
-    texts = (csv_text(COLUMNS, rows), text + "\n", differences_page(found, xyz))
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
+    return Page(
+        "comparison",
+        "Comparison",
+        f"{second} minus {first}",
+        verdict_of_comparison(found),
+        (
+            Section("Figures", (_figures(found, known), note)),
+            Section("Test", _test(found, tested)) if tested else None,
+            picture,
+            *(Section(f"Camera {one.camera}", _camera(one, second)) for one in found.interior),
+            Section(
+                "Points",
+                (Folded(counted(len(rows), "point"), (Table(columns, rows, "differences"),)),),
+            ),
+        ),
+        summary=_summary(found, tested),
+    )
 
 
-def differences_summary(found: ResultComparison) -> dict[str, Any]:
-    """Return what comparison.json holds: plain values only, None for what is not known."""
+def _figures(found: ResultComparison, known: list[str]) -> Table:
+    """Return how the results were brought together, and how far they are apart."""
+
+    def length(name: str, value: float) -> tuple[str, str, str]:
+        factor, unit = finer_unit(found.unit, value)
+        return name, significant(value * factor), unit or "object units"
+
+    aligned = {
+        "points": counted(len(found.points), "common point"),
+        "cameras": counted(len(found.images), "projection centre"),
+        "control": "control points",
+        "none": "nothing: both as they are",
+    }[found.alignment]
+    rows = (
+        ("aligned by", aligned, ""),
+        ("scale", words_of_scale(found), ""),
+        ("common points", words_of_pairing(found), ""),
+        length("RMS difference of a point coordinate", _rms(found.point_difference)),
+        length("largest difference of a point", _longest(found.point_difference)),
+        ("common photographs", len(found.images), ""),
+        length("RMS difference of a projection centre's coordinate", _rms(found.position_difference)),
+        ("largest difference of a rotation", significant(_largest(found.rotation_deg)), "deg"),
+        ("standard deviations known of", " and ".join(known) or "neither", ""),
+    )
+    return Table(VALUES, rows)
+
+
+def _test(found: ResultComparison, tested: int) -> tuple[Part, ...]:
+    largest = _largest(found.statistic[np.isfinite(found.statistic)])
+    moved = f"{found.significant.sum()} of {tested}" if found.majority else "not known"
+    columns = (Column(), *(Column(name, format=significant) for name in ("value", "critical value")))
+    rows = (
+        ("all points together", found.global_statistic, found.global_critical),
+        ("largest of a single point", largest, found.critical),
+        ("points that moved", moved, ""),
+    )
+    datum = "the points that did not move" if found.majority else "all common points"
+    words = (
+        "T = d' (Qa + Qb)^-1 d / 3 of a difference d, with the covariance of each point alone"
+        if found.approximate
+        else f"Both results in one datum, that of {datum}. T of such a point is what the weighted square sum "
+        "of all differences drops by without it, over 3"
+    )
+    return Table(columns, rows), Note(f"{words}: 1 is what chance gives.")
+
+
+def _camera(one: InteriorDifference, second: str) -> tuple[Part | None, ...]:
+    columns = (
+        Column("parameter"),
+        Column("difference", format=".4g"),
+        Column("sigma", format=".2g", unknown="not known"),
+        Column("unit"),
+    )
+    converted = one.conversion
+    note = (
+        None
+        if converted is None
+        else Note(
+            f"{second}: {converted.source_model} written as {one.model} differs by "
+            f"{fixed(converted.rms_px, 4)} px RMS, {fixed(converted.max_px, 4)} px at most. Parameters of a "
+            "converted camera have no sigma here."
+        )
+    )
+    return Table(columns, list(zip(one.names, one.difference, one.sigma, one.units, strict=True))), note
+
+
+def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
+    """Return what comparison.json holds."""
     verdict = verdict_of_comparison(found)
     return {
         "results": list(found.names),
         "length_unit": found.unit,
         "standard_deviations": list(found.has_sigma),
-        "same_image_points": or_none(found.same_share),
+        "same_image_points": found.same_share,
         "paired": {
             "points_by_name": found.pairing.points_by_name,
             "points_by_image_points": found.pairing.points_by_image_points,
@@ -72,29 +154,29 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         },
         "alignment": found.alignment,
         "scale_estimated": found.scale_estimated,
-        "scale": or_none(found.a_from_b.scale),
+        "scale": found.a_from_b.scale,
         "points": len(found.points),
         "images": len(found.images),
-        "rms_point": or_none(_rms(found.point_difference)),
-        "max_point": or_none(_longest(found.point_difference)),
-        "rms_position": or_none(_rms(found.position_difference)),
-        "max_rotation_deg": or_none(_largest(found.rotation_deg)),
+        "rms_point": _rms(found.point_difference),
+        "max_point": _longest(found.point_difference),
+        "rms_position": _rms(found.position_difference),
+        "max_rotation_deg": _largest(found.rotation_deg),
         "changed": found.changed,
         **verdict.as_dict(),
         "untested": found.untested and found.untested.kind,
         "approximate": found.approximate,
-        "tested": _tested(found),
+        "tested": tested,
         "global_test": {
-            "statistic": or_none(found.global_statistic),
-            "critical": or_none(found.global_critical),
+            "statistic": found.global_statistic,
+            "critical": found.global_critical,
         },
         "significant": [n for n, flag in zip(found.points, found.significant, strict=True) if flag],
         "cameras": [
             {
                 "name": one.camera,
                 "model": one.model,
-                "difference": dict(zip(one.names, map(or_none, one.difference), strict=True)),
-                "sigma": dict(zip(one.names, map(or_none, one.sigma), strict=True)),
+                "difference": dict(zip(one.names, one.difference, strict=True)),
+                "sigma": dict(zip(one.names, one.sigma, strict=True)),
                 "conversion": None
                 if one.conversion is None
                 else {
@@ -134,41 +216,6 @@ def largest_difference(found: ResultComparison) -> str:
     longest = _longest(found.point_difference)
     factor, unit = finer_unit(found.unit, longest)
     return f"{significant(longest * factor)} {unit or 'object units of ' + found.names[0]}"
-
-
-def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
-    """Return the page: verdict, figures, picture and tables."""
-    verdict = verdict_of_comparison(found)
-    largest = _longest(found.point_difference)
-    return render(
-        "comparison.html",
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        paired=words_of_pairing(found),
-        scale=words_of_scale(found),
-        found=found,
-        size={
-            "rms_point": _rms(found.point_difference),
-            "max_point": largest,
-            "rms_position": _rms(found.position_difference),
-            "max_rotation_deg": _largest(found.rotation_deg),
-            "tested": _tested(found),
-            "largest_statistic": _largest(found.statistic[np.isfinite(found.statistic)]),
-        },
-        known=[name for name, has in zip(found.names, found.has_sigma, strict=True) if has],
-        picture=_picture(found, xyz) if len(found.points) >= 3 and largest > 0 else None,
-    )
-
-
-def _picture(found: ResultComparison, xyz: FloatArray) -> Plot:
-    figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
-    return plot("differences", PICTURE, figure)
-
-
-def _tested(found: ResultComparison) -> int:
-    """How many points were tested."""
-    return int(np.isfinite(found.statistic).sum())
 
 
 def _largest(values: FloatArray) -> float:

@@ -1,14 +1,9 @@
-"""The analysis of epochs as displacements.csv, series.csv, epochs.json and epochs.html.
-
-The scene of two epochs: the points of the first with their displacements to the second.
-"""
+"""The page of an analysis of epochs, with the points of the first and their displacements in its scene."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,13 +16,11 @@ from sfm.epochs.blocks import BlockMotion
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.findings import verdict_of_epochs
 from sfm.epochs.series import EpochPair, EpochSeries
-from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
-from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit
-from sfm.report.page_files import write_files
+from sfm.report.numbers import finer_unit, general, significant
+from sfm.report.page import Column, Folded, Heading, Note, Page, Paragraph, Part, Section, Table, axes
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -37,38 +30,181 @@ from sfm.solution import Solution
 MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 
 NAMED = 12  # points in a sentence
-FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
-COLUMNS = (
-    *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
-    *("moved", "detectable"),
-)
-SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
 )
 BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
+STEPS = (
+    Column("points", "points", format=str),
+    Column("Omega", "omega", format=significant),
+    Column("degrees of freedom", "freedom", format=str),
+    Column("T", "T", format=significant),
+    Column("critical value", "critical", format=significant),
+    Column("removed then", "removed"),
+)
+MICRO, DEGREES = 1e6, float(np.rad2deg(1.0))
 
 
-def write_epochs(found: EpochSeries, out: Path) -> Path:
-    """Write an analysis of epochs into a folder and return the path of its page.
+def page(found: EpochSeries) -> Page:
+    """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
+    series = _series_picture(found)
+    displacements = [row for pair in found.pairs for row in _rows(pair.displacements)]
+    since = [row for pair in found.since_first for row in _rows(pair.displacements)]
+    moved_on = [(row[2], row[1], *row[3:9], row[-2]) for row in since]
+    verdict = verdict_of_epochs(found)
+    return Page(
+        "epochs",
+        "Epochs",
+        " - ".join((found.names[0], found.names[-1])),
+        verdict,
+        (
+            Section("Series", (series,)) if series else None,
+            *(_section(pair, k) for k, pair in enumerate(found.pairs)),
+        ),
+        viewer=_viewer(found),
+        summary={
+            "epochs": found.names,
+            "changed": found.changed,
+            **verdict.as_dict(),
+            "adjusted_together": [
+                {
+                    "camera": one.name,
+                    "epochs": one.epochs,
+                    "parameters": one.parameters,
+                    "T": one.statistic,
+                    "critical": one.critical,
+                }
+                for one in found.cameras
+            ],
+            "pairs": [_pair(pair) for pair in found.pairs],
+        },
+        files=(
+            Table(_columns(), displacements, "displacements"),
+            Table((Column(name="id"), Column(name="epoch"), *axes("d"), *axes("sd"), Column(name="moved")),
+                  moved_on, "series"),
+        ),
+    )  # fmt: skip
+
+
+def _columns(factor: float = 1.0, unit: str = "") -> tuple[Column, ...]:
+    """Return the columns of displacements.
 
     Args:
-        found: the analysis.
-        out: the folder.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
+        factor: from the object unit to that of the page.
+        unit: of the page.
     """
-    text = json.dumps(epochs_summary(found), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    texts = (
-        csv_text(COLUMNS, (row for pair in found.pairs for row in _rows(pair.displacements))),
-        csv_text(SERIES, _series_rows(found)),
-        text,
-        epochs_page(found),
+    return (
+        *(Column(None, "first"), Column(None, "second"), Column("point", "id")),
+        *axes("d", unit, factor=factor),
+        *axes("sd", unit, factor=factor),
+        Column(None, "length"),
+        Column("T", "T", format=significant),
+        Column("critical", "critical", format=significant),
+        *(Column(), Column(None, "stable"), Column(None, "moved")),
+        Column("found from", "detectable", unit, significant, factor),
     )
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
+
+
+def _rows(found: Displacements) -> list[tuple[Any, ...]]:
+    """Return the rows of displacements, in the object unit."""
+    states = ["moved" if m else "stable" if s else "" for m, s in zip(found.moved, found.stable, strict=True)]
+    length = np.linalg.norm(found.displacement, axis=1)
+    return [
+        (*found.differences.names, name, *d, *s, *others)
+        for name, d, s, *others in zip(
+            *(found.differences.points, found.displacement, found.sigma, length),
+            *(found.congruency.statistic, found.congruency.critical, states, found.stable, found.moved),
+            found.detectable,
+            strict=True,
+        )
+    ]
+
+
+def _steps(found: Displacements) -> Table:
+    """Return the steps of the search for stable points."""
+    names = found.differences.points
+    return Table(
+        STEPS,
+        [
+            (one.points, one.omega, one.freedom, one.statistic, one.critical,
+             None if one.removed is None else names[one.removed])
+            for one in found.congruency.search.steps
+        ],
+    )  # fmt: skip
+
+
+def _section(pair: EpochPair, number: int) -> Section:
+    """Return what is shown of two epochs."""
+    found = pair.displacements
+    d = found.differences
+    factor, unit = finer_unit(d.unit, _typical(found))
+    unit = unit or "object units"
+    kept = "translation and rotation" if d.motion == "rigid" else (
+        "translation, rotation and scale: not both have one"
+    )  # fmt: skip
+    common: list[tuple[str, object]] = [
+        ("common points", len(d.points)),
+        ("of them recognised by their place", d.by_place),
+        (f"only in {d.names[0]}", _names(d.only_first)),
+        (f"only in {d.names[1]}", _names(d.only_second)),
+        ("without the covariance among points", _names(d.untested)),
+        ("no change", kept),
+        ("given to both epochs", _names(d.shared) or "nothing"),
+    ]
+    shared = Note(
+        "What both were given makes both wrong alike: its part of the covariance is taken out of the "
+        "differences."
+    )
+    test = Note(
+        "T is the weighted square sum of the differences over its degrees of freedom, after the "
+        "S-transformation to the points that are left; 1 is what chance gives. The level of "
+        f"{general(100 * found.alpha, 2)} % is shared between this test and those of single points."
+    )
+    limits = Note(
+        "sd: standard deviations. Found from: the smallest displacement, in its worst direction, that would "
+        f"be found with {general(100 * POWER, 2)} %."
+    )
+    points = (Table(_columns(factor, unit), _rows(found)), limits)
+    return Section(
+        " to ".join(d.names),
+        (
+            Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
+            shared if d.shared else None,
+            Paragraph(words_of_stable(found)),
+            _steps(found),
+            test,
+            _picture(found, number),
+            Folded(counted(len(d.points), "point"), points, open=bool(found.moved.any())),
+            *(part for block in pair.blocks for part in _block(block, factor, unit)),
+        ),
+    )
+
+
+def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
+    """Return what is shown of a group of points."""
+    rows = []
+    for name, value, sigma in zip(block.parameters, block.value, block.sigma, strict=True):
+        scale, of = (factor, unit) if name[0] == "t" else (MICRO, "1e-6")
+        if name in ("omega", "phi", "kappa"):
+            scale, of = DEGREES, "deg"
+        rows.append((name, scale * value, scale * sigma, of))
+    tests = [
+        *(
+            (part.name, part.statistic, part.critical, "significant" if part.significant else "")
+            for part in block.parts
+        ),
+        ("what is left", block.statistic, block.critical, "" if block.fits else "significant"),
+    ]
+    numbers = [Column(name, format=significant) for name in ("value", "sigma")]
+    limits = [Column(name, format=significant, unknown="") for name in ("T", "critical value")]
+    return (
+        Heading(block.name),
+        Paragraph(f"{words_of_block(block)}."),
+        Table((Column("parameter"), *numbers, Column("unit")), rows),
+        Table((Column(), *limits, Column()), tests),
+    )
 
 
 def words_of_stable(found: Displacements) -> str:
@@ -106,55 +242,6 @@ def words_of_block(block: BlockMotion) -> str:
     return f"{block.name} ({counted(len(block.points), 'point')}, {block.model}): {how}; {rest}"
 
 
-def epochs_summary(found: EpochSeries) -> dict[str, Any]:
-    """Return what epochs.json holds: plain values only, None for what is not known."""
-    verdict = verdict_of_epochs(found)
-    return {
-        "epochs": list(found.names),
-        "changed": found.changed,
-        **verdict.as_dict(),
-        "adjusted_together": [
-            {
-                "camera": one.name,
-                "epochs": list(one.epochs),
-                "parameters": list(one.parameters),
-                "T": or_none(one.statistic),
-                "critical": or_none(one.critical),
-            }
-            for one in found.cameras
-        ],
-        "pairs": [_pair(p) for p in found.pairs],
-    }
-
-
-def epochs_page(found: EpochSeries) -> str:
-    """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
-    verdict = verdict_of_epochs(found)
-    return render(
-        "epochs.html",
-        title=" - ".join((found.names[0], found.names[-1])),
-        headline=verdict.headline,
-        remarks=verdict.lines,
-        level=verdict.level,
-        power=POWER,
-        viewer=_viewer(found),
-        pairs=[
-            {
-                "found": pair.displacements,
-                "title": " to ".join(pair.displacements.differences.names),
-                "stable": words_of_stable(pair.displacements),
-                "unit": finer_unit(pair.displacements.differences.unit, _typical(pair.displacements)),
-                "groups": pair.blocks,
-                "picture": _picture(pair.displacements, k),
-            }
-            for k, pair in enumerate(found.pairs)
-        ],
-        words_of_block=words_of_block,
-        names=_names,
-        series=_series_picture(found),
-    )
-
-
 def _pair(pair: EpochPair) -> dict[str, Any]:
     found = pair.displacements
     d = found.differences
@@ -176,17 +263,7 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
         "stable": names[found.stable].tolist(),
         "moved": names[found.moved].tolist(),
         "undecided": names[found.undecided].tolist(),
-        "steps": [
-            {
-                "points": step.points,
-                "omega": or_none(step.omega),
-                "freedom": step.freedom,
-                "T": or_none(step.statistic),
-                "critical": or_none(step.critical),
-                "removed": None if step.removed is None else d.points[step.removed],
-            }
-            for step in found.congruency.search.steps
-        ],
+        "steps": _steps(found).records,
         "groups": [
             {
                 "name": one.name,
@@ -194,7 +271,7 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
                 "model": one.model,
                 "centre": one.centre.tolist(),
                 "parameters": {
-                    name: {"value": or_none(value), "sigma": or_none(sigma)}
+                    name: {"value": value, "sigma": sigma}
                     for name, value, sigma in zip(one.parameters, one.value, one.sigma, strict=True)
                 },
                 "significant": [part.name for part in one.parts if part.significant],
@@ -203,27 +280,6 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
             for one in pair.blocks
         ],
     }
-
-
-def _rows(found: Displacements) -> Iterable[tuple[object, ...]]:
-    d = found.differences
-    for k, name in enumerate(d.points):
-        yield (
-            *(*d.names, name, *found.displacement[k], *found.sigma[k]),
-            *(
-                float(np.linalg.norm(found.displacement[k])),
-                found.congruency.statistic[k],
-                found.congruency.critical[k],
-            ),
-            *(int(found.stable[k]), int(found.moved[k]), found.detectable[k]),
-        )
-
-
-def _series_rows(found: EpochSeries) -> Iterable[tuple[object, ...]]:
-    for pair in found.since_first:
-        one = pair.displacements
-        for k, name in enumerate(one.differences.points):
-            yield (name, one.differences.names[1], *one.displacement[k], *one.sigma[k], int(one.moved[k]))
 
 
 def _viewer(found: EpochSeries) -> Viewer | None:

@@ -1,71 +1,62 @@
-"""Photographs to be added to a survey, as page, table and exterior orientation."""
+"""The page of photographs to be added to a survey."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import angles_from_rotation
 from sfm.display import counted
-from sfm.files.plain_text import csv_text
 from sfm.planning.further import Further
-from sfm.report.html.page import render
+from sfm.remarks.verdict import Line
 from sfm.report.numbers import finer_unit, significant
-from sfm.report.page_files import write_files
+from sfm.report.page import Banner, Column, Note, Page, Section, Table
+from sfm.report.planning import exterior_table, shot_columns, shot_rows
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.solution import Solution
 
-FILES = ("exterior.csv", "points.csv", "more.html")
+HIDDEN = Line("note", "What hides a point from a new station is not known: look before you photograph.")
 
 
-def write_further(found: Further, result: Solution, out: Path) -> Path:
-    """Write the photographs to be added into a folder and return the path of its page.
+def page(found: Further, *, result: Solution) -> Page:
+    """Return the page: the photographs, and what they do for the weakest points.
 
     Args:
         found: the photographs.
         result: of the survey.
-        out: the folder.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
     """
-    angles = np.degrees(angles_from_rotation(found.stations.rotation))
-    exterior = (
-        (name, *X0, *a)
-        for name, X0, a in zip(
-            found.stations.names, found.stations.position.tolist(), angles.tolist(), strict=True
-        )
+    size = float(np.abs([one.position for one in found.shots]).max(initial=0.0))
+    columns = shot_columns(result.unit or "object units", size, planned=False)
+    scene = scene_of_stored(replace(found.adjustment.solution, name=result.name, unit=result.unit))
+    stations = Note(
+        f"In the coordinates of the result, with camera {found.camera}. Azimuth from +X towards +Y and "
+        "elevation: where the camera looks. Roll: counter-clockwise about that direction. Keep the focus of "
+        "the survey: another one is another calibration."
     )
-    sigma = (
-        (name, *("" if not np.isfinite(s) else s for s in both))
-        for name, *both in zip(
-            result.network.points, found.before.tolist(), found.after.tolist(), strict=True
-        )
+    sigma = Note(
+        "Sigma: RMS of the three coordinates, in a free datum. Predicted for image points as precise as "
+        "those of the survey."
     )
-    a = found.adjustment
-    scene = scene_of_stored(replace(a.solution, name=result.name, unit=result.unit))
-    page = render(
-        "more.html",
+    weak = (Column("point"), Column("sigma now", format=str), Column("sigma with them", format=str))
+    points = (Column(name="id"), Column(name="sigma"), Column(name="sigma_with_more"))
+    level = "bad" if found.adjustment.undetermined else "good"  # only what is determined with them is good
+    return Page(
+        "more",
+        "Photographs to add",
+        result.name,
+        Banner(level, headline(found, result), (HIDDEN,)),
+        (
+            Section("Photographs", (Table(columns, shot_rows(found.shots)), stations)),
+            Section("Weakest points", (Table(weak, weakest(found, result)), sigma)),
+        ),
         viewer=viewer_of(scene, Pictures()),
-        title=result.name,
-        level=_level(found),
-        headline=headline(found, result),
-        remarks=["What hides a point from a new station is not known: look before you photograph."],
-        found=found,
-        size=float(np.abs([s.position for s in found.shots]).max(initial=0.0)),
-        unit=result.unit or "object units",
-        weakest=weakest(found, result),
+        files=(
+            exterior_table(found.stations),
+            Table(points, list(zip(result.network.points, found.before, found.after, strict=True)), "points"),
+        ),
     )
-    texts = (
-        csv_text(("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"), exterior),
-        csv_text(("id", "sigma", "sigma_with_more"), sigma),
-        page,
-    )
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
 
 
 def headline(found: Further, result: Solution) -> str:
@@ -74,11 +65,6 @@ def headline(found: Further, result: Solution) -> str:
     before, after = (_length(result, float(s[known].max())) for s in (found.before, found.after))
     count = len(found.stations)
     return f"{counted(count, 'more photograph')}: sigma of the worst point from {before} to {after}"
-
-
-def _level(found: Further) -> str:
-    """Say "good" only of what is determined with them."""
-    return "bad" if found.adjustment.undetermined else "good"
 
 
 def weakest(found: Further, result: Solution) -> list[tuple[str, str, str]]:

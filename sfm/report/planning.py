@@ -1,9 +1,8 @@
-"""A planned network as page, tables and JSON: what it will give, where it is weak, the photographs."""
+"""The page of a planned network: what it will give, where it is weak, the photographs."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,23 @@ import numpy as np
 from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
-from sfm.files.plain_text import csv_text, or_none
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
+from sfm.planning.shots import Shot
 from sfm.planning.sight import MIN_PIXELS
+from sfm.planning.stations import Stations
 from sfm.planning.wanted import ALPHA, found_displacement
-from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, or_unlimited, raised, significant
-from sfm.report.page_files import write_files
+from sfm.report.numbers import (
+    NOT_DETERMINED,
+    finer_unit,
+    fixed,
+    or_unlimited,
+    placed,
+    raised,
+    significant,
+)
+from sfm.report.page import Column, Folded, Note, Page, Paragraph, Part, Section, Table, axes, facts
 from sfm.report.phrases import NORMAL_95
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
@@ -27,78 +34,152 @@ from sfm.report.viewer.scene import ViewerScene
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.solution import Solution
 
-FILES = ("points.csv", "image_points.csv", "exterior.csv", "shots.csv", "plan.json", "plan.html")
-POINTS = ("id", "X", "Y", "Z", "nX", "nY", "nZ", "sX", "sY", "sZ", "rays", "angle_deg", "coded")
-SHOTS = (
-    *(
-        "image",
-        "X",
-        "Y",
-        "Z",
-        "azimuth_deg",
-        "elevation_deg",
-        "roll_deg",
-        "distance",
-        "focus",
-        "points",
-        "coded",
-    ),
-)
 NAMED = 12  # weak points that are listed
+EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
+IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 
 
-def write_plan(plan: Plan, out: Path) -> Path:
-    """Write a plan into a folder and return the path of its page.
-
-    Args:
-        plan: the plan.
-        out: the folder.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
-    """
-    p = plan.prediction
+def page(plan: Plan) -> Page:
+    """Return the page: the scene to explore, figures, list of photographs, weak points and the camera."""
+    p, unit = plan.prediction, plan.unit
     m, n = np.nonzero(p.sight.seen)
     deviation = np.sqrt(np.diagonal(p.sight.covariance[m, n], axis1=1, axis2=2))
-    angles = np.degrees(angles_from_rotation(p.stations.rotation))
-    texts = (
-        csv_text(POINTS, _points(plan)),
-        csv_text(
-            ("image", "point", "x_px", "y_px", "sx_px", "sy_px"),
-            (
-                (p.stations.names[i], p.planned.names[j], *p.sight.xy[i, j].tolist(), *s)
-                for i, j, s in zip(m, n, deviation.tolist(), strict=True)
-            ),
-        ),
-        csv_text(
-            ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"),
-            (
-                (name, *X0, *a)
-                for name, X0, a in zip(
-                    p.stations.names, p.stations.position.tolist(), angles.tolist(), strict=True
-                )
-            ),
-        ),
-        csv_text(
-            SHOTS,
-            (
-                (
-                    *(s.station, *np.round(s.position, 6).tolist(), round(s.azimuth_deg, 2)),
-                    *(
-                        round(s.elevation_deg, 2),
-                        round(s.roll_deg, 2),
-                        round(s.distance, 6),
-                        round(s.focus, 6),
-                    ),
-                    *(s.points, s.coded),
-                )
-                for s in plan.shots
-            ),
-        ),
-        json.dumps(plan_summary(plan), indent=2, ensure_ascii=False, allow_nan=False) + "\n",
-        plan_page(plan),
+    seen = [
+        (p.stations.names[i], p.planned.names[j], *xy, *s)
+        for i, j, xy, s in zip(m, n, p.sight.xy[m, n].tolist(), deviation.tolist(), strict=True)
+    ]
+    size = float(np.abs([*p.planned.xyz, *(one.position for one in plan.shots)]).max())
+    columns = shot_columns(unit, size)
+    points = _points(plan, size)
+    prediction = Note(
+        "Predicted for the standard deviations of the image points that the plan states, with a free datum "
+        "and the camera adjusted as below; targets are assumed to be measured wherever they are seen. Sigma "
+        "of a point: RMS of its three coordinates."
     )
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
+    axis = Note(
+        "Azimuth from +X towards +Y and elevation: where the camera looks. Roll: counter-clockwise about "
+        "that direction, 0 upright. Distance: mean of the points shown, along the axis. Focus: one for all "
+        "photographs, as a calibration holds for one focus only; unless it was given, as sharp at the "
+        "nearest point as at the farthest."
+    )
+    rows = [(name[0].upper() + name[1:], value) for name, value in figures(plan)]
+    return Page(
+        "plan",
+        "Plan of a network",
+        plan.name,
+        verdict_of_plan(plan),
+        (
+            Section("Figures", (facts(rows), prediction)),
+            Section("Photographs", (Table(columns, shot_rows(plan.shots)), axis)),
+            Section("Weak points", _weak(plan)),
+            Section("Camera", _camera(plan)),
+            Section("Points", (Folded(counted(len(points.rows), "point"), (points,)),)),
+        ),
+        viewer=viewer_of(plan_scene(plan), Pictures()),
+        summary=_summary(plan),
+        files=(
+            Table(tuple(Column(name=name) for name in IMAGE_POINTS), seen, "image_points"),
+            exterior_table(p.stations),
+            Table(columns, shot_rows(plan.shots, rounded=True), "shots"),
+        ),
+    )
+
+
+def exterior_table(stations: Stations) -> Table:
+    """Return the exterior orientation of planned photographs, for a file."""
+    angles = np.degrees(angles_from_rotation(stations.rotation)).tolist()
+    rows = [(n, *X0, *a) for n, X0, a in zip(stations.names, stations.position.tolist(), angles, strict=True)]
+    return Table(tuple(Column(name=name) for name in ("image", *EXTERIOR)), rows, "exterior")
+
+
+def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Column, ...]:
+    """Return the columns of photographs to be taken.
+
+    Args:
+        unit: object unit.
+        size: the largest coordinate that is written, in that unit.
+        planned: whether focus and coded points are planned, too.
+    """
+    return (
+        Column("station", "image"),
+        *axes("", unit, lambda value: placed(value, size)),
+        *(Column(a, f"{a}_deg", "deg", "z.0f") for a in ("azimuth", "elevation", "roll")),
+        Column("distance", "distance", unit, ".4g"),
+        Column("focus" if planned else None, "focus", unit, ".4g"),
+        Column("points", "points", format=str),
+        Column("coded" if planned else None, "coded", format=str),
+    )
+
+
+def shot_rows(shots: Sequence[Shot], *, rounded: bool = False) -> list[tuple[object, ...]]:
+    """Return the rows of photographs to be taken, for files rounded as they can be carried out."""
+    rows: list[tuple[object, ...]] = []
+    for one in shots:
+        lengths = [*one.position.tolist(), one.distance, one.focus]
+        angles = [one.azimuth_deg, one.elevation_deg, one.roll_deg]
+        if rounded:
+            lengths, angles = ([round(value, to) for value in x] for x, to in ((lengths, 6), (angles, 2)))
+        rows.append((one.station, *lengths[:3], *angles, *lengths[3:], one.points, one.coded))
+    return rows
+
+
+def _points(plan: Plan, size: float) -> Table:
+    """Return the points with what is predicted of them."""
+    p = plan.prediction
+    factor, fine = finer_unit(plan.unit, p.rms_sigma)
+    columns = (
+        Column("point", "id"),
+        *axes("", plan.unit, lambda value: placed(value, size)),
+        *(Column(None, name) for name in ("nX", "nY", "nZ", "sX", "sY", "sZ")),
+        Column("sigma", "", fine, significant, factor),
+        Column("rays", "rays", format=str),
+        Column("angle", "angle_deg", "deg", "z.0f", unknown=""),
+        Column(None, "coded"),
+    )
+    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+    coded = np.isin(np.arange(len(p.planned.names)), plan.coded)
+    rows = [
+        (name, *xyz, *normal, *s, one if known else NOT_DETERMINED, *others)
+        for name, xyz, normal, s, one, known, *others in zip(
+            *(p.planned.names, p.planned.xyz, p.planned.normals, sigma, p.sigma, p.determined, p.rays),
+            *(p.angle_deg, coded),
+            strict=True,
+        )
+    ]
+    return Table(columns, rows, "points")
+
+
+def _weak(plan: Plan) -> tuple[Part, ...]:
+    """Return the weak points, the worst first."""
+    if not plan.weak:
+        return (Paragraph("None: no point is more than 1.5 times as uncertain as the median."),)
+    factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
+    columns = (Column("point"), Column("sigma", "", fine, significant, factor), Column("reason"))
+    rows = [
+        (one.name, one.sigma if np.isfinite(one.sigma) else NOT_DETERMINED, one.reason)
+        for one in plan.weak[:NAMED]
+    ]
+    more = (Note(f"The worst {NAMED} of {len(plan.weak)}."),) if len(plan.weak) > NAMED else ()
+    return Table(columns, rows), *more
+
+
+def _camera(plan: Plan) -> tuple[Part, ...]:
+    """Return whether the network calibrates its camera."""
+    c = plan.calibration
+    if c is None:
+        return (Paragraph("Its interior orientation is held."),)
+    rolled, turned, deep = fixed(100 * c.rolled, 0), fixed(c.convergence_deg, 0), fixed(100 * c.depth, 0)
+    words = Paragraph(
+        f"The network {'calibrates' if c.good else 'does not calibrate'} the camera: what is left uncertain "
+        f"of it is {significant(c.contribution)} sigmas of an image coordinate, and adjusting it costs "
+        f"{significant(100 * c.cost - 100, 2)} % of the precision of points. {rolled} % of the photographs "
+        f"are rolled, axes converge by {turned} deg, the object is {deep} % of its distance deep."
+    )
+    columns = (
+        *(Column("parameter"), Column("sigma", format=str), Column("unit")),
+        Column("strongly correlated with"),
+    )
+    return words, Table(columns, _camera_rows(plan))
 
 
 def figures(plan: Plan) -> list[tuple[str, str]]:
@@ -147,28 +228,6 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
     return rows
 
 
-def plan_page(plan: Plan) -> str:
-    """Return the page: the scene to explore, figures, list of photographs, weak points and the camera."""
-    scene, verdict = plan_scene(plan), verdict_of_plan(plan)
-    factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
-    return render(
-        "plan.html",
-        viewer=viewer_of(scene, Pictures()),
-        plan=plan,
-        p=plan.prediction,
-        title=plan.name,
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        figures=figures(plan),
-        fine=fine,
-        factor=factor,
-        camera_rows=_camera_rows(plan),
-        size=float(np.abs([*plan.prediction.planned.xyz, *(s.position for s in plan.shots)]).max()),
-        named=NAMED,
-    )
-
-
 def plan_scene(plan: Plan) -> ViewerScene:
     """Return the scene of a plan: stations, rays and all points, those not determined included."""
     p = plan.prediction
@@ -188,8 +247,8 @@ def plan_scene(plan: Plan) -> ViewerScene:
     return scene_of_stored(Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit))
 
 
-def plan_summary(plan: Plan) -> dict[str, Any]:
-    """Return what plan.json holds: plain values only, None for what is not known."""
+def _summary(plan: Plan) -> dict[str, Any]:
+    """Return what plan.json holds."""
     p, c, camera = plan.prediction, plan.calibration, plan.prediction.camera
     verdict = verdict_of_plan(plan)
     return {
@@ -197,7 +256,7 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
         "unit": plan.unit,
         **verdict.as_dict(),
         "reached": plan.reached,
-        "shortfall": or_none(plan.shortfall),
+        "shortfall": plan.shortfall,
         "wanted": {
             "sigma": plan.wanted.sigma,
             "length_sigma": plan.wanted.length_sigma,
@@ -207,8 +266,8 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
         "stations": p.stations.places,
         "points": len(p.planned.names),
         "determined": int(p.determined.sum()),
-        "sigma_rms": or_none(p.rms_sigma),
-        "sigma_largest": or_none(float(p.sigma.max())),
+        "sigma_rms": p.rms_sigma,
+        "sigma_largest": float(p.sigma.max()),
         "sigma_px": p.sigma_px,
         "redundancy": p.adjustment.redundancy,
         "fraser": {"q": p.q, "k": p.photographs_per_station, "S_per_px": p.scale_number},
@@ -229,9 +288,9 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
             "parameters": dict(zip(camera.names, camera.parameters.tolist(), strict=True)),
             "free": [n for n, f in zip(camera.names, camera.free, strict=True) if f],
             "can_be_calibrated": None if c is None else c.good,
-            "sigma": {} if c is None else {n: or_none(s) for n, s in zip(c.parameters, c.sigma, strict=True)},
+            "sigma": {} if c is None else dict(zip(c.parameters, c.sigma, strict=True)),
         },
-        "weak_points": [{"point": w.name, "sigma": or_none(w.sigma), "reason": w.reason} for w in plan.weak],
+        "weak_points": [{"point": w.name, "sigma": w.sigma, "reason": w.reason} for w in plan.weak],
     }
 
 
@@ -255,24 +314,6 @@ def _camera_rows(plan: Plan) -> list[tuple[str, ...]]:
         shown = significant(sigma) if np.isfinite(sigma) else "not determined"
         rows.append((name, shown, raised(units[name]), "; ".join((*others, *outer))))
     return rows
-
-
-def _points(plan: Plan) -> list[tuple[object, ...]]:
-    p = plan.prediction
-    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
-    coded = set(plan.coded.tolist())
-
-    def cell(value: float) -> object:
-        return value if np.isfinite(value) else ""
-
-    return [
-        (
-            *(name, *p.planned.xyz[j].tolist(), *map(cell, p.planned.normals[j].tolist())),
-            *map(cell, sigma[j].tolist()),
-            *(int(p.rays[j]), cell(float(p.angle_deg[j])), int(j in coded)),
-        )
-        for j, name in enumerate(p.planned.names)
-    ]
 
 
 def _first(undetermined: tuple[str, ...]) -> str:

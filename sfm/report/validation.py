@@ -1,107 +1,111 @@
-"""A validation as validation.csv, validation.json and validation.html."""
+"""The page of a validation of the adjuster."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm.comparison.solutions import SAME_SIGMAS
 from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
-from sfm.files.plain_text import csv_text, or_none
+from sfm.display import counted, program_name
 from sfm.remarks.catalogue import KINDS
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import plot
-from sfm.report.html.page import render
-from sfm.report.page_files import write_files
+from sfm.report.numbers import fixed, general
+from sfm.report.page import Column, Folded, Note, Page, Paragraph, Section, Table
 
-FILES = ("validation.csv", "validation.json", "validation.html")
-COLUMNS = (
-    "network",
-    "arrangement",
-    "photographs",
-    "points",
-    "image_points",
-    "planar",
-    "visibility",
-    "noise_px",
-    "model",
-    "cameras",
-    "interior",
-    "datum",
-    "cost_kolinear_px2",
-    "cost_other_px2",
-    "rms_kolinear_px",
-    "rms_other_px",
-    "iterations_kolinear",
-    "iterations_other",
-    "seconds_kolinear",
-    "seconds_other",
-    "interior_over_sigma",
-    "position_over_sigma",
-    "rotation_over_sigma",
-    "point_over_sigma",
-    "conditional_covariance_difference",
-    "interior_covariance_difference",
-    "marginal_over_conditional_sigma",
-    "ended",
-    "message",
-)
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
     "of the comparison; in everyday use it stops earlier."
 )
+TRIALS = (
+    *(Column("network", "network"), Column("arrangement", "arrangement")),
+    *(Column("photographs", "photographs", format=str), Column("points", "points", format=str)),
+    Column("image points", "image_points", format=str),
+    *(Column(None, "planar"), Column(None, "visibility"), Column("noise px", "noise_px", format="z.2f")),
+    *(Column("model", "model"), Column(None, "cameras"), Column("interior", "interior")),
+    *(Column("datum", "datum"), Column("cost", "cost_kolinear_px2", format=".6g")),
+    *(Column(None, "cost_other_px2"), Column("relative difference", format=".1e")),
+    *(Column(None, "rms_kolinear_px"), Column(None, "rms_other_px"), Column("steps", format=str)),
+    *(Column(None, "iterations_kolinear"), Column(None, "iterations_other"), Column("seconds", format=str)),
+    *(Column(None, "seconds_kolinear"), Column(None, "seconds_other"), Column(None, "interior_over_sigma")),
+    *(Column(None, "position_over_sigma"), Column(None, "rotation_over_sigma")),
+    Column("point / sigma", "point_over_sigma", format=".1e"),
+    *(Column(None, "conditional_covariance_difference"), Column(None, "interior_covariance_difference")),
+    *(Column(None, "marginal_over_conditional_sigma"), Column(), Column(None, "ended")),
+    Column(None, "message"),
+)
 
 
-def write_validation(validation: Validation, out: Path) -> Path:
-    """Write a validation into a folder and return the path of its page.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
-    """
-    rows = [trial_row(trial) for trial in validation.trials]
-    text = json.dumps(validation_summary(validation), indent=2, allow_nan=False)
-    texts = (csv_text(COLUMNS, rows), text + "\n", validation_page(validation))
-    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
-
-
-def trial_row(trial: Trial) -> tuple[object, ...]:
-    """Return one trial in the order of COLUMNS."""
-    plan = trial.plan
-    return (
-        *(trial.number, plan.arrangement, plan.images, trial.points, trial.image_points),
-        *(int(plan.planar), plan.visibility, plan.noise_px, plan.model, plan.cameras, plan.interior),
-        *(plan.datum, *trial.cost, *trial.rms_px, *trial.iterations, *trial.seconds),
-        *(trial.interior_sigmas, trial.position_sigmas, trial.rotation_sigmas, trial.point_sigmas),
-        *(trial.conditional_difference, trial.interior_difference, trial.marginal_over_conditional),
-        *(trial.remark.kind, "; ".join(messages_of(trial))),
+def page(found: Validation) -> Page:
+    """Return the page: how the adjusters ended, largest differences, time, and every network."""
+    other = program_name(found.backend)
+    optima = [(ended(kind), count) for kind, count in found.counts()]
+    differences = [(name, in_words(value, unit)) for name, value, unit in largest(found)]
+    ratios = list(_known(one.marginal_over_conditional for one in found.trials))
+    ratio = fixed(float(np.median(ratios)) if ratios else math.nan, 2)
+    trials = Table(TRIALS, [trial_row(one) for one in found.trials], "validation")
+    seconds = (sum(_known(one.seconds[k] for one in found.trials)) for k in (0, 1))
+    return Page(
+        "validation",
+        "Validation",
+        f"Kolinear and {other}, seed {found.seed}",
+        verdict_of_validation(found),
+        (
+            Section(
+                "Optima",
+                (
+                    Table((Column(), Column("networks", format=str)), optima),
+                    Note(
+                        f"Same optimum: the costs differ by no more than a difference of "
+                        f"{general(SAME_SIGMAS, 6)} standard deviations in one direction."
+                    ),
+                ),
+            ),
+            Section(
+                "Largest differences",
+                (
+                    Table((Column(), Column("largest difference")), differences),
+                    Paragraph(
+                        "A point's sigma counts all that is uncertain (marginal); with photographs and "
+                        f"cameras held, as {other} gives it, it is smaller: by {ratio} in the median."
+                    ),
+                ),
+            ),
+            Section("Time", (plot("time", TIME_CAPTION, time_figure(found)),)),
+            Section("All networks", (Folded(counted(len(found.trials), "network"), (trials,)),)),
+        ),
+        summary={
+            "backend": found.backend,
+            "seed": found.seed,
+            "networks": len(found.trials),
+            "passed": found.passed,
+            **verdict_of_validation(found).as_dict(),
+            "ended": dict(found.counts()),
+            "largest": {name: value for name, value, _ in largest(found)},
+            "seconds": dict(zip(("kolinear", found.backend), seconds, strict=True)),
+            "trials": [{**asdict(one), "remark": one.remark.as_dict()} for one in found.trials],
+        },
     )
 
 
-def validation_summary(validation: Validation) -> dict[str, Any]:
-    """Return what validation.json holds: plain values only, None for what is not known."""
-    return {
-        "backend": validation.backend,
-        "seed": validation.seed,
-        "networks": len(validation.trials),
-        "passed": validation.passed,
-        **verdict_of_validation(validation).as_dict(),
-        "ended": dict(validation.counts()),
-        "largest": {name: or_none(value) for name, value, _ in largest(validation)},
-        "seconds": {
-            "kolinear": or_none(sum(_known(t.seconds[0] for t in validation.trials))),
-            validation.backend: or_none(sum(_known(t.seconds[1] for t in validation.trials))),
-        },
-        "trials": [
-            {**_plain(asdict(trial)), "remark": trial.remark.as_dict()} for trial in validation.trials
-        ],
-    }
+def trial_row(trial: Trial) -> tuple[object, ...]:
+    """Return one trial in the order of TRIALS."""
+    plan, (ours, theirs) = trial.plan, trial.cost
+    return (
+        *(trial.number, plan.arrangement, plan.images, trial.points, trial.image_points, plan.planar),
+        *(plan.visibility, plan.noise_px, plan.model, plan.cameras, plan.interior, plan.datum),
+        *(ours, theirs, (theirs - ours) / ours if ours > 0 else math.nan, *trial.rms_px),
+        *(" / ".join(map(str, trial.iterations)), *trial.iterations),
+        *(" / ".join(fixed(one, 2) for one in trial.seconds), *trial.seconds),
+        *(trial.interior_sigmas, trial.position_sigmas, trial.rotation_sigmas, trial.point_sigmas),
+        *(trial.conditional_difference, trial.interior_difference, trial.marginal_over_conditional),
+        *(ended(trial.remark.kind), trial.remark.kind, "; ".join(messages_of(trial))),
+    )
 
 
 def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
@@ -151,45 +155,9 @@ def messages_of(trial: Trial) -> tuple[str, ...]:
     return (*trial.remark.names("message"), *trial.remark.names("their_message"))
 
 
-def validation_page(validation: Validation) -> str:
-    """Return the page: how the adjusters ended, largest differences, time, and every network."""
-    verdict = verdict_of_validation(validation)
-    return render(
-        "validation.html",
-        v=validation,
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        same_sigmas=SAME_SIGMAS,
-        ended=[(ended(kind), count) for kind, count in validation.counts()],
-        networks=[(trial, ended(trial.remark.kind)) for trial in validation.trials],
-        largest=[(name, in_words(value, unit)) for name, value, unit in largest(validation)],
-        marginal_over_conditional=_median_ratio(validation),
-        picture=plot("time", TIME_CAPTION, time_figure(validation)),
-    )
-
-
-def _median_ratio(validation: Validation) -> float:
-    known = list(_known(t.marginal_over_conditional for t in validation.trials))
-    return float(np.median(known)) if known else math.nan
-
-
 def _known(values: Iterable[float]) -> Iterator[float]:
     return (value for value in values if math.isfinite(value))
 
 
 def _max(values: Iterable[float]) -> float:
     return max(_known(values), default=math.nan)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with NaN as None and tuples as lists."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return or_none(float(value))
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value

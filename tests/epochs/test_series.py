@@ -16,7 +16,8 @@ from sfm.epochs.findings import remarks_of_pair, verdict_of_epochs
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, kinds_of
-from sfm.report.epochs import FILES, words_of_stable, write_epochs
+from sfm.report.epochs import words_of_stable
+from sfm.report.pages import write_page
 from tests.epochs.scenes import POINTS, epoch
 
 
@@ -48,8 +49,10 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
         (span,) = pair.groups
         assert span.moved and span.fits and pair.together is not None
         assert abs(span.value[2] - 0.01) < 4 * span.sigma[2]
-    page = write_epochs(found, tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "manifest.json"}
+    page = write_page(found, tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *("displacements.csv", "series.csv", "epochs.json", "epochs.html", "manifest.json")
+    }
     text = page.read_text(encoding="utf-8")
     said = verdict_of_epochs(found).remarks[0].text
     assert said in text.replace("\xa0", " ") and "span" in text and "Series" in text
@@ -123,7 +126,7 @@ def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
     def told(one: Epoch, other: Epoch) -> tuple[Remark, ...]:
         found = analyse_epochs([one, other])
         verdict = verdict_of_epochs(found)
-        text = write_epochs(found, tmp_path / "out").read_text(encoding="utf-8")
+        text = write_page(found, tmp_path / "out").read_text(encoding="utf-8")
         assert all(one.text in text for one in verdict.remarks)
         return tuple(one for one in verdict.remarks if one.kind.startswith("held_"))
 

@@ -17,7 +17,7 @@ from sfm.errors import KolinearError, SurveyFileError
 from sfm.inspection.acceptance import Acceptance, CalibratedLengths, accept_result, read_lengths
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.remarks.remark import remark
-from sfm.report.acceptance import write_acceptance
+from sfm.report.pages import write_page
 from sfm.solution import Solution
 from tests.inspection.benches import one_bench
 from tests.synthetic import seed_of
@@ -67,7 +67,7 @@ def test_a_complete_test_is_proven(tmp_path: Path) -> None:
     assert found.limit[longest] == pytest.approx(0.02 + 2e-5 * np.sqrt(3) * 1000, rel=1e-5)
     assert accepted(*volume(), b=0.03).limit.max() == 0.03
     assert found.sigma[0] == pytest.approx(np.sqrt(2e-4), rel=1e-9)  # of two points with 0.01 mm each
-    page = write_acceptance(found, tmp_path / "out")
+    page = write_page(found, tmp_path / "out")
     text = page.read_text(encoding="utf-8")
     assert "VDI/VDE 2634 part 1" in text and "10360" not in text
     summary = json.loads((tmp_path / "out" / "acceptance.json").read_text(encoding="utf-8"))

@@ -25,8 +25,8 @@ from sfm.planning.stations import Stations, arrangement
 from sfm.planning.wanted import Wanted
 from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
-from sfm.report.further import headline, weakest, write_further
-from sfm.report.planning import write_plan
+from sfm.report.further import headline, weakest
+from sfm.report.pages import write_page
 from sfm.solution import Solution
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
@@ -58,7 +58,7 @@ def test_further_photographs_help_the_weakest_points(tmp_path: Path) -> None:
     assert found.after.max() < alone.after.max() < before.max()
     assert np.allclose(alone.stations.position[0], found.stations.position[0])
     result = Solution("plate", network, estimate, unit="m")
-    page = write_further(found, result, tmp_path / "more").read_text(encoding="utf-8")
+    page = write_page(found, tmp_path / "more", result=result).read_text(encoding="utf-8")
     assert headline(found, result) in page and weakest(found, result)[0][1] in page
     assert (tmp_path / "more" / "exterior.csv").read_text(encoding="utf-8").count("\n") == 3
 
@@ -79,7 +79,7 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     stations: Stations = arrangement("ring:8", plate, camera)
     seeing = Seeing(diameter=12.0, target=target)
     plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=Wanted())
-    write_plan(plan, tmp_path / "plan")
+    write_page(plan, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
     assert (read.seen == plan.prediction.sight.seen).all() and read.camera.free.sum() == 1
     assert np.allclose(read.stations.rotation, stations.rotation, atol=1e-9)
@@ -102,7 +102,7 @@ def test_targets_that_overlap_are_refused(tmp_path: Path) -> None:
     plan = plan_of(
         "plate", "mm", plate, camera, arrangement("ring:6", plate, camera), seeing, wanted=Wanted()
     )
-    write_plan(plan, tmp_path / "plan")
+    write_page(plan, tmp_path / "plan")
     with pytest.raises(GeometryError, match="overlap; needed fewer points or smaller targets"):
         write_simulation(read_plan(tmp_path / "plan"), tmp_path)
 

@@ -19,11 +19,10 @@ from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
-from sfm.report.differences import write_differences
 from sfm.report.findings.findings import findings_of
 from sfm.report.html.page import content_policy, render
 from sfm.report.output import write_result
-from sfm.report.validation import write_validation
+from sfm.report.pages import write_page
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.places import ROOT
@@ -100,13 +99,13 @@ def validation_page(folder: Path) -> str:
     figures = ((10.0, 10.0), (0.1, 0.1), (5, 12), (0.01, 0.02), 1e-6, 2e-6, 3e-6, 4e-6, 1e-12, np.nan, 1.4)
     ended = remark("other_adjuster_failed", network=0, program="COLMAP", their_message=EVIL)
     trial = Trial(0, plan, 60, 400, *figures, ended)
-    return write_validation(Validation("colmap", 7, (trial,)), folder / "out").read_text(encoding="utf-8")
+    return write_page(Validation("colmap", 7, (trial,)), folder / "out").read_text(encoding="utf-8")
 
 
 def differences_page(folder: Path) -> str:
     network, truth = make_network(seed_of("policy"), model="opencv", images=5, points=20)
     found = compare_results(Solution(EVIL, network, truth), Solution("b", network, truth))
-    return write_differences(found, truth.points, folder / "out").read_text(encoding="utf-8")
+    return write_page(found, folder / "out", xyz=truth.points).read_text(encoding="utf-8")
 
 
 PAGES = (report_page, index_page, validation_page, differences_page)

@@ -22,8 +22,9 @@ from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.remarks.remark import Remark, kinds_of, remark
-from sfm.report.differences import largest_difference, write_differences
-from sfm.report.validation import COLUMNS, verdict_of_validation, write_validation
+from sfm.report.differences import largest_difference
+from sfm.report.pages import write_page
+from sfm.report.validation import TRIALS, verdict_of_validation
 from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 
@@ -56,10 +57,10 @@ def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
         "other_adjuster_failed", network=1, program="COLMAP", apart=np.nan, their_message="<out of order>"
     )
     lost = trial(1, cost=np.nan, ended=failed)
-    path = write_validation(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
+    path = write_page(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
     with (tmp_path / "out" / "validation.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == list(COLUMNS)
+    assert list(rows[0]) == [one.name for one in TRIALS if one.name]
     assert rows[0]["ended"] == "same_optimum" and rows[1]["cost_other_px2"] == ""
     assert rows[1]["message"] == "<out of order>"
     summary = json.loads((tmp_path / "out" / "validation.json").read_text())
@@ -82,7 +83,7 @@ def test_a_worse_kolinear_comes_first(tmp_path: Path) -> None:
     verdict = verdict_of_validation(validation)
     assert verdict.level == "bad" and not validation.passed
     assert kinds_of(verdict.remarks) == ("kolinear_higher", "kolinear_lower")
-    page = write_validation(validation, tmp_path / "out").read_text()
+    page = write_page(validation, tmp_path / "out").read_text()
     assert '<div class="banner bad"><strong>1 of 3 networks' in page and verdict.remarks[0].text in page
     good = verdict_of_validation(Validation("colmap", 7, (trial(0),)))
     assert good.level == "good" and good.remarks == ()
@@ -90,14 +91,14 @@ def test_a_worse_kolinear_comes_first(tmp_path: Path) -> None:
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     validation = Validation("colmap", 7, (trial(0),))
-    write_validation(validation, tmp_path / "out")
-    write_validation(validation, tmp_path / "out")  # an earlier one is replaced
+    write_page(validation, tmp_path / "out")
+    write_page(validation, tmp_path / "out")  # an earlier one is replaced
     (tmp_path / "out" / "mine.txt").write_text("keep")
     with pytest.raises(OutputError, match=r"holds 'mine\.txt'"):
-        write_validation(validation, tmp_path / "out")
+        write_page(validation, tmp_path / "out")
     assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
     with pytest.raises(OutputError, match="a file has this name"):
-        write_validation(validation, tmp_path / "out" / "mine.txt")
+        write_page(validation, tmp_path / "out" / "mine.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
@@ -109,7 +110,7 @@ def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
         """After it nothing is done any more."""
 
     validation = Validation("colmap", 7, (trial(0),))
-    page = write_validation(validation, tmp_path / "out")
+    page = write_page(validation, tmp_path / "out")
     before, renamed = page.read_text(), []
 
     def rename(*given: Any) -> None:
@@ -125,7 +126,7 @@ def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
     with monkeypatch.context() as patch, pytest.raises(KilledError):
         patch.setattr("sfm.files.whole_files.move", rename)
         patch.setattr(shutil, "rmtree", rmtree)
-        write_validation(validation, tmp_path / "out")
+        write_page(validation, tmp_path / "out")
     remove_leftovers(tmp_path / "out")
     assert page.read_text() == before
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -153,7 +154,7 @@ def measured_again(network: Network) -> Network:
 def test_comparison_is_written_with_every_point(
     moved: tuple[ResultComparison, np.ndarray], tmp_path: Path
 ) -> None:
-    path = write_differences(*moved, tmp_path / "out")
+    path = write_page(moved[0], tmp_path / "out", xyz=moved[1])
     with (tmp_path / "out" / "differences.csv").open() as file:
         rows = {row["id"]: row for row in csv.DictReader(file)}
     assert len(rows) == 20
@@ -176,7 +177,7 @@ def test_comparison_is_written_with_every_point(
 def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("bare"), model="opencv", images=5, points=20)
     found = compare_results(Solution("a", network, truth), Solution("b", measured_again(network), truth))
-    page = write_differences(found, truth.points, tmp_path / "out").read_text()
+    page = write_page(found, tmp_path / "out", xyz=truth.points).read_text()
     verdict = verdict_of_comparison(found)
     assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.remarks[0].text in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
@@ -188,10 +189,10 @@ def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None
     a, b = (Solution(name, network, truth, covariance) for name in "ab")
     found = compare_results(a, b)
     assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
-    page = write_differences(found, truth.points, tmp_path / "out").read_text()
+    page = write_page(found, tmp_path / "out", xyz=truth.points).read_text()
     (said,) = verdict_of_comparison(found).remarks
     assert said.kind == "same_image_points" and said.number("share") == 1.0 and bound(said.text) in page
-    write_differences(found, truth.points, tmp_path / "out")  # again, over its own files
+    write_page(found, tmp_path / "out", xyz=truth.points)  # again, over its own files
 
 
 def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
@@ -210,7 +211,7 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
         align="cameras",
     )
     assert kinds_of(verdict_of_comparison(photographs_only).remarks) == ("no_common_points",)
-    write_differences(photographs_only, truth.points[:0], tmp_path / "out")
+    write_page(photographs_only, tmp_path / "out", xyz=truth.points[:0])
 
 
 def test_sigmas_of_one_result_are_enough() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sfm.comparison.significance import compare_results
-from sfm.report.differences import write_differences
+from sfm.report.pages import write_page
 from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import make_network, seed_of
@@ -27,9 +27,8 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shift[:, 0] = np.arange(20) ** 2 * 1e-4 * (-1.0) ** np.arange(20)
     other = replace(truth, points=truth.points + shift)
     a, b = Solution("a", network, truth, unit="m"), Solution("b", network, other, unit="m")
-    return write_differences(
-        compare_results(a, b, align="none"), truth.points, tmp_path_factory.mktemp("page") / "out"
-    )
+    found = compare_results(a, b, align="none")
+    return write_page(found, tmp_path_factory.mktemp("page") / "out", xyz=truth.points)
 
 
 def cells(page: Any, column: int) -> list[str]:

@@ -71,7 +71,8 @@ def epochs(
         from sfm.epochs.findings import verdict_of_epochs
         from sfm.epochs.series import analyse_epochs
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.epochs import words_of_block, words_of_stable, write_epochs
+        from sfm.report.epochs import words_of_block, words_of_stable
+        from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
     if len(results) < 2:
@@ -96,7 +97,7 @@ def epochs(
             alpha=alpha,
             together=together,
         )
-    page = write_epochs(found, out)
+    page = write_page(found, out)
     tell_verdict(verdict_of_epochs(found))
     for pair in found.pairs:
         print(" to ".join(pair.displacements.differences.names))

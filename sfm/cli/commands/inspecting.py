@@ -115,7 +115,7 @@ def accept(
         from sfm.cli.console import tell_verdict
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.acceptance import accept_result, read_lengths
-        from sfm.report.acceptance import write_acceptance
+        from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
     with working_on(str(source)):
@@ -132,7 +132,7 @@ def accept(
         coverage=coverage,
         diagonal=diagonal,
     )
-    page = write_acceptance(found, out)
+    page = write_page(found, out)
     tell_verdict(found.verdict)
     print(f"largest error of a length: {found.largest:.4g} {found.unit}")
     print(f"Report: {page}")

@@ -219,7 +219,8 @@ def network_command(
         from sfm.planning.sight.image_precision import TargetImage
         from sfm.planning.sight.visibility import Seeing
         from sfm.planning.wanted import Wanted
-        from sfm.report.planning import figures, write_plan
+        from sfm.report.pages import write_page
+        from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress
 
@@ -263,7 +264,7 @@ def network_command(
                 object_, one, allowed, seeing, wanted, max_photographs=photographs, bars=bars
             )
             found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
-    page = write_plan(found, out)
+    page = write_page(found, out)
     tell_verdict(verdict_of_plan(found))
     for what, value in figures(found):
         print(f"  {what}: {value}")

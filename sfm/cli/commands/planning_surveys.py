@@ -77,7 +77,8 @@ def more_command(
         from sfm.errors import GeometryError
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.further import further_photographs
-        from sfm.report.further import headline, weakest, write_further
+        from sfm.report.further import headline, weakest
+        from sfm.report.pages import write_page
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress
 
@@ -98,7 +99,7 @@ def more_command(
         found = further_photographs(
             network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
         )
-    page = write_further(found, stored, out)
+    page = write_page(found, out, result=stored)
     print(headline(found, stored))
     for name, before, after in weakest(found, stored):
         print(f"  point {name}: {before} -> {after}")

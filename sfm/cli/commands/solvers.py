@@ -34,14 +34,15 @@ def validate(
         from sfm.cli.console import tell_verdict
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.validation import ended, in_words, largest, verdict_of_validation, write_validation
+        from sfm.report.pages import write_page
+        from sfm.report.validation import ended, in_words, largest, verdict_of_validation
         from sfm.runtime.progress_bar import drawn_progress
 
     load_pycolmap()  # without it there is nothing to compare, which is no verdict on a network
     refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
-    page = write_validation(found, out)
+    page = write_page(found, out)
     tell_verdict(verdict_of_validation(found))
     for kind, count in found.counts():
         print(f"{count} of {networks} networks: {ended(kind)}")
@@ -80,12 +81,8 @@ def compare(
         from sfm.comparison.findings import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.differences import (
-            largest_difference,
-            words_of_pairing,
-            words_of_scale,
-            write_differences,
-        )
+        from sfm.report.differences import largest_difference, words_of_pairing, words_of_scale
+        from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
     with working_on(str(a)):
@@ -98,7 +95,7 @@ def compare(
     found = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
-    page = write_differences(found, xyz, out)
+    page = write_page(found, out, xyz=xyz)
     print(
         f"{words_of_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
         f"{words_of_scale(found)}"

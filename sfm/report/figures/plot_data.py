@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from sfm.conventions import FloatArray, IntArray
 
@@ -15,6 +16,7 @@ class Plot:
     caption: str
     png: bytes
     panels: tuple[bytes, ...]  # PNG each, row by row: a page puts as many beside one another as are legible
+    kind: ClassVar[str] = "figure"  # among the parts of a page
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
+from sfm.report.page import Page
 from sfm.report.phrases import NORMAL_95, PHRASES
 from sfm.report.template_cache import template_cache
 from sfm.report.viewer.embedded import Viewer
@@ -62,6 +63,21 @@ def render(
         )
         context |= {"viewer": viewer, "policy": policy}
     return environment().get_template(template).render(context)
+
+
+def html(page: Page) -> str:
+    """Return a declared page as HTML."""
+    return render(
+        "declared.html",
+        viewer=page.viewer,
+        pictures_beside=page.pictures_beside,
+        page=page,
+        kind=page.kind,
+        title=page.title,
+        headline=page.verdict.headline,
+        level=page.verdict.level,
+        remarks=page.verdict.lines,
+    )
 
 
 def data_url(data: bytes, kind: str) -> str:

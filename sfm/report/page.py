@@ -1,0 +1,289 @@
+"""Declared pages: what a page shows, and its tables as text, CSV and JSON. `html.page` renders it as HTML.
+
+A page is sections of tables, figures and words below a verdict. Its tables hold plain values; columns say how
+a value is named and written, so that the page, the terminal and the files beside the page share one table.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+from urllib.parse import quote
+
+import numpy as np
+from markupsafe import Markup
+
+from sfm.display import counted
+from sfm.files.plain_text import csv_text, or_none
+from sfm.remarks.verdict import Line, Verdict
+from sfm.report.figures.plot_data import Plot
+from sfm.report.numbers import significant
+from sfm.report.viewer.embedded import Viewer
+
+MAX_ROWS = 2000  # of a table of a page; files have all
+
+Format = str | Callable[[Any], str]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A word of a table with the colour of a level."""
+
+    text: str
+    level: str  # good, fair or bad
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __html__(self) -> str:
+        """Return it for a template."""
+        return Markup('<span class="mark {}">{}</span>').format(self.level, self.text)
+
+
+@dataclass(frozen=True)
+class Link:
+    """A word of a table that leads to a file beside the page."""
+
+    text: str
+    path: str  # from the folder of the page, as the disk knows it
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __html__(self) -> str:
+        """Return it for a template."""
+        return Markup('<a href="{}">{}</a>').format(quote(self.path), self.text)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: how its values are named and written."""
+
+    title: str | None = ""  # heading on the page; None: only in files
+    name: str = ""  # heading in files; empty: only on the page
+    unit: str = ""  # on the page, in brackets behind the title
+    format: Format | None = None  # of numbers: a format specification or a function; None: a text
+    factor: float = 1.0  # from the unit of files to that of the page
+    flag: tuple[str, str] = ("", "yes")  # on the page for what is not true and what is
+    unknown: str | None = None  # in place of NaN on the page; None: what the format makes of it
+
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else f"{self.title}"
+
+    def cell(self, value: Any) -> str | Mark | Link:
+        """Return a value as the page shows it."""
+        if value is None:
+            return ""
+        if isinstance(value, str | Mark | Link):
+            return value
+        if isinstance(value, bool | np.bool_):
+            return self.flag[int(value)]
+        if self.unknown is not None and math.isnan(value):
+            return self.unknown
+        if self.format is None or self.format is str:
+            return str(value)
+        number = value if self.factor == 1 else value * self.factor
+        return format(number, self.format) if isinstance(self.format, str) else self.format(number)
+
+
+def axes(
+    prefix: str, unit: str = "", format: Format = significant, *, factor: float = 1.0, parts: str = "XYZ"
+) -> tuple[Column, ...]:
+    """Return columns of a vector, with the same names on the page and in files."""
+    return tuple(Column(prefix + one, prefix + one, unit, format, factor) for one in parts)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of plain values below columns; a page shows the first ones."""
+
+    columns: tuple[Column, ...]
+    rows: Sequence[Sequence[Any]]
+    file: str = ""  # name of the CSV file without its ending; empty: it has none
+    facts: bool = False  # names and words without a header
+    kind: ClassVar[str] = "table"
+
+    @property
+    def shown(self) -> tuple[tuple[int, Column], ...]:
+        """The columns on the page, with their places in the rows."""
+        return tuple((k, one) for k, one in enumerate(self.columns) if one.title is not None)
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The headings on the page, those of numbers with ">" before them."""
+        return tuple(("" if one.format is None else ">") + one.heading for _, one in self.shown)
+
+    @property
+    def cells(self) -> Iterable[tuple[str | Mark | Link, ...]]:
+        """The rows as the page shows them."""
+        shown = self.shown
+        return (tuple(one.cell(row[k]) for k, one in shown) for row in self.rows[:MAX_ROWS])
+
+    @property
+    def cut(self) -> str:
+        """How many of the rows the page shows; empty where all."""
+        if len(self.rows) <= MAX_ROWS:
+            return ""
+        where = f"; all are in {self.file}.csv" if self.file else ""
+        return f"The first {MAX_ROWS} of {counted(len(self.rows), 'row')}{where}."
+
+    @property
+    def csv(self) -> str:
+        """The table as CSV, with all digits."""
+        named = [(k, one.name) for k, one in enumerate(self.columns) if one.name]
+        rows = ([_plain(row[k]) for k, _ in named] for row in self.rows)
+        return csv_text([name for _, name in named], rows)
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The rows for JSON, by the names of the columns in files."""
+        named = [(k, one.name) for k, one in enumerate(self.columns) if one.name]
+        return [{name: plain(row[k]) for k, name in named} for row in self.rows]
+
+    @property
+    def text(self) -> str:
+        """The table in columns of plain text, numbers at the right."""
+        shown = [one for _, one in self.shown]
+        rows = [[str(cell) for cell in row] for row in self.cells]
+        if not self.facts:
+            rows.insert(0, [one.heading for one in shown])
+        width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = (
+            "  ".join(
+                cell.ljust(w) if one.format is None else cell.rjust(w)
+                for cell, w, one in zip(row, width, shown, strict=True)
+            )
+            for row in rows
+        )
+        return "".join(f"{line.rstrip()}\n" for line in lines)
+
+
+def facts(rows: Sequence[tuple[str, str]]) -> Table:
+    """Return names and what is stated of each."""
+    return Table((Column(), Column()), rows, facts=True)
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading within a section."""
+
+    text: str
+    kind: ClassVar[str] = "heading"
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Sentences."""
+
+    text: str
+    kind: ClassVar[str] = "paragraph"
+
+
+@dataclass(frozen=True)
+class Note:
+    """Sentences that explain what is beside them."""
+
+    text: str
+    kind: ClassVar[str] = "note"
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Parts that a click unfolds."""
+
+    summary: str
+    parts: tuple[Part, ...]
+    open: bool = False
+    kind: ClassVar[str] = "folded"
+
+
+Part = Table | Plot | Heading | Paragraph | Note | Folded
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page with a title."""
+
+    title: str
+    parts: tuple[Part | None, ...]  # None: left out
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A figure that a reader sees first."""
+
+    name: str
+    value: object
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Banner:
+    """A verdict on what is not judged by remarks."""
+
+    level: str
+    headline: str
+    lines: tuple[Line, ...] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows, and the files beside it."""
+
+    name: str  # of the page and of its JSON, without endings
+    kind: str  # line above the title
+    title: str
+    verdict: Verdict | Banner
+    sections: tuple[Section | None, ...]  # None: left out
+    tiles: tuple[Tile, ...] = ()
+    viewer: Viewer | None = None
+    pictures_beside: bool = False  # whether the scene shows pictures that lie beside the page
+    summary: Mapping[str, Any] | None = None  # for NAME.json; values that are not finite become null
+    files: tuple[Table, ...] = ()  # tables that are written beside those of the sections
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """The tables with a file."""
+        parts = [part for section in self.sections if section for part in _unfolded(section.parts)]
+        found = (*self.files, *(part for part in parts if isinstance(part, Table)))
+        return tuple(one for one in found if one.file)
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The text files beside the page by name."""
+        found = {f"{one.file}.csv": one.csv for one in self.tables}
+        if self.summary is not None:
+            text = json.dumps(plain(self.summary), indent=2, ensure_ascii=False, allow_nan=False)
+            found[f"{self.name}.json"] = text + "\n"
+        return found
+
+
+def plain(value: Any) -> Any:
+    """Return a value for JSON: numbers that are not finite as None, arrays and tuples as lists."""
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    if isinstance(value, np.integer | np.bool_):
+        return value.item()
+    return or_none(float(value)) if isinstance(value, float | np.floating) else value
+
+
+def _plain(value: Any) -> Any:
+    """Return the value of a cell of a file, 0 or 1 for what is true or not."""
+    return int(value) if isinstance(value, bool | np.bool_) else value
+
+
+def _unfolded(parts: Iterable[Part | None]) -> Iterable[Part]:
+    for part in parts:
+        if isinstance(part, Folded):
+            yield from _unfolded(part.parts)
+        elif part is not None:
+            yield part
