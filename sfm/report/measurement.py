@@ -1,9 +1,8 @@
-"""A measured result as tables, JSON, drawing and page."""
+"""The page of a measured result."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,91 +12,244 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.display import counted, plural
 from sfm.files.covariance_file import MAX_POINTS, write_covariance
-from sfm.files.folder_lock import locked
-from sfm.files.plain_text import csv_text, or_none
-from sfm.files.whole_files import remove_leftovers, whole_folder
+from sfm.geometry.alignment import Alignment
 from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
 from sfm.inspection.measure import Measurement
 from sfm.report.figures.measurements import deviation_figure
 from sfm.report.figures.plots import plot
-from sfm.report.html.page import render
+from sfm.report.numbers import fixed, general, signed, significant, with_sigma
+from sfm.report.page import (
+    Column,
+    Folded,
+    Heading,
+    Note,
+    Page,
+    Part,
+    Section,
+    Table,
+    Tile,
+    axes,
+    facts,
+)
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.solution import Solution
 
-POINT_COLUMNS = ("id", "X", "Y", "Z", "sX", "sY", "sZ", "group")
-SHAPE_COLUMNS = ("shape", "kind", "parameter", "axis", "value", "sigma", "unit")
-RESIDUAL_COLUMNS = ("shape", "point", "deviation", "sigma", "w", "used")
-QUANTITY_COLUMNS = ("name", "what", "value", "sigma", "unit", "remark")
-DEVIATION_COLUMNS = (
-    *("tolerance", "point", "dX", "dY", "dZ", "deviation", "sigma", "U", "lower", "upper", "decision"),
-)
-MAX_ROWS_SHOWN = 2000  # of a table of the page
-PAGE = "measurement.html"
-
-Writer = Callable[[Path], None]
+METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}
+USED = ("no", "yes")
 
 
-def write_measurement(
-    found: Measurement, result: Solution, out: Path, *, drawings: Sequence[tuple[str, Writer]] = ()
-) -> Path:
-    """Write a measured result into a folder and return the path of its page.
+def page(found: Measurement, *, result: Solution) -> Page:
+    """Return the page: verdict, tolerances, shapes, functions and points.
 
     Args:
         found: what was measured.
-        result: that it was measured in, for the scene of the page.
-        out: the folder.
-        drawings: name of a file, and what writes it, of formats of other programs.
-
-    Raises:
-        OutputError: the folder holds something else or cannot be written.
+        result: that it was measured in, for the scene.
     """
-    text = json.dumps(measurement_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
-    texts = {
-        "points.csv": csv_text(POINT_COLUMNS, point_rows(found)),
-        "shapes.csv": csv_text(SHAPE_COLUMNS, shape_rows(found)),
-        "shape_points.csv": csv_text(RESIDUAL_COLUMNS, residual_rows(found)),
-        "quantities.csv": csv_text(QUANTITY_COLUMNS, quantity_rows(found)),
-        "deviations.csv": csv_text(DEVIATION_COLUMNS, deviation_rows(found)),
-        "measurement.json": text + "\n",
-        PAGE: measurement_page(found, scene_viewer(found, result)),
-    }
-    with locked(out.parent / f".{out.name}.lock", out):
-        remove_leftovers(out)
-        with whole_folder(out, "the result", replaceable=True) as folder:
-            for name, content in texts.items():
-                (folder / name).write_text(content, encoding="utf-8", newline="")
-            covariance = found.points.covariance
-            if covariance is not None and covariance.ndim == 2 and len(found.points.names) <= MAX_POINTS:
-                write_covariance(folder, covariance, found.points.names, None)
-            for name, write in drawings:
-                write(folder / name)
-    return out / PAGE
-
-
-def point_rows(found: Measurement) -> list[tuple[object, ...]]:
-    """Return the rows of points.csv."""
-    sigma = point_sigma(found)
-    return [
-        (name, *found.points.xyz[j], *sigma[j], found.group_of(j))
-        for j, name in enumerate(found.points.names)
+    points, u = found.points, found.unit
+    groups = counted(len(found.groups), "group") if found.groups else ""
+    quantities = quantity_table(found)
+    columns = (
+        *(Column("point", "id"), *axes("", u, ".9g"), *axes("s", u)),
+        Column("group", "group"),
+    )
+    rows = [
+        (name, *xyz, *sigma, found.group_of(j))
+        for j, (name, xyz, sigma) in enumerate(zip(points.names, points.xyz, point_sigma(found), strict=True))
     ]
+    return Page(
+        "measurement",
+        "Measurement",
+        found.name,
+        found.verdict,
+        (
+            Section("Tolerances", _tolerances(found)) if found.tolerances else None,
+            Section("Shapes", tuple(part for fit in found.shapes for part in _shape(found, fit)))
+            if found.shapes
+            else None,
+            Section("Distances, angles and heights", (quantities,)) if quantities.rows else None,
+            Section("Alignment", _alignment(found.alignment, u)) if found.alignment else None,
+            Section("Points", (Folded(counted(len(rows), "point"), (Table(columns, rows, "points"),)),)),
+        ),
+        tiles=(
+            Tile("Points", len(points.names), groups),
+            Tile("Shapes", len(found.shapes)),
+            *(
+                Tile(
+                    one.name,
+                    f"{one.count('in')} of {len(one.points)} in",
+                    f"{one.count('out')} out, {one.count('undecided')} undecided, against {one.against}",
+                )
+                for one in found.tolerances[:3]
+            ),
+        ),
+        viewer=scene_viewer(found, result),
+        summary=_summary(found, quantities),
+        files=(
+            _parameters(found, found.shapes),
+            _shape_points(found, found.shapes),
+            *(() if quantities.rows else (quantities,)),
+            _deviations(found, found.tolerances),
+        ),
+    )
+
+
+def write_point_covariance(found: Measurement, folder: Path) -> None:
+    """Write the joint covariance of the points, if it is known and there are not too many."""
+    covariance = found.points.covariance
+    if covariance is not None and covariance.ndim == 2 and len(found.points.names) <= MAX_POINTS:
+        write_covariance(folder, covariance, found.points.names, None)
+
+
+def _tolerances(found: Measurement) -> tuple[Part, ...]:
+    """Return how many deviations are decided in which way, and every deviation."""
+    u = found.unit
+    columns = (
+        *(Column(), Column("against"), Column("lower", "", u, significant)),
+        *(Column("upper", "", u, significant), *(Column(one, format=str) for one in DECISIONS)),
+        Column("not measured", format=str),
+    )
+    rows = [
+        (one.name, one.against, one.lower, one.upper, *map(one.count, DECISIONS), len(one.missing))
+        for one in found.tolerances
+    ]
+    note = Note(
+        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma where a tolerance says nothing else: in "
+        "and out are proven, undecided is what lies within U of a limit."
+    )
+    parts: list[Part] = [Table(columns, rows), note]
+    for k, one in enumerate(found.tolerances):
+        caption = f"Deviations of {one.name} from {one.against}, with its limits."
+        folded = Folded(counted(len(one.points), "deviation"), (_deviations(found, [one], file=""),))
+        parts += [Heading(one.name), plot(f"deviations {k}", caption, deviation_figure(one, u)), folded]
+    return tuple(parts)
+
+
+def _deviations(found: Measurement, those: Iterable[Deviations], *, file: str = "deviations") -> Table:
+    """Return the deviations of tolerances."""
+    u = found.unit
+    columns = (
+        *(Column(None, "tolerance"), Column("point", "point"), *axes("d", u, signed)),
+        *(Column("deviation", "deviation", u, signed), Column("sigma", "sigma", u, significant)),
+        *(Column(None, "U"), Column(None, "lower"), Column(None, "upper"), Column("decision", "decision")),
+    )
+    rows = [
+        (one.name, found.points.names[j], *d, v, s, one.coverage * s, one.lower, one.upper, decision)
+        for one in those
+        for j, d, v, s, decision in zip(
+            one.points, one.vector, one.value, one.sigma, one.decision, strict=True
+        )
+    ]
+    return Table(columns, rows, file)
+
+
+def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
+    """Return what is shown of a shape."""
+    u, size = found.unit, len(fit.used)
+    sigma0 = "not known" if np.isnan(fit.sigma0) else fixed(fit.sigma0, 3)
+    if fit.weights != "network" and np.isfinite(fit.sigma0):
+        sigma0 = f"{significant(fit.sigma0)} {u}"
+    span = "twice the largest distance" if fit.distances.shape[1] == 2 else "largest minus smallest distance"
+    used = "" if fit.used.all() else f" of {size}, the others contradict them"
+    rows = [
+        ("Points", f"{fit.used.sum()}{used}"),
+        ("RMS distance", f"{significant(fit.rms)} {u}"),
+        ("Form error", f"{significant(fit.form_error)} {u}, {span}"),
+    ]
+    network = f"covariance of the points{'' if found.points.correlated else ', each by itself'}"
+    rows.append(("Weights", network if fit.weights == "network" else "equal"))
+    rows.append(("Sigma0", f"{sigma0}, redundancy {fit.redundancy}"))
+    if fit.weights == "network" and fit.fits is not None:
+        said = "as" if fit.fits else "larger than"
+        limit = f"{significant(fit.statistic)}, limit {significant(fit.critical)}"
+        rows.append(("Test of the residuals", f"{said} the precision of the points: {limit}"))
+    source = "the residuals" if fit.from_residuals else "the covariance of the points"
+    rows.append(("Standard deviations from", source))
+    if fit.offset:
+        rows.append(("Offset of the targets", f"{signed(fit.offset)} {u} along the normal"))
+    points = _shape_points(found, [fit], file="")
+    return (
+        Heading(f"{fit.name}: {fit.shape.kind.name}"),
+        _parameters(found, [fit], file=""),
+        facts(rows),
+        Folded(counted(len(fit.points), "point"), (points,)),
+    )
+
+
+def _parameters(found: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shapes") -> Table:
+    """Return the parameters of shapes, angles in degrees."""
+    columns = (
+        *(Column(None, "shape"), Column(None, "kind"), Column("parameter"), Column(None, "parameter")),
+        *(Column(None, "axis"), Column(None, "value"), Column(None, "sigma"), Column("value", format=str)),
+        *(Column("sigma", format=str), Column("unit"), Column(None, "unit")),
+    )
+    rows = [
+        (
+            *(fit.name, fit.shape.kind.name, f"{name} {axis}".rstrip(), name, axis, value, sigma),
+            *(*with_sigma(value, sigma), "" if unit == "1" else unit, unit),
+        )
+        for fit in shapes
+        for name, axis, value, sigma, unit in parameter_rows(fit, found.unit)
+    ]
+    return Table(columns, rows, file)
+
+
+def _shape_points(found: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shape_points") -> Table:
+    """Return the distances of points from shapes."""
+    u = found.unit
+    columns = (
+        *(Column(None, "shape"), Column("point", "point"), Column("deviation", "deviation", u, signed)),
+        Column("sigma", "sigma", u, significant),
+        Column("w", "w", format="z.2f", unknown=""),
+        Column("used", "used", flag=USED),
+    )
+    rows = [
+        (fit.name, found.points.names[j], *values)
+        for fit in shapes
+        for j, *values in zip(fit.points, fit.deviation, fit.sigma, fit.w, fit.used, strict=True)
+    ]
+    return Table(columns, rows, file)
+
+
+def quantity_table(found: Measurement) -> Table:
+    """Return distances, angles and heights, angles in degrees."""
+    columns = (
+        *(Column("", "name"), Column("of", "what"), Column(None, "value"), Column(None, "sigma")),
+        *(Column("value", format=str), Column("sigma", format=str), Column("unit", "unit")),
+        Column("remark", "remark"),
+    )
+    rows = []
+    for one in found.quantities:
+        text = " ".join(said.text for said in one.remarks) or None
+        factor, unit = (float(np.rad2deg(1.0)), "deg") if one.kind == "angle" else (1.0, found.unit)
+        value, sigma = one.value * factor, one.sigma * factor
+        rows.append((one.name, one.what, value, sigma, *with_sigma(value, sigma), unit, text))
+    return Table(columns, rows, "quantities")
+
+
+def _alignment(found: Alignment, u: str) -> tuple[Part, ...]:
+    """Return how the points were aligned, and the differences from nominal points."""
+    fit = found.fitted
+    if fit is None:
+        return (facts([("Method", METHODS[found.method])]),)
+    sigma0 = "not known" if np.isnan(fit.sigma0) else significant(fit.sigma0)
+    rows = [
+        ("Method", METHODS[found.method]),
+        ("Points", f"{fit.used.sum()} of {len(fit.used)}"),
+        ("Scale", f"{general(fit.scale, 10)} {'fitted' if found.scaled else 'kept'}"),
+        ("Sigma0", f"{sigma0}, redundancy {fit.redundancy}"),
+    ]
+    columns = (Column("point"), *axes("d", u, signed), Column("used", flag=USED))
+    differences = [(n, *d, used) for n, d, used in zip(fit.names, fit.difference, fit.used, strict=True)]
+    title = f"{len(fit.names)} differences, aligned minus nominal"
+    return facts(rows), Folded(title, (Table(columns, differences),))
 
 
 def point_sigma(found: Measurement) -> FloatArray:
     """Return the standard deviations of the points, NaN where not known, object unit, (n, 3)."""
     return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", found.points.blocks), 0.0)))
-
-
-def shape_rows(found: Measurement) -> list[tuple[object, ...]]:
-    """Return the rows of shapes.csv, angles in degrees."""
-    return [
-        (fit.name, fit.shape.kind.name, name, axis, value, sigma, unit)
-        for fit in found.shapes
-        for name, axis, value, sigma, unit in parameter_rows(fit, found.unit)
-    ]
 
 
 def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, float, str]]:
@@ -114,38 +266,8 @@ def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, floa
     return rows
 
 
-def residual_rows(found: Measurement) -> list[tuple[object, ...]]:
-    """Return the rows of shape_points.csv."""
-    return [
-        (fit.name, found.points.names[j], d, s, w, int(used))
-        for fit in found.shapes
-        for j, d, s, w, used in zip(fit.points, fit.deviation, fit.sigma, fit.w, fit.used, strict=True)
-    ]
-
-
-def quantity_rows(found: Measurement) -> list[tuple[str, str, float, float, str, str]]:
-    """Return the rows of quantities.csv, angles in degrees."""
-    rows = []
-    for one in found.quantities:
-        text = " ".join(said.text for said in one.remarks)
-        factor, unit = (float(np.rad2deg(1.0)), "deg") if one.kind == "angle" else (1.0, found.unit)
-        rows.append((one.name, one.what, one.value * factor, one.sigma * factor, unit, text))
-    return rows
-
-
-def deviation_rows(found: Measurement) -> list[tuple[object, ...]]:
-    """Return the rows of deviations.csv."""
-    return [
-        (one.name, found.points.names[j], *d, v, s, one.coverage * s, one.lower, one.upper, decision)
-        for one in found.tolerances
-        for j, d, v, s, decision in zip(
-            one.points, one.vector, one.value, one.sigma, one.decision, strict=True
-        )
-    ]
-
-
-def measurement_summary(found: Measurement) -> dict[str, Any]:
-    """Return what measurement.json holds: plain values only, None for what is not known."""
+def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
+    """Return what measurement.json holds."""
     alignment = None
     if found.alignment is not None:
         T, fit = found.alignment.aligned_from_object, found.alignment.fitted
@@ -159,11 +281,11 @@ def measurement_summary(found: Measurement) -> dict[str, Any]:
             else {
                 "points": int(fit.used.sum()),
                 "held_out": [n for n, used in zip(fit.names, fit.used, strict=True) if not used],
-                "rms": or_none(float(np.sqrt((fit.difference[fit.used] ** 2).mean()))),
-                "sigma0": or_none(fit.sigma0),
+                "rms": float(np.sqrt((fit.difference[fit.used] ** 2).mean())),
+                "sigma0": fit.sigma0,
                 "redundancy": fit.redundancy,
-                "statistic": or_none(fit.statistic),
-                "critical": or_none(fit.critical),
+                "statistic": fit.statistic,
+                "critical": fit.critical,
             },
         }
     return {
@@ -175,16 +297,13 @@ def measurement_summary(found: Measurement) -> dict[str, Any]:
         "groups": {name: [found.points.names[j] for j in members] for name, members in found.groups},
         "alignment": alignment,
         "shapes": [_shape_summary(found, fit) for fit in found.shapes],
-        "quantities": [
-            {"name": n, "what": what, "value": v, "sigma": or_none(s), "unit": unit, "remark": remark or None}
-            for n, what, v, s, unit, remark in quantity_rows(found)
-        ],
+        "quantities": quantities.records,
         "tolerances": [
             {
                 "name": one.name,
                 "against": one.against,
-                "lower": or_none(one.lower),
-                "upper": or_none(one.upper),
+                "lower": one.lower,
+                "upper": one.upper,
                 "coverage": one.coverage,
                 "points": len(one.points),
                 **{decision.replace(" ", "_"): one.count(decision) for decision in DECISIONS},
@@ -203,16 +322,16 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
         "points": int(fit.used.sum()),
         "left_out": [found.points.names[j] for j in fit.points[~fit.used]],
         "parameters": [
-            {"name": f"{name}{f' {axis}' if axis else ''}", "value": v, "sigma": or_none(s), "unit": unit}
+            {"name": f"{name}{f' {axis}' if axis else ''}", "value": v, "sigma": s, "unit": unit}
             for name, axis, v, s, unit in parameter_rows(fit, found.unit)
         ],
-        "covariance": [[or_none(v) for v in row] for row in fit.covariance],
+        "covariance": fit.covariance,
         "rms": fit.rms,
         "form_error": fit.form_error,
-        "sigma0": or_none(fit.sigma0),
+        "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
-        "statistic": or_none(fit.statistic),
-        "critical": or_none(fit.critical),
+        "statistic": fit.statistic,
+        "critical": fit.critical,
         "converged": fit.converged,
     }
 
@@ -271,30 +390,3 @@ def worst_deviation(found: Measurement) -> FloatArray:
         larger = ~(np.abs(value) <= np.abs(worst[one.points]))
         worst[one.points[larger]] = value[larger]
     return worst
-
-
-def measurement_page(found: Measurement, viewer: Viewer | None) -> str:
-    """Return the page: verdict, tolerances, shapes, functions and points."""
-    pictures = [
-        plot(
-            f"deviations {k}",
-            f"Deviations of {one.name} from {one.against}, with its limits.",
-            deviation_figure(one, found.unit),
-        )
-        for k, one in enumerate(found.tolerances)
-    ]
-    verdict = found.verdict
-    return render(
-        "measurement.html",
-        viewer=viewer,
-        m=found,
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        pictures=pictures,
-        decisions=DECISIONS,
-        parameters=[parameter_rows(fit, found.unit) for fit in found.shapes],
-        quantities=quantity_rows(found),
-        sigma=point_sigma(found),
-        shown=MAX_ROWS_SHOWN,
-    )

@@ -7,7 +7,6 @@ import tomllib
 from pathlib import Path
 
 from sfm.inspection.features_file import FeaturesFile, HeldSettings, read_features_file
-from sfm.report.measurement import PAGE
 from tests.places import ROOT
 
 TEXT = (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
@@ -31,7 +30,7 @@ def test_features_files_of_the_page_are_read_and_show_every_key(tmp_path: Path) 
         assert shown[key] == {field.alias or name for name, field in kind.model_fields.items()}, key
     for name in HeldSettings.model_fields:
         assert re.search(rf"\b{name}\b", TEXT), name
-    assert PAGE in TEXT
+    assert "measurement.html" in TEXT
 
 
 BLOCK = re.findall(r"```toml\n(.*?)```", TEXT, re.S)[0]

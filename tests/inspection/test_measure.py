@@ -18,7 +18,8 @@ from sfm.errors import KolinearError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.remarks.remark import kinds_of
-from sfm.report.measurement import words_of_measured, write_measurement
+from sfm.report.measurement import words_of_measured
+from sfm.report.pages import write_page
 from sfm.solution import Solution
 from tests.inspection.benches import (
     DIAMETERS,
@@ -229,7 +230,7 @@ def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
 def test_a_result_without_features_gives_its_points(tmp_path: Path) -> None:
     found = measure_result(one_bench())
     assert words_of_measured(found) == "85 points." and found.verdict.level == "good"
-    page = write_measurement(found, one_bench(), tmp_path / "out")
+    page = write_page(found, tmp_path / "out", result=one_bench())
     assert page.is_file()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,6 @@ NOT_KEPT = 1  # exit code where a limit is proven not to be kept
 MAX_PRINTED = 40  # distances, angles and heights; all of them stand in quantities.csv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from sfm.inspection.measure import Measurement
 
 
@@ -52,15 +51,16 @@ def measure(
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.features_file import read_features_file
         from sfm.inspection.measure import measure_result
-        from sfm.report.measurement import parameter_rows, quantity_rows, words_of_measured, write_measurement
+        from sfm.report.measurement import parameter_rows, quantity_table, words_of_measured
         from sfm.report.numbers import with_sigma
+        from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
     asked, paths = (None, {}) if features is None else read_features_file(features, allow_outside=outside)
     with working_on(str(source)):
         result = read_comparable(source, from_format)
         found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
-    page = write_measurement(found, result, out, drawings=_drawings(found))
+    page = write_page(found, out, also=partial(_write_drawings, found), result=result)
     tell_verdict(found.verdict)
     print(words_of_measured(found))
     for fit in found.shapes:
@@ -71,9 +71,9 @@ def measure(
         ]
         what = f"{fit.shape.kind.name} {fit.name}: {', '.join((*said, ''))}"
         print(f"{what}form error {fit.form_error:.3g} {found.unit}, {counted(fit.used.sum(), 'point')}")
-    rows = quantity_rows(found)
-    for name, what, value, sigma, unit, remark in rows[:MAX_PRINTED]:
-        told = f"{name} ({what}): {' +- '.join(with_sigma(value, sigma))} {unit}"
+    rows = quantity_table(found).rows
+    for name, what, _, _, value, sigma, unit, remark in rows[:MAX_PRINTED]:
+        told = f"{name} ({what}): {value} +- {sigma} {unit}"
         print(f"{told}{f'; {remark}' if remark else ''}")
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
@@ -140,15 +140,13 @@ def accept(
         raise SystemExit(NOT_KEPT)
 
 
-def _drawings(found: Measurement) -> list[tuple[str, Callable[[Path], None]]]:
-    """Return the files of other programs that go with a measurement."""
-    from functools import partial
-
+def _write_drawings(found: Measurement, folder: Path) -> None:
+    """Write what goes with a measurement for other programs: covariance, point cloud and drawing."""
     import numpy as np
 
     from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
     from adapters.formats.ply import write_ply
-    from sfm.report.measurement import point_sigma
+    from sfm.report.measurement import point_sigma, write_point_covariance
 
     points = found.points
     sigma = point_sigma(found)
@@ -163,9 +161,8 @@ def _drawings(found: Measurement) -> list[tuple[str, Callable[[Path], None]]]:
             lines.append(DxfLine(fit.name, *ends))
         if shape.kind.name in ("circle", "cylinder", "torus"):
             circles.append(DxfCircle(fit.name, shape.origin, shape.axis, float(shape.form[0])))
-    return [
-        ("points.ply", partial(write_ply, names=points.names, xyz=points.xyz,
-                               sigma=sigma if np.isfinite(sigma).all() else None)),
-        ("measurement.dxf", partial(write_dxf, names=points.names, xyz=points.xyz, layers=layers, lines=lines,
-                                    circles=circles, texts=texts)),
-    ]  # fmt: skip
+    write_point_covariance(found, folder)
+    known = sigma if np.isfinite(sigma).all() else None
+    write_ply(folder / "points.ply", names=points.names, xyz=points.xyz, sigma=known)
+    write_dxf(folder / "measurement.dxf", names=points.names, xyz=points.xyz, layers=layers, lines=lines,
+              circles=circles, texts=texts)  # fmt: skip
