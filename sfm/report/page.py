@@ -106,6 +106,7 @@ class Table:
     rows: Sequence[Sequence[Any]]
     file: str = ""  # name of the CSV file without its ending; empty: it has none
     facts: bool = False  # names and words without a header
+    total: Sequence[Any] | None = None  # a last row, of sums or means, on the page
     kind: ClassVar[str] = "table"
 
     @property
@@ -121,8 +122,15 @@ class Table:
     @property
     def cells(self) -> Iterable[tuple[str | Mark | Link, ...]]:
         """The rows as the page shows them."""
-        shown = self.shown
-        return (tuple(one.cell(row[k]) for k, one in shown) for row in self.rows[:MAX_ROWS])
+        return map(self._cells, self.rows[:MAX_ROWS])
+
+    @property
+    def sums(self) -> tuple[str | Mark | Link, ...]:
+        """The last row as the page shows it, empty without one."""
+        return () if self.total is None else self._cells(self.total)
+
+    def _cells(self, row: Sequence[Any]) -> tuple[str | Mark | Link, ...]:
+        return tuple(one.cell(row[k]) for k, one in self.shown)
 
     @property
     def cut(self) -> str:

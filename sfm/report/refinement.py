@@ -1,4 +1,4 @@
-"""A model before and after refinement as a page, and its standard deviations as tables."""
+"""The page of a model before and after refinement, with its standard deviations."""
 
 from __future__ import annotations
 
@@ -10,24 +10,15 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted
-from sfm.files.plain_text import csv_text
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
 from sfm.report.findings.given_residuals import given_of
-from sfm.report.html.page import render
+from sfm.report.given import given_parts
 from sfm.report.numbers import general, significant
+from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes
 from sfm.survey.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
 from sfm.survey.refining.targets import PREFIX
 from sfm.survey.refining.windows import MIN_RAYS
-
-PAGE = "refinement.html"
-POINT_COLUMNS = ("point3D_id", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
-IMAGE_COLUMNS = (
-    *("image_id", "name", "X0", "Y0", "Z0", "sX0", "sY0", "sZ0"),
-    *("somega_deg", "sphi_deg", "skappa_deg", "key_points", "measured_anew", "rms_before_px", "rms_after_px"),
-)
-TARGET_COLUMNS = ("target", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
-CAMERA_COLUMNS = ("camera_id", "model", "parameter", "before", "after", "sigma")
 
 
 @dataclass(frozen=True)
@@ -36,28 +27,10 @@ class Numbers:
 
     image_ids: tuple[int, ...]  # of each photograph
     point_ids: tuple[int, ...]  # of each point
-    interior: tuple[tuple[object, ...], ...]  # rows of CAMERA_COLUMNS, sigma NaN where held
+    interior: tuple[tuple[object, ...], ...]  # camera, model, parameter, before, after, sigma; NaN: held
     in_rigs: int = 0  # photographs that belong to rigs of several cameras
     written: int = 0  # key points with a point in the files
     written_px: float = 0.0  # their RMS per coordinate by COLMAP
-
-
-def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict[str, str]:
-    """Return the page and the tables by the names of their files.
-
-    Args:
-        found: the model before and after.
-        numbers: as its file counts.
-        title: of the page, such as the folder of the model.
-    """
-    images = image_rows(found, numbers)
-    targets = {} if found.targets is None else {"targets.csv": csv_text(TARGET_COLUMNS, target_rows(found))}
-    return targets | {
-        "sigma_points.csv": csv_text(POINT_COLUMNS, _point_rows(found, numbers)),
-        "sigma_images.csv": csv_text(IMAGE_COLUMNS, images),
-        "sigma_cameras.csv": csv_text(CAMERA_COLUMNS, [[_blank(c) for c in row] for row in numbers.interior]),
-        PAGE: _page(found, numbers, images, title),
-    }
 
 
 def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
@@ -69,40 +42,114 @@ def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
     )
 
 
-def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title: str) -> str:
-    """Return the page."""
-    after, before = found.adjustment, found.readjusted
+def page(found: Refinement, *, numbers: Numbers, title: str) -> Page:
+    """Return the page: what changed, key points that took no part, targets, cameras and photographs.
+
+    Args:
+        found: the model before and after.
+        numbers: as its file counts.
+        title: of the page, such as the folder of the model.
+    """
     rigs = (remark("rigs_held_together", photographs=numbers.in_rigs),) if numbers.in_rigs else ()
     px = significant(found.before_px), significant(found.after_px)
     figures = f"RMS of the key points {px[0]} px before, {px[1]} px after"
     bad = f"Not dependable: {figures}"
-    verdict = judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad})
     unit = "object units" if found.targets is None else found.targets.unit
-    given = given_of(after, unit)
-    return render(
-        "refinement.html",
-        title=title,
-        unit=unit,
-        given=given,
-        targets=target_rows(found),
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        sizes=_sizes(found, numbers, unit),
-        found=found,
-        limits={"shift_px": MIN_SHIFT_PX, "shift_factor": MAX_SHIFT_FACTOR, "rays": MIN_RAYS},
-        after=after,
-        before=before,
-        interior=numbers.interior,
-        units=_units(found),
-        images=images,
+    return Page(
+        "refinement",
+        "Refinement of a COLMAP model",
+        title,
+        judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad}),
+        (
+            Section("Before and after", _changes(found, numbers, unit)),
+            Section("Key points that took no part", _reasons(found)),
+            None
+            if found.targets is None
+            else Section("Targets, control and scale bars", _targets(found, unit)),
+            Section("Cameras", _cameras(found, numbers)),
+            Section("Photographs", _photographs(found, numbers, unit)),
+        ),
+        files=(_points(found, numbers),),
     )
 
 
-def _units(found: Refinement) -> dict[str, str]:
-    """Return what stands behind the name of each interior parameter: its unit in brackets, if it has one."""
+def _changes(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:
+    columns = (
+        Column(),
+        *(Column(name, format=str) for name in ("as it came", "adjusted here", "measured anew")),
+    )
+    control = ", those after in the datum of the control" if found.adjustment.datum == "control" else ""
+    note = Note(
+        "Adjusted here: the key points of the model as they came, in an adjustment of inner constraints "
+        f"without rejection. Measured anew: by least squares matching with windows of {found.window_px} px; "
+        "adjusted are the points whose windows do not overlap, the others are intersected afterwards. "
+        f"Standard deviations are in the datum of inner constraints{control}, and scaled by sigma0 of the "
+        "same column. The files hold the key points measured anew, and those that stay as they came: of "
+        f"points that could not be measured anew in {MIN_RAYS} photographs. COLMAP finds their RMS in the "
+        "files."
+    )
+    return Table(columns, _sizes(found, numbers, unit)), note
+
+
+def _reasons(found: Refinement) -> tuple[Part, ...]:
+    """Return why key points took no part."""
+    if not found.reasons:
+        return (Paragraph("None."),)
+    columns = (Column("why"), Column("key points", format=str), Column("of all", "", "%", "z.1f"))
+    return (
+        Table(columns, [(why, count, 100 * count / found.key_points) for why, count in found.reasons]),
+        Note(
+            f"Too far: further from the model's key point than {general(MAX_SHIFT_FACTOR, 2)} times the "
+            f"robust spread of the model's residuals (at least {general(MIN_SHIFT_PX, 2)} px). Outside: the "
+            "window reaches beyond a photograph. Template of a point without a match: the window that was "
+            "found in no other photograph. Contradict the others: large residual in the adjustment. "
+            "Diverged: no solution, or the window turned inside out."
+        ),
+        Note(
+            "A key point that was not measured anew no longer claims its point where enough others do, and "
+            "stays in the model without one. Points that fewer than three photographs see keep their key "
+            "points and are intersected anew."
+        ),
+    )
+
+
+def _targets(found: Refinement, unit: str) -> tuple[Part, ...]:
+    """Return the targets that were adjusted with the key points, and what was given."""
+    after = found.adjustment
+    given = given_of(after, unit)
+    names = [after.network.points[j].removeprefix(PREFIX) for j in found.target_points]
+    datum = "datum of the control" if after.datum == "control" else "datum of inner constraints"
+    note = Note(
+        f"Measured in the photographs beside the key points, and adjusted with them, in the {datum}. The "
+        "same with all digits is in targets.csv. COLMAP's files do not hold them: its mapper wants key "
+        "points as they are in its database."
+    )
+    table = _coordinates(found, "target", names, found.target_points, "targets", unit)
+    return *given_parts(given, after, unit), table, note
+
+
+def _cameras(found: Refinement, numbers: Numbers) -> tuple[Part, ...]:
     pairs = [pair for camera in found.start.cameras for pair in zip(camera.names, camera.units, strict=True)]
-    return {name: "" if unit == "1" else f" [{unit}]" for name, unit in pairs}
+    unit = {name: "" if unit == "1" else f" [{unit}]" for name, unit in pairs}
+    columns = (
+        *(Column("camera", "camera_id"), Column("model", "model"), Column("parameter")),
+        *(
+            Column(None, "parameter"),
+            Column("before", "before", format=".8g"),
+            Column("after", "after", format=".8g"),
+        ),
+        Column("sigma", "sigma", format=significant, unknown="held"),
+    )
+    rows = [
+        (camera, model, f"{name}{unit[str(name)]}", name, *values)
+        for camera, model, name, *values in numbers.interior
+    ]
+    note = Note(
+        "COLMAP's parameters, its pixel coordinates from the corner of the photograph. Held: not estimated, "
+        "by --fix, because it was 0, or cx and cy of a camera with few photographs. Sigma: one standard "
+        "deviation."
+    )
+    return Table(columns, rows, "sigma_cameras"), note
 
 
 def _common_px(a: Adjustment) -> str:
@@ -168,60 +215,68 @@ def _root_mean(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3))
 
 
-def image_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
-    """Return the rows of sigma_images.csv; empty cells of photographs that were not adjusted."""
-    seen, accepted = found.model.image_points, found.accepted
-    m = len(found.images)
-    count = np.bincount(seen.image, minlength=m)
-    anew = np.bincount(seen.image[accepted], minlength=m)
-    before = _rms_of(found.residuals_before, seen.image, m)
-    own = found.adjustment
+def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:
+    """Return the photographs with standard deviations and residuals; NaN where they were not adjusted."""
+    seen, own, m = found.model.image_points, found.adjustment, len(found.images)
     used = ~own.rejected
-    after = np.full(m, np.nan)
     used[len(found.rows) :] = False  # targets
+    after = np.full(m, np.nan)
     after[found.images] = _rms_of(
         own.residuals[used], own.network.image_points.image[used], int(found.images.sum())
     )
     sigma = np.full((m, 6), np.nan)
     sigma[found.images] = np.sqrt(np.diagonal(own.covariance.exterior, axis1=1, axis2=2))
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
-    return [
-        [
-            numbers.image_ids[i],
-            found.model.images[i],
-            *(_blank(value) for value in (*found.estimate.position[i], *sigma[i])),
-            int(count[i]),
-            int(anew[i]),
-            _blank(before[i]),
-            _blank(after[i]),
-        ]
-        for i in range(m)
+    columns = (
+        *(Column(None, "image_id"), Column("photograph", "name")),
+        *(Column(None, name) for name in ("X0", "Y0", "Z0")),
+        *(Column(f"sigma {one}", f"s{one}", unit, significant, unknown="") for one in ("X0", "Y0", "Z0")),
+        *(Column(None, name) for name in ("somega_deg", "sphi_deg", "skappa_deg")),
+        Column("sigma rotation", "", "mdeg", significant, 1000.0, unknown=""),
+        Column("key points", "key_points", format=str),
+        Column("measured anew", "measured_anew", format=str),
+        Column("RMS before", "rms_before_px", "px", significant, unknown=""),
+        Column("RMS after", "rms_after_px", "px", significant, unknown="not adjusted"),
+    )
+    rows = [
+        (number, name, *X0, *s, rotation, *others)
+        for number, name, X0, s, rotation, *others in zip(
+            *(numbers.image_ids, found.model.images, found.estimate.position, sigma),
+            np.sqrt((sigma[:, 3:] ** 2).mean(axis=1)),
+            np.bincount(seen.image, minlength=m),
+            np.bincount(seen.image[found.accepted], minlength=m),
+            *(_rms_of(found.residuals_before, seen.image, m), after),
+            strict=True,
+        )
     ]
+    note = Note(
+        "Sigma X0, Y0, Z0: of the projection centre. The same with all digits, and those of the points and "
+        "cameras, are in sigma_images.csv, sigma_points.csv and sigma_cameras.csv beside this page."
+    )
+    return Table(columns, rows, "sigma_images"), note
 
 
-def _point_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
-    """Return the rows of sigma_points.csv: the adjusted points."""
+def _points(found: Refinement, numbers: Numbers) -> Table:
+    """Return the adjusted points, for a file."""
     names = [numbers.point_ids[j] for j in np.flatnonzero(found.points)]
-    return _coordinates(found, names, np.arange(len(names)))
+    return _coordinates(found, "point3D_id", names, np.arange(len(names)), "sigma_points")
 
 
-def target_rows(found: Refinement) -> list[list[object]]:
-    """Return the rows of targets.csv: the adjusted targets, by their names."""
-    rows = found.target_points
-    names = [found.adjustment.network.points[j].removeprefix(PREFIX) for j in rows]
-    return _coordinates(found, names, rows)
-
-
-def _coordinates(found: Refinement, names: Sequence[object], points: IntArray) -> list[list[object]]:
+def _coordinates(
+    found: Refinement, name: str, names: Sequence[object], points: IntArray, file: str, unit: str = ""
+) -> Table:
     """Return name, coordinates, their standard deviations and rays of points of the adjustment."""
     own = found.adjustment
     rays = np.bincount(own.network.image_points.point[~own.rejected], minlength=len(own.network.points))
     sigma = np.sqrt(np.diagonal(own.covariance.points[points], axis1=1, axis2=2))
+    columns = (
+        *(Column(name, name), *axes("", unit, ".9g")),
+        *(Column(f"sigma {one}", f"s{one}", unit, significant) for one in "XYZ"),
+        Column("photographs", "rays", format=str),
+    )
     xyz = own.estimate.points[points]
-    return [
-        [name, *at, *s, int(r)]
-        for name, at, s, r in zip(names, xyz.tolist(), sigma.tolist(), rays[points].tolist(), strict=True)
-    ]
+    rows = [(n, *at, *s, r) for n, at, s, r in zip(names, xyz, sigma, rays[points], strict=True)]
+    return Table(columns, rows, file)
 
 
 def _rms_of(v: FloatArray, image: IntArray, m: int) -> FloatArray:
@@ -230,8 +285,3 @@ def _rms_of(v: FloatArray, image: IntArray, m: int) -> FloatArray:
     count = np.bincount(image[known], minlength=m)
     squares = np.bincount(image[known], (v[known] ** 2).sum(axis=1), minlength=m)
     return np.asarray(np.sqrt(np.where(count > 0, squares / (2 * np.maximum(count, 1)), np.nan)))
-
-
-def _blank(value: object) -> object:
-    """Return a value, an empty text in place of what is not known."""
-    return "" if isinstance(value, float) and not np.isfinite(value) else value

@@ -70,7 +70,8 @@ def refine(
             update_model,
         )
         from sfm.files.whole_files import refuse_unwritable, whole_folder
-        from sfm.report.refinement import PAGE, Numbers, refinement_files, words_of_key_points
+        from sfm.report.pages import page_of, texts_of
+        from sfm.report.refinement import Numbers, words_of_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import read_survey
         from sfm.survey.refining.refinement import refine_model, refinement_text
@@ -110,12 +111,13 @@ def refine(
     )
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs, *key_points_of(opened))
     print(refinement_text(found), end="")
+    page = page_of(found, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:
         write_scene(folder, opened.scene)
-        for name, text in refinement_files(found, numbers, title=model.resolve().name).items():
+        for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
     print(words_of_key_points(found, numbers))
     print(f"Model: {out}")
-    print(f"Report: {out / PAGE}")
+    print(f"Report: {out / 'refinement.html'}")
     if not found.dependable:
         raise SystemExit(FAILED)

@@ -37,6 +37,7 @@ from sfm.display import program_name
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
 from sfm.report.findings.findings import Findings
+from sfm.report.given import R_AND_W, given_parts
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.page import Page
 from sfm.report.phrases import NORMAL_95, PHRASES
@@ -106,6 +107,8 @@ def environment() -> Environment:
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "strong": STRONG,
+        "given_parts": given_parts,
+        "r_and_w": R_AND_W,
         "style": Markup(style),
         "tables_script": Markup(_script()),
         "policy": content_policy([style], [_script()]),
