@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import astuple, fields
 from pathlib import Path
 
 from sfm.batch.job import LOGS, SurveyRow
 from sfm.errors import OutputError
 from sfm.files.manifest import MANIFEST, read_manifest, refuse_foreign_files
-from sfm.files.plain_text import as_plain, csv_text, is_plain
+from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.whole_files import whole_files
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import judge
-from sfm.report.html.page import render
+from sfm.report.numbers import fixed
+from sfm.report.page import Column, Link, Mark, Note, Page, Section, Table, Tile
+from sfm.report.pages import texts_of
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first states whose they are
 
@@ -31,16 +32,10 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
     Raises:
         OutputError: they cannot be written.
     """
-    names = [field.name for field in fields(SurveyRow)]
-    data = {"surveys": [asdict(row) for row in rows], "totals": totals(rows)}
-    pages = (
-        json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
-        csv_text(names, [tuple(asdict(row).values()) for row in rows]),
-        render_index(rows, out.name),
-    )
+    texts = texts_of(batch_page(rows, out.name))
     with whole_files(out) as part:
-        for name, text in zip(PAGES, pages, strict=True):
-            (part / name).write_bytes(text.encode())
+        for name in PAGES:
+            (part / name).write_bytes(texts[name].encode())
 
 
 def refuse_foreign_pages(out: Path) -> None:
@@ -82,7 +77,7 @@ def batch_remarks(rows: Sequence[SurveyRow]) -> tuple[Remark, ...]:
     return tuple(remark(kind, surveys=names) for kind, names in kinds.items() if names)
 
 
-def render_index(rows: Sequence[SurveyRow], name: str) -> str:
+def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
     """Return the page with a line for every survey.
 
     Args:
@@ -91,23 +86,74 @@ def render_index(rows: Sequence[SurveyRow], name: str) -> str:
     """
     good = sum(row.succeeded for row in rows)
     headline = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
-    verdict = judge(batch_remarks(rows), {"good": headline, "fair": headline, "bad": headline})
     above = _common_folder(rows)
-    return render(
-        "batch.html",
-        title=name,
-        headline=verdict.headline,
-        level=verdict.level,
-        remarks=verdict.lines,
-        rows=rows,
-        good=good,
-        oriented=sum(row.photographs or 0 for row in rows),
-        photographs=sum(row.photographs_total or 0 for row in rows),
-        points=sum(row.points or 0 for row in rows),
-        above=above,
-        below=lambda file: os.path.relpath(file, above) if above else file,
-        logs=LOGS,
+    oriented, photographs, points = (
+        sum(getattr(row, of) or 0 for row in rows) for of in ("photographs", "photographs_total", "points")
     )
+    every = Table(
+        tuple(Column(name=field.name) for field in fields(SurveyRow)),
+        [astuple(row) for row in rows],
+        "batch",
+    )
+    without = [row for row in rows if row.status != "done"]
+    return Page(
+        "batch",
+        "Batch of surveys",
+        name,
+        judge(batch_remarks(rows), {"good": headline, "fair": headline, "bad": headline}),
+        (
+            Section("Surveys", (_surveys(rows, above), Note(f"Files are below {above}") if above else None)),
+            Section("Without a result", (_without(without, above),)) if without else None,
+        ),
+        tiles=(
+            Tile("Surveys", len(rows), f"{good} with a dependable result"),
+            Tile("Photographs oriented", f"{oriented} of {photographs}", "of surveys with a result"),
+            Tile("Object points", points),
+            Tile("Computing", f"{fixed(sum(row.seconds for row in rows), 1)} s", "of all workers together"),
+        ),
+        summary={"surveys": every.records, "totals": totals(rows)},
+        files=(every,),
+        file="index",
+    )
+
+
+def _surveys(rows: Sequence[SurveyRow], above: str) -> Table:
+    """Return the surveys with what came of them."""
+    columns = (
+        *(Column("survey"), Column("file"), Column("result"), Column("photographs", format=str)),
+        *(Column("points", format="z.0f"), Column("sigma0, px", format="z.4f")),
+        *(Column("RMS, px", format="z.4f"), Column("COLMAP"), Column("seconds", format="z.1f")),
+    )
+    cells = []
+    for row in rows:
+        done = row.status == "done"
+        compared = Mark("differs", "bad") if row.comparison == "differs" else row.comparison
+        cells.append(
+            (
+                Link(row.survey, f"{row.folder}/report.html") if done else row.survey,
+                _below(row.file, above),
+                Mark(row.verdict if done else row.status, row.verdict or "bad"),
+                f"{row.photographs} / {row.photographs_total}" if done else None,
+                *(row.points, row.sigma0_px, row.rms_px, compared, row.seconds),
+            )
+        )
+    return Table(columns, cells)
+
+
+def _without(rows: Sequence[SurveyRow], above: str) -> Table:
+    """Return the surveys that have no result, and why."""
+    cells = [
+        (
+            *(row.survey, _below(row.file, above), Mark(row.status, "bad"), row.reason),
+            Link(f"{row.folder}.jsonl", f"{LOGS}/{row.folder}.jsonl"),
+        )
+        for row in rows
+    ]
+    return Table(tuple(Column(one) for one in ("survey", "file", "", "reason", "log")), cells)
+
+
+def _below(file: str, above: str) -> str:
+    return os.path.relpath(file, above) if above else file
 
 
 def _common_folder(rows: Sequence[SurveyRow]) -> str:

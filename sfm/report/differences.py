@@ -14,7 +14,7 @@ from sfm.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, fixed, significant
-from sfm.report.page import Column, Folded, Note, Page, Part, Section, Table, axes
+from sfm.report.page import YES, Column, Folded, Note, Page, Part, Section, Table, axes
 
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -44,7 +44,7 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
         *axes("d", found.unit),
         *axes("sd", found.unit),
         Column("T", "T", format=significant),
-        Column("significant", "significant"),
+        Column("significant", "significant", flag=YES),
     )
     rows = [
         (name, *d, *s, t, flag)

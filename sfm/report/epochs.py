@@ -20,7 +20,7 @@ from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, general, significant
-from sfm.report.page import Column, Folded, Heading, Note, Page, Paragraph, Part, Section, Table, axes
+from sfm.report.page import YES, Column, Folded, Heading, Note, Page, Paragraph, Part, Section, Table, axes
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -43,6 +43,9 @@ STEPS = (
     Column("T", "T", format=significant),
     Column("critical value", "critical", format=significant),
     Column("removed then", "removed"),
+)
+SERIES = (
+    *(Column(name="id"), Column(name="epoch"), *axes("d"), *axes("sd"), Column(name="moved", flag=YES)),
 )
 MICRO, DEGREES = 1e6, float(np.rad2deg(1.0))
 
@@ -82,8 +85,7 @@ def page(found: EpochSeries) -> Page:
         },
         files=(
             Table(_columns(), displacements, "displacements"),
-            Table((Column(name="id"), Column(name="epoch"), *axes("d"), *axes("sd"), Column(name="moved")),
-                  moved_on, "series"),
+            Table(SERIES, moved_on, "series"),
         ),
     )  # fmt: skip
 
@@ -102,7 +104,7 @@ def _columns(factor: float = 1.0, unit: str = "") -> tuple[Column, ...]:
         Column(None, "length"),
         Column("T", "T", format=significant),
         Column("critical", "critical", format=significant),
-        *(Column(), Column(None, "stable"), Column(None, "moved")),
+        *(Column(), Column(None, "stable", flag=YES), Column(None, "moved", flag=YES)),
         Column("found from", "detectable", unit, significant, factor),
     )
 

@@ -25,6 +25,8 @@ from sfm.report.viewer.embedded import Viewer
 
 MAX_ROWS = 2000  # of a table of a page; files have all
 
+YES = ("", "yes")  # words of a flag
+
 Format = str | Callable[[Any], str]
 
 
@@ -67,7 +69,7 @@ class Column:
     unit: str = ""  # on the page, in brackets behind the title
     format: Format | None = None  # of numbers: a format specification or a function; None: a text
     factor: float = 1.0  # from the unit of files to that of the page
-    flag: tuple[str, str] = ("", "yes")  # on the page for what is not true and what is
+    flag: tuple[str, str] | None = None  # on the page for what is not true and what is, 0 and 1 in files
     unknown: str | None = None  # in place of NaN on the page; None: what the format makes of it
 
     @property
@@ -81,7 +83,7 @@ class Column:
             return ""
         if isinstance(value, str | Mark | Link):
             return value
-        if isinstance(value, bool | np.bool_):
+        if self.flag is not None:
             return self.flag[int(value)]
         if self.unknown is not None and math.isnan(value):
             return self.unknown
@@ -143,15 +145,23 @@ class Table:
     @property
     def csv(self) -> str:
         """The table as CSV, with all digits."""
-        named = [(k, one.name) for k, one in enumerate(self.columns) if one.name]
-        rows = ([_plain(row[k]) for k, _ in named] for row in self.rows)
-        return csv_text([name for _, name in named], rows)
+        named = self._named
+        flags = [one.flag is not None for _, one in named]
+        rows = (
+            [int(row[k]) if flag else row[k] for (k, _), flag in zip(named, flags, strict=True)]
+            for row in self.rows
+        )
+        return csv_text([one.name for _, one in named], rows)
 
     @property
     def records(self) -> list[dict[str, Any]]:
         """The rows for JSON, by the names of the columns in files."""
-        named = [(k, one.name) for k, one in enumerate(self.columns) if one.name]
-        return [{name: plain(row[k]) for k, name in named} for row in self.rows]
+        return [{one.name: plain(row[k]) for k, one in self._named} for row in self.rows]
+
+    @property
+    def _named(self) -> list[tuple[int, Column]]:
+        """The columns in files, with their places in the rows."""
+        return [(k, one) for k, one in enumerate(self.columns) if one.name]
 
     @property
     def text(self) -> str:
@@ -243,7 +253,7 @@ class Banner:
 class Page:
     """What a page shows, and the files beside it."""
 
-    name: str  # of the page and of its JSON, without endings
+    name: str  # of its files, without their endings
     kind: str  # line above the title
     title: str
     verdict: Verdict | Banner
@@ -253,6 +263,12 @@ class Page:
     pictures_beside: bool = False  # whether the scene shows pictures that lie beside the page
     summary: Mapping[str, Any] | None = None  # for NAME.json; values that are not finite become null
     files: tuple[Table, ...] = ()  # tables that are written beside those of the sections
+    file: str = ""  # of the page itself, without its ending; empty: its name
+
+    @property
+    def path(self) -> str:
+        """Name of the file of the page."""
+        return f"{self.file or self.name}.html"
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -263,7 +279,7 @@ class Page:
 
     @property
     def texts(self) -> dict[str, str]:
-        """The text files beside the page by name."""
+        """The text files beside the page, by their names."""
         found = {f"{one.file}.csv": one.csv for one in self.tables}
         if self.summary is not None:
             text = json.dumps(plain(self.summary), indent=2, ensure_ascii=False, allow_nan=False)
@@ -282,11 +298,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.integer | np.bool_):
         return value.item()
     return or_none(float(value)) if isinstance(value, float | np.floating) else value
-
-
-def _plain(value: Any) -> Any:
-    """Return the value of a cell of a file, 0 or 1 for what is true or not."""
-    return int(value) if isinstance(value, bool | np.bool_) else value
 
 
 def _unfolded(parts: Iterable[Part | None]) -> Iterable[Part]:

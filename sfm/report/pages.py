@@ -21,7 +21,7 @@ PAGES: Mapping[str, str] = {
     "Refinement": "sfm.report.refinement",
     "ResultComparison": "sfm.report.differences",
     "Validation": "sfm.report.validation",
-    "ViewerScene": "sfm.report.view",
+    "ViewerScene": "sfm.report.html.view_page",
 }
 """The type of a result, and the module, imported when needed, whose function `page` declares its page."""
 
@@ -38,7 +38,7 @@ def page_of(found: Any, **beside: Any) -> Page:
 
 def texts_of(page: Page) -> dict[str, str]:
     """Return the page as HTML and the text files beside it, by name."""
-    return page.texts | {f"{page.name}.html": html(page)}
+    return page.texts | {page.path: html(page)}
 
 
 def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = None, **beside: Any) -> Path:
@@ -64,4 +64,4 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
                 (folder / name).write_text(text, encoding="utf-8", newline="")
             if also is not None:
                 also(folder)
-    return out / f"{page.name}.html"
+    return out / page.path

@@ -26,7 +26,7 @@ from sfm.report.numbers import (
     raised,
     significant,
 )
-from sfm.report.page import Column, Folded, Note, Page, Paragraph, Part, Section, Table, axes, facts
+from sfm.report.page import YES, Column, Folded, Note, Page, Paragraph, Part, Section, Table, axes, facts
 from sfm.report.phrases import NORMAL_95
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
@@ -134,7 +134,7 @@ def _points(plan: Plan, size: float) -> Table:
         Column("sigma", "", fine, significant, factor),
         Column("rays", "rays", format=str),
         Column("angle", "angle_deg", "deg", "z.0f", unknown=""),
-        Column(None, "coded"),
+        Column(None, "coded", flag=YES),
     )
     sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
     coded = np.isin(np.arange(len(p.planned.names)), plan.coded)

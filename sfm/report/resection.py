@@ -6,13 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.conventions import angles_from_rotation
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.files.plain_text import or_none
 from sfm.orientation.resection.candidates import ResectionSolution
+from sfm.report.page import Column, Table, plain
 from sfm.textbook.resection.by_method import Resected
 from sfm.textbook.resection.dlt import DirectLinearTransformation
+
+EXTERIOR = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
+METHODS = (
+    *(Column("method"), Column("no", format=str)),
+    *(Column(name, format=".6f") for name in EXTERIOR[:3]),
+    *(Column(name, format=".5f") for name in ("omega", "phi", "kappa")),
+    Column("rms mm", format=".6f"),
+)
 
 
 def resection_json(found: Resected, c: float) -> dict[str, Any]:
@@ -27,33 +35,31 @@ def resection_json(found: Resected, c: float) -> dict[str, Any]:
         where they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history, residuals_mm,
         line_fit, interior, rejected, trials, warning.
     """
-    out: dict[str, Any] = {"method": found.method, "points": found.points}
-    out["solutions"] = [_plain(solution, c) for solution in found.solutions]
-    if found.line_fit:
-        out["line_fit"] = [
-            {"slope": line.slope, "intercept_mm": line.intercept * c, "scatter_mm": line.scatter * c}
-            for line in found.line_fit
+    unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
+    lines = found.line_fit or ()
+    known = {
+        "method": found.method,
+        "points": found.points,
+        "solutions": [
+            dict(zip(EXTERIOR, _values(one), strict=True)) | {"M": one.rotation.T, "rms_mm": one.rms * c}
+            for one in found.solutions
+        ],
+        "line_fit": [
+            {"slope": one.slope, "intercept_mm": one.intercept * c, "scatter_mm": one.scatter * c}
+            for one in lines
         ]
-    if found.sigma0_mm is not None:
-        out |= {"sigma0_mm": or_none(found.sigma0_mm), "redundancy": found.redundancy}
-    if found.dispersion is not None:
-        unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
-        out["dispersion"] = _rows(found.dispersion * np.outer(unit, unit))
-    if found.history is not None:
-        history = found.history.copy()
-        history[:, 3:] = np.degrees(history[:, 3:])
-        out["history"] = history.tolist()
-    if found.residuals_mm is not None:
-        out["residuals_mm"] = _rows(found.residuals_mm)
-    if found.interior is not None:
-        out["interior"] = _interior(found.interior)
-    if found.rejected is not None:
-        out["rejected"] = list(found.rejected)
-    if found.trials is not None:
-        out["trials"] = found.trials
-    if found.warning:
-        out["warning"] = found.warning
-    return out
+        or None,
+        "sigma0_mm": found.sigma0_mm,
+        "redundancy": None if found.sigma0_mm is None else found.redundancy,
+        "dispersion": None if found.dispersion is None else found.dispersion * np.outer(unit, unit),
+        "history": None if found.history is None else found.history * unit[: found.history.shape[1]],
+        "residuals_mm": found.residuals_mm,
+        "interior": None if found.interior is None else _interior(found.interior),
+        "rejected": found.rejected,
+        "trials": found.trials,
+        "warning": found.warning or None,
+    }
+    return {name: plain(value) for name, value in known.items() if value is not None}
 
 
 def comparison_json(found: dict[str, Resected | GeometryError], c: float) -> list[dict[str, Any]]:
@@ -65,34 +71,27 @@ def comparison_json(found: dict[str, Resected | GeometryError], c: float) -> lis
 
 
 def comparison_table(found: dict[str, Resected | GeometryError], c: float) -> str:
-    """Return what all methods find, or why one finds nothing, side by side; c in mm."""
-    header = " ".join(
-        [f"{'method':<16} no"]
-        + [f"{name:>14}" for name in ("X0", "Y0", "Z0")]
-        + [f"{name:>10}" for name in ("omega", "phi", "kappa", "rms mm")]
-    )
-    lines = [header, "-" * len(header)]
+    """Return what all methods find side by side, and below why others find nothing; c in mm."""
+    rows, remarks = [], []
     for name, one in found.items():
         if isinstance(one, GeometryError):
-            lines.append(f"{name:<16}  - {str(one).removeprefix(name + ': ')}")
+            remarks.append(f"{name}: {str(one).removeprefix(f'{name}: ')}\n")
             continue
-        lines.extend(_row(name, k, _plain(each, c)) for k, each in enumerate(one.solutions, start=1))
+        rows += [(name, k, *_values(each), each.rms * c) for k, each in enumerate(one.solutions, start=1)]
         if one.warning:
-            lines.append(f"{'':<16}  ! {one.warning}")
-    return "\n".join(lines)
+            remarks.append(f"{name}: {one.warning}\n")
+    return (Table(METHODS, rows).text + "".join(remarks)).rstrip("\n")
 
 
 def resection_text(found: Resected, c: float) -> str:
     """Return what one method finds as text; c in mm."""
     lines = [f"{found.method}, {counted(found.points, 'point')}"]
-    for k, solution in enumerate(found.solutions, start=1):
-        one = _plain(solution, c)
-        lines.append(f"solution {k}: rms {one['rms_mm']:.6f} mm")
-        lines.append(f"  X0 Y0 Z0        {one['X0']:.8f} {one['Y0']:.8f} {one['Z0']:.8f}")
-        lines.append(
-            f"  omega phi kappa {one['omega_deg']:.7f} {one['phi_deg']:.7f} {one['kappa_deg']:.7f} deg"
-        )
-        lines += ["  M " + " ".join(f"{value:12.9f}" for value in row) for row in one["M"]]
+    for k, one in enumerate(found.solutions, start=1):
+        X0, Y0, Z0, omega, phi, kappa = _values(one)
+        lines.append(f"solution {k}: rms {one.rms * c:.6f} mm")
+        lines.append(f"  X0 Y0 Z0        {X0:.8f} {Y0:.8f} {Z0:.8f}")
+        lines.append(f"  omega phi kappa {omega:.7f} {phi:.7f} {kappa:.7f} deg")
+        lines += ["  M " + " ".join(f"{value:12.9f}" for value in row) for row in one.rotation.T]
     if found.sigma0_mm is not None and np.isfinite(found.sigma0_mm):
         lines.append(f"sigma0 {found.sigma0_mm:.7g} mm, redundancy {found.redundancy}")
         if found.dispersion is not None:
@@ -129,26 +128,6 @@ def _interior(found: DirectLinearTransformation) -> dict[str, float]:
     }
 
 
-def _plain(solution: ResectionSolution, c: float) -> dict[str, Any]:
-    X0, Y0, Z0 = solution.position.tolist()
-    omega, phi, kappa = np.degrees(angles_from_rotation(solution.rotation)).tolist()
-    return {
-        "X0": X0,
-        "Y0": Y0,
-        "Z0": Z0,
-        "omega_deg": omega,
-        "phi_deg": phi,
-        "kappa_deg": kappa,
-        "M": solution.rotation.T.tolist(),
-        "rms_mm": solution.rms * c,
-    }
-
-
-def _rows(values: FloatArray) -> list[list[float | None]]:
-    return [[or_none(value) for value in row] for row in values]
-
-
-def _row(name: str, number: int, one: dict[str, Any]) -> str:
-    angles = " ".join(f"{one[key]:10.5f}" for key in ("omega_deg", "phi_deg", "kappa_deg"))
-    position = " ".join(f"{one[key]:14.6f}" for key in ("X0", "Y0", "Z0"))
-    return f"{name if number == 1 else '':<16} {number:>2} {position} {angles} {one['rms_mm']:10.6f}"
+def _values(solution: ResectionSolution) -> tuple[float, ...]:
+    """Return X0, Y0, Z0 and omega, phi, kappa in degrees."""
+    return (*solution.position.tolist(), *np.degrees(angles_from_rotation(solution.rotation)).tolist())

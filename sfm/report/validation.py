@@ -16,7 +16,7 @@ from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import fixed, general
-from sfm.report.page import Column, Folded, Note, Page, Paragraph, Section, Table
+from sfm.report.page import YES, Column, Folded, Note, Page, Paragraph, Section, Table
 
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
@@ -26,7 +26,11 @@ TRIALS = (
     *(Column("network", "network"), Column("arrangement", "arrangement")),
     *(Column("photographs", "photographs", format=str), Column("points", "points", format=str)),
     Column("image points", "image_points", format=str),
-    *(Column(None, "planar"), Column(None, "visibility"), Column("noise px", "noise_px", format="z.2f")),
+    *(
+        Column(None, "planar", flag=YES),
+        Column(None, "visibility"),
+        Column("noise px", "noise_px", format="z.2f"),
+    ),
     *(Column("model", "model"), Column(None, "cameras"), Column("interior", "interior")),
     *(Column("datum", "datum"), Column("cost", "cost_kolinear_px2", format=".6g")),
     *(Column(None, "cost_other_px2"), Column("relative difference", format=".1e")),

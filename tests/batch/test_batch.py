@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
@@ -25,13 +26,14 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.finished import note_finished
 from sfm.batch.job import LOCK, SurveyJob, SurveyRow, reconstruct
-from sfm.batch.pages import batch_remarks, render_index
+from sfm.batch.pages import batch_page, batch_remarks
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
 from sfm.files.manifest import MANIFEST, sha256_of
 from sfm.files.whole_files import write_manifest
 from sfm.remarks.remark import kinds_of
+from sfm.report.html.page import html
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
@@ -375,8 +377,8 @@ def test_index_escapes_everything() -> None:
     nasty = "\"><script>alert('1')</script>&"
     row = SurveyRow(nasty, nasty, nasty, nasty, nasty, comparison=nasty, reason=nasty)
     for status in ("failed", "done"):
-        page = render_index([SurveyRow(**{**row.__dict__, "status": status})], nasty)
-        assert page.count("<script") == render_index([], "").count("<script")
+        page = html(batch_page([replace(row, status=status)], nasty))
+        assert page.count("<script") == html(batch_page([], "")).count("<script")
         assert 'href="' + nasty not in page
 
 

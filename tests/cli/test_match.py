@@ -67,6 +67,8 @@ def test_tables_and_picture(photographs: tuple[Path, Path], tmp_path: Path) -> N
         rows = list(csv.DictReader(file))
     assert [row["point"] for row in rows] == ["a", "b"]
     assert float(rows[1]["x_right_px"]) == pytest.approx(100.5 + SHIFT[0], abs=0.05)
+    as_json = json.loads(match_command(*photographs, points=table, search_px=41, as_json=True)[0])["points"]
+    assert [float(row["x_right_px"]) for row in rows] == [one["x_right_px"] for one in as_json]  # all digits
     drawn = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
     assert drawn.shape == (2 * (21 * 8 + LINE), 3 * 21 * 8 + 8)
     difference = drawn[LINE : LINE + 21 * 8, -21 * 8 :].astype(float)

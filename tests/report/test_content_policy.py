@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from sfm.batch.job import SurveyRow
-from sfm.batch.pages import render_index
+from sfm.batch.pages import batch_page
 from sfm.comparison.significance import compare_results
 from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.page import content_policy, render
+from sfm.report.html.page import content_policy, html, render
 from sfm.report.output import write_result
 from sfm.report.pages import write_page
 from sfm.solution import Solution
@@ -91,7 +91,7 @@ def index_page(folder: Path) -> str:
         SurveyRow(EVIL, "/a/survey.toml", "javascript:alert(1)", "done", "good", 0.1, 0.1, 6, 6, 9, "agrees"),
         SurveyRow(EVIL, "/b/survey.toml", "b", "failed", reason=EVIL),
     )
-    return render_index(rows, EVIL)
+    return html(batch_page(rows, EVIL))
 
 
 def validation_page(folder: Path) -> str:

@@ -13,7 +13,7 @@ from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, match_points
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.patches import draw_patches
 from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
-from sfm.report.matching import COLUMNS, matches_csv, matches_json, matches_text
+from sfm.report.matching import NAMES, matches_json, matches_table
 
 
 def match_command(
@@ -64,7 +64,7 @@ def match_command(
     if not 0.0 <= min_correlation <= 1.0:
         raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
     inputs = (left_path, right_path, *(() if points is None else (points,)))
-    refuse_outputs(out, picture, inputs, COLUMNS, as_json)
+    refuse_outputs(out, picture, inputs, NAMES, as_json)
     if points is not None:
         names, xy, start = read_points_to_match(points)
     else:
@@ -90,12 +90,12 @@ def match_command(
             drawing = draw_patches(names, left, right, found, template_px)
             picture_part.write_bytes(picture_file(drawing))
         if table_file is not None:
-            text = matches_json(names, found) if as_json else matches_csv(names, found)
+            text = matches_json(names, found) if as_json else matches_table(names, found).csv
             table_file.write_bytes(text.encode())
     matched = int(found.good.sum())
     if out is not None:
         return f"{matched} of {len(found)} points matched: {out}\n", matched > 0
-    return matches_json(names, found) if as_json else matches_text(names, found), matched > 0
+    return matches_json(names, found) if as_json else matches_table(names, found).text, matched > 0
 
 
 def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
@@ -107,7 +107,7 @@ def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, Float
     Raises:
         SurveyFileError: unreadable, wrong columns, no rows, a name twice, or not a finite number.
     """
-    table = read_table(path, COLUMNS[:1], COLUMNS[1:3], COLUMNS[3:5])
+    table = read_table(path, NAMES[:1], NAMES[1:3], NAMES[3:5])
     values = table.values
     return table.keys("point"), values[:, :2], values[:, 2:] if values.shape[1] > 2 else None
 

@@ -6,9 +6,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
+from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.files.whole_files import refuse_existing, whole_file
-from sfm.report.html.page import render
+from sfm.remarks.verdict import Line
+from sfm.report.html.page import html
+from sfm.report.numbers import fixed
+from sfm.report.page import Banner, Column, Folded, Page, Section, Table, axes, facts
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, Pictures, cut_pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -18,7 +24,7 @@ MARK = b"<!DOCTYPE html>\n<!-- kolinear view -->\n"
 """by which an earlier page is known, which a new one may replace"""
 
 
-def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
+def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
     """Return the page of a scene.
 
     Args:
@@ -26,15 +32,51 @@ def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
         pictures: of its photographs.
         source: what it was read from.
     """
-    page = render(
-        "view.html",
-        viewer=viewer_of(scene, pictures),
-        pictures_beside=bool(pictures.beside),
-        s=scene,
-        source=source,
-        cameras=", ".join(f"{camera.name} ({camera.model})" for camera in scene.cameras),
+    s, u = scene, scene.unit
+    viewer = viewer_of(scene, pictures)
+    counts = ((s.photographs, "photograph"), (s.points, "point"), (s.rays, "image point"))
+    figures = facts(
+        [
+            ("Read from", source),
+            ("Photographs", str(len(s.photographs))),
+            ("Cameras", ", ".join(f"{camera.name} ({camera.model})" for camera in s.cameras)),
+            ("Object points", str(len(s.points))),
+            ("Image points", f"{len(s.rays)}, {s.rays.rejected.sum()} rejected"),
+            (
+                "RMS residual",
+                "not known" if np.isnan(s.rms_px) else f"{fixed(s.rms_px, 4)} px per image coordinate",
+            ),
+        ]
     )
-    return page.replace("<!DOCTYPE html>\n", MARK.decode(), 1)
+    columns = (
+        *(Column("point"), *axes("", u, ".9g"), Column("rays", format=str)),
+        *(Column("angle", "", "deg", "z.1f"), Column("RMS", "", "px", "z.3f")),
+    )
+    rows = [
+        (name, *xyz, *others)
+        for name, xyz, *others in zip(
+            s.points, s.xyz, s.rays_of_point, s.angle_deg, s.point_rms_px, strict=True
+        )
+    ]
+    return Page(
+        "view",
+        "Result to explore",
+        s.name,
+        Banner(
+            "good",
+            f"{', '.join(counted(len(them), noun) for them, noun in counts)}.",
+            tuple(Line("note", note) for note in viewer.notes),
+        ),
+        (Section("Figures", (figures, Folded("Object points", (Table(columns, rows),)))),),
+        viewer=viewer,
+        pictures_beside=bool(pictures.beside),
+    )
+
+
+def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
+    """Return the page of a scene as HTML, with the mark by which it is known again."""
+    text = html(page(scene, pictures=pictures, source=source))
+    return text.replace("<!DOCTYPE html>\n", MARK.decode(), 1)
 
 
 def write_view(
