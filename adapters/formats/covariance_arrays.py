@@ -10,37 +10,28 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
+from sfm.files.result_tables import COVARIANCES
 from sfm.solution import Solution
 
-NAME = "covariances.npz"
 MAX_BYTES = 2**31  # of the file unpacked
 
 
-def write_covariances(path: Path, solution: Solution) -> None:
-    """Write the covariances of the orientations, as far as they are known."""
-    network, estimate = solution.network, solution.estimate
-    arrays: dict[str, Any] = {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
-    if solution.exterior_covariance is not None:
-        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
-    np.savez_compressed(path, camera_names=np.array([camera.name for camera in estimate.cameras]), **arrays)
-
-
-def read_covariances(path: Path, result: Solution) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
+def read_covariances(folder: Path, result: Solution) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
     """Return the covariances of the exterior (m, 6, 6) and of each interior orientation, None and () without.
 
     Args:
-        path: the file, which may be missing.
+        folder: of the result; the file may be missing.
         result: that the tables beside it say.
 
     Raises:
         SurveyFileError: the file is damaged or belongs to other tables.
     """
+    path = folder / COVARIANCES
     if not path.is_file():
         return None, ()
     images, cameras = result.network.images, result.estimate.cameras

@@ -1,9 +1,4 @@
-"""Given values of a survey with standard deviations, read from given.csv of its result.
-
-    kind,name,coordinate,unit,given,difference,sigma,r,w
-
-Source: RFC 4180 for CSV; the columns are described in the README.
-"""
+"""Given values of a survey with standard deviations, read from and written to given.csv of its result."""
 
 from __future__ import annotations
 
@@ -15,15 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from sfm.conventions import FloatArray
-from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, read_json
-from sfm.files.plain_text import csv_text
+from sfm.files.result_tables import GIVEN
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.solution import CONTROL_COVARIANCE
 
 ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates
-HEADER = ("kind", "name", "coordinate", "unit", "given", "difference", "sigma", "r", "w")
 
 
 class _Summary(Content):
@@ -55,16 +48,14 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     Raises:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
-    path = folder / "given.csv"
+    path = folder / GIVEN.file
     summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
     if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return GivenValues(
             *(ScaleBars(), ObjectPoints(), (), ExteriorObservations()),
             *(summary.sigma0 or 1.0, summary.sigma0_px),
         )
-    table = read_table(
-        path, ("kind", "name", "coordinate"), ("given", "sigma"), ignored=None, blank=("sigma",)
-    )
+    table = GIVEN.read(folder)
     table.refuse(table.values[:, 1:], table.values[:, 1:] < 0, ("sigma",), "0 or more, or nothing")
     index = {name: j for j, name in enumerate(network.points)}
     bars: list[tuple[int, int, float, float]] = []
@@ -112,7 +103,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     )
 
 
-def write_given(path: Path, network: Network, estimate: Estimate) -> None:
+def write_given(folder: Path, network: Network, estimate: Estimate) -> None:
     """Write what a network was given with a standard deviation, without its residuals; no file of nothing."""
     rows: list[tuple[object, ...]] = []
 
@@ -147,7 +138,7 @@ def write_given(path: Path, network: Network, estimate: Estimate) -> None:
             kind = "projection centre" if k < 3 else "rotation"
             add(kind, network.images[i], ORIENTATION[k], value, sigma)
     if rows:
-        path.write_text(csv_text(HEADER, rows), encoding="utf-8", newline="")
+        GIVEN.write_rows(folder, rows)
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

@@ -1,7 +1,7 @@
 """Control and check points of a result: control.csv of converted tables, control_points.csv of a survey.
 
     control.csv         id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], empty where not known
-    control_points.csv  use (control or check),point,coordinate,given,sigma_prior, a row for each coordinate
+    control_points.csv  a row for each coordinate
 
 Source: RFC 4180 for CSV; the columns are described in the README.
 """
@@ -17,11 +17,12 @@ from adapters.formats.content import PAIRS
 from sfm.conventions import BoolArray, FloatArray
 from sfm.files.csv_tables import read_header, read_table
 from sfm.files.plain_text import csv_text
+from sfm.files.result_tables import CONTROL_POINTS
 from sfm.network import Network, ObjectPoints
 
 AXES, SIGMAS = ("X", "Y", "Z"), ("sX", "sY", "sZ")
 COVARIANCES, CHECKS = ("cXY", "cXZ", "cYZ"), ("checkX", "checkY", "checkZ")
-CONTROL, PROTOCOL = "control.csv", "control_points.csv"
+CONTROL = "control.csv"
 
 
 def read_known_points(
@@ -39,12 +40,10 @@ def read_known_points(
     """
     if (folder / CONTROL).is_file():
         return _of_control(folder / CONTROL, network)
-    if not (folder / PROTOCOL).is_file():
+    path = folder / CONTROL_POINTS.file
+    if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return control, ObjectPoints()
-    if not (folder / PROTOCOL).read_text(encoding="utf-8").strip().partition("\n")[2]:
-        return control, ObjectPoints()
-    path, columns = folder / PROTOCOL, ("given", "sigma_prior")
-    table = read_table(path, ("use", "point", "coordinate"), columns, ignored=None, blank=columns)
+    table = CONTROL_POINTS.read(folder)
     index = {name: j for j, name in enumerate(network.points)}
     found: dict[str, dict[int, tuple[FloatArray, FloatArray]]] = {"control": {}, "check": {}}
     for use, name, axis, (given, sigma) in zip(*table.texts, table.values.tolist(), strict=True):

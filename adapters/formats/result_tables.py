@@ -1,23 +1,13 @@
-"""A survey's result as CSV tables with named columns, read and written.
+"""A survey's result as CSV tables, read and written.
 
-    points.csv          id,X,Y,Z[,sX,sY,sZ]
-    images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
-    cameras.csv         camera,parameter,value[,sigma],unit
-    image_points.csv    image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]][,rejected]
-    point_covariance.npy    of the points together, see `sfm.files.covariance_file`
-    summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
-
-These are the tables that `kolinear run` writes; other columns are passed over. What a summary does not say of
-size and pixel is taken from the COLMAP model in the folder `colmap`.
-
-Source: RFC 4180 for CSV; the columns are described in the README.
+These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are passed over.
+What a summary does not say of size and pixel is taken from the COLMAP model in the folder `colmap`.
 """
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,28 +17,33 @@ from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
 from adapters.formats.content import Content
-from adapters.formats.covariance_arrays import NAME as COVARIANCES
-from adapters.formats.covariance_arrays import read_covariances, write_covariances
+from adapters.formats.covariance_arrays import read_covariances
 from adapters.formats.given_table import read_given, write_given
 from adapters.formats.known_points import read_known_points
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
-from sfm.files.csv_tables import CsvTable, read_header, read_table
+from sfm.files.csv_tables import CsvTable
 from sfm.files.json_files import Content as Json
 from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.open_folders import refuse_links_out
-from sfm.files.plain_text import csv_text
+from sfm.files.result_tables import (
+    CAMERAS,
+    GIVEN,
+    IMAGE_POINTS,
+    IMAGES,
+    POINTS,
+    RELIABILITY,
+    write_covariances,
+    write_solution,
+)
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.network_check import CORRELATION_LIMIT
 from sfm.solution import Solution
 
-EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
-SIGMAS = ("sX", "sY", "sZ")
-SIGMAS_PX = ("sx_px", "sy_px")
-COVARIANCE_PX = "cxy_px2"
+SIGMAS, SIGMAS_PX = ("sX", "sY", "sZ"), ("sx_px", "sy_px")
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
@@ -63,9 +58,7 @@ def read_result(folder: Path) -> Solution:
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}
-    table = read_table(
-        folder / "images.csv", ("image", "camera"), EXTERIOR, SIGMAS, ignored=None, blank=SIGMAS
-    )
+    table = IMAGES.read(folder)
     images = table.keys("image")
     for line, name in zip(table.line, table.texts[1], strict=True):
         if name not in index:
@@ -73,7 +66,7 @@ def read_result(folder: Path) -> Solution:
     camera = np.array([index[name] for name in table.texts[1]], dtype=np.int64)
     rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
-    table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
+    table = POINTS.read(folder)
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
@@ -92,7 +85,7 @@ def read_result(folder: Path) -> Solution:
         summary.datum.kind if summary.datum else "",
         covariance_points=of_points,
     )
-    exterior, interior = read_covariances(folder / COVARIANCES, found)
+    exterior, interior = read_covariances(folder, found)
     return replace(found, exterior_covariance=exterior, interior_covariance=interior)
 
 
@@ -111,11 +104,10 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
         SurveyFileError: what is missing or wrong, with file and line number.
     """
     seen, rejected = _image_points(folder, network.images, network.points)
-    path = folder / "reliability.csv"
+    path = folder / RELIABILITY.file
     if not path.is_file():
         return seen, rejected, np.full((len(seen), 2), np.nan)
-    columns = ("wx", "wy")
-    table = read_table(path, ("image", "point"), columns, ignored=None, blank=columns)
+    table = RELIABILITY.read(folder)
     keys = [(network.images[i], network.points[j]) for i, j in zip(seen.image, seen.point, strict=True)]
     if keys != list(zip(*table.texts, strict=True)):
         raise SurveyFileError(f"{path}: its rows are not those of image_points.csv beside it")
@@ -134,13 +126,12 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
     Raises:
         SurveyFileError: the table is damaged.
     """
-    path = folder / "given.csv"
+    path = folder / GIVEN.file
     if not path.is_file():
         return None, ()
     if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return (), ()
-    table = read_table(path, ("kind", "name"), (), ignored=None)
-    kinds, names = table.texts
+    kinds, names, _ = GIVEN.read(folder).texts
     found = {
         kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
         for kind in ("scale bar", "control point")
@@ -171,30 +162,7 @@ def write_content(folder: Path, content: Content) -> None:
     ):
         for k in np.flatnonzero(~placed)[:1]:
             raise OutputError(f"{folder}: {kind} {names[k]} has no coordinates, tables want them of all")
-    angles = np.rad2deg(angles_from_rotation(estimate.rotation))
-    point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
-    position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
-    if result.exterior_covariance is not None and len(sigmas_of_images):
-        variance = np.diagonal(result.exterior_covariance, axis1=1, axis2=2)[:, 3:]
-        position_sigma = np.hstack([position_sigma, np.degrees(np.sqrt(variance))])
-        sigmas_of_images = (*sigmas_of_images, "somega_deg", "sphi_deg", "skappa_deg")
     seen = joined_image_points(network.image_points, content.rejected)
-    rejected = np.arange(len(seen)) >= len(network.image_points)
-    flagged = ("rejected",) if rejected.any() else ()
-    sigma = seen.stated_sigma
-    sigmas_of_image_points: tuple[str, ...] = SIGMAS_PX if np.isfinite(sigma).any() else ()
-    sigma = sigma[:, : len(sigmas_of_image_points)]
-    if seen.stated_covariance.any():
-        sigmas_of_image_points += (COVARIANCE_PX,)
-        sigma = np.concatenate([sigma, seen.stated_covariance[:, None]], axis=1)
-    camera_rows = []
-    for k, camera in enumerate(estimate.cameras):
-        known = np.full(len(camera.names), np.nan)
-        known = known if result.interior_sigma is None else result.interior_sigma[k]
-        camera_rows += [
-            (camera.name, name, value, s, unit)
-            for name, value, s, unit in zip(camera.names, camera.parameters, known, camera.units, strict=True)
-        ]
     summary: dict[str, Any] = {
         "survey": result.name,
         "redundancy": result.redundancy,
@@ -215,39 +183,12 @@ def write_content(folder: Path, content: Content) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write(
-            folder / "points.csv",
-            ("id", "X", "Y", "Z", *sigmas_of_points),
-            ((n, *x, *s) for n, x, s in zip(network.points, estimate.points, point_sigma, strict=True)),
-        )
-        _write(
-            folder / "images.csv",
-            ("image", *EXTERIOR, *sigmas_of_images, "camera"),
-            (
-                (
-                    name,
-                    *estimate.position[i],
-                    *angles[i],
-                    *position_sigma[i],
-                    estimate.cameras[network.camera[i]].name,
-                )
-                for i, name in enumerate(network.images)
-            ),
-        )
-        _write(folder / "cameras.csv", ("camera", "parameter", "value", "sigma", "unit"), camera_rows)
-        _write(
-            folder / "image_points.csv",
-            ("image", "point", "x_px", "y_px", *sigmas_of_image_points, *flagged),
-            (
-                (network.images[i], network.points[j], *xy, *s, *(int(bad) for _ in flagged))
-                for i, j, xy, s, bad in zip(seen.image, seen.point, seen.xy, sigma, rejected, strict=True)
-            ),
-        )
+        write_solution(folder, result, seen, np.arange(len(seen)) >= len(network.image_points))
         if result.covariance is not None:
             write_covariance(folder, result.covariance, network.points, result.covariance_points)
         if result.exterior_covariance is not None or any(map(len, result.interior_covariance)):
-            write_covariances(folder / COVARIANCES, result)
-        write_given(folder / "given.csv", network, estimate)
+            write_covariances(folder, result)
+        write_given(folder, network, estimate)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -389,14 +330,7 @@ def _summary(path: Path) -> _Summary:
 
 def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
     """Cameras in the order of the summary, and the sigmas of their parameters."""
-    table = read_table(
-        folder / "cameras.csv",
-        ("camera", "parameter"),
-        ("value",),
-        ("sigma",),
-        ignored=None,
-        blank=("sigma",),
-    )
+    table = CAMERAS.read(folder)
     values, sigma = table.values[:, 0], table.values[:, 1:]
     table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
     keys = tuple(zip(*table.texts, strict=True))
@@ -446,14 +380,8 @@ def _image_points(
     folder: Path, images: tuple[str, ...], points: tuple[str, ...]
 ) -> tuple[ImagePoints, BoolArray]:
     """Read the image points, and which of them were rejected."""
-    path = folder / "image_points.csv"
-    flagged = ("rejected",) if "rejected" in read_header(path) else ()
-    header, sigmas = read_header(path), SIGMAS_PX
-    with_covariance = sigmas[0] in header and COVARIANCE_PX in header
-    optional = (*sigmas, COVARIANCE_PX) if with_covariance else sigmas
-    table = read_table(
-        path, ("image", "point"), ("x_px", "y_px", *flagged), optional, ignored=None, blank=optional
-    )
+    path = folder / IMAGE_POINTS.file
+    table = IMAGE_POINTS.read(folder)
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
     index = []
     files = ("images.csv", "points.csv")
@@ -463,37 +391,22 @@ def _image_points(
             if name not in place:
                 raise SurveyFileError(f"{path}, line {line}: {column} '{name}' is not in {file}")
         index.append(np.array([place[name] for name in names], dtype=np.int64))
-    rejected, sigma, mixed = np.split(table.values[:, 2:], (len(flagged), len(flagged) + 2), axis=1)
-    table.refuse(rejected, (rejected != 0) & (rejected != 1), flagged, "0 or 1")
-    table.refuse(sigma, sigma <= 0, sigmas, "more than 0")
-    sigma = sigma if sigma.size else np.full((len(table.line), 2), np.nan)
+    rejected, sigma = np.nan_to_num(table.part(("rejected",))), table.part(SIGMAS_PX)
+    table.refuse(rejected, (rejected != 0) & (rejected != 1), ("rejected",), "0 or 1")
+    table.refuse(sigma, sigma <= 0, SIGMAS_PX, "more than 0")
     image, point = index
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     sigma = np.where(stated[:, None], sigma, 1.0)
     covariance = np.eye(2) * sigma[:, None, :] ** 2
-    if with_covariance:
-        mixed = np.where(stated[:, None], np.nan_to_num(mixed), 0.0)
-        largest = CORRELATION_LIMIT * sigma.prod(axis=1, keepdims=True)
-        table.refuse(
-            mixed, np.abs(mixed) > largest, (COVARIANCE_PX,), "a correlation below 1 with the sigmas"
-        )
-        covariance += (1 - np.eye(2)) * mixed[:, :, None]
+    mixed = np.where(stated[:, None], np.nan_to_num(table.part(("cxy_px2",))), 0.0)
+    largest = CORRELATION_LIMIT * sigma.prod(axis=1, keepdims=True)
+    table.refuse(mixed, np.abs(mixed) > largest, ("cxy_px2",), "a correlation below 1 with the sigmas")
+    covariance += (1 - np.eye(2)) * mixed[:, :, None]
     found = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated)
-    return found, rejected[:, 0] == 1 if flagged else np.zeros(len(found), dtype=bool)
+    return found, rejected[:, 0] == 1
 
 
 def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:
     """Diagonal covariances (n, 3, 3) of columns sX, sY, sZ; None where no row has any."""
     table.refuse(sigma, sigma < 0, SIGMAS, "0 or more, or nothing")
     return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
-
-
-def _sigma_of(covariance: FloatArray | None, count: int) -> tuple[FloatArray, tuple[str, ...]]:
-    """Standard deviations and the names of their columns, none where none is known."""
-    if covariance is None or not np.isfinite(covariance).any():
-        return np.empty((count, 0)), ()
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), SIGMAS
-
-
-def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    path.write_text(csv_text(header, rows), encoding="utf-8", newline="")

@@ -1,9 +1,4 @@
-"""Targets measured and candidates rejected in the photographs, read from targets.csv of a result.
-
-    image,x_px,y_px,a_px,b_px,angle_deg,reason
-
-Source: RFC 4180 for CSV; the columns are described in the README.
-"""
+"""Targets measured and candidates rejected in the photographs, read from targets.csv of a result."""
 
 from __future__ import annotations
 
@@ -12,11 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from sfm.errors import SurveyFileError
-from sfm.files.csv_tables import read_table
+from sfm.files.result_tables import TARGETS
 from sfm.network import Network
 from sfm.solution import MEASURED, SeenTargets
-
-OUTLINE = ("a_px", "b_px", "angle_deg")
 
 
 def read_targets(folder: Path, network: Network) -> SeenTargets | None:
@@ -29,17 +22,17 @@ def read_targets(folder: Path, network: Network) -> SeenTargets | None:
     Raises:
         SurveyFileError: what is wrong, with file and line number.
     """
-    path = folder / "targets.csv"
+    path = folder / TARGETS.file
     if not path.is_file():
         return None
-    table = read_table(path, ("image", "reason"), ("x_px", "y_px", *OUTLINE), ignored=None, blank=OUTLINE)
+    table = TARGETS.read(folder)
     index = {name: i for i, name in enumerate(network.images)}
     images, reasons = table.texts
     for line, name in zip(table.line, images, strict=True):
         if name not in index:
             raise SurveyFileError(f"{path}, line {line}: image '{name}' is not in images.csv")
     axes = table.values[:, 2:4]
-    table.refuse(axes, axes <= 0, OUTLINE[:2], "more than 0, or nothing")
+    table.refuse(axes, axes <= 0, ("a_px", "b_px"), "more than 0, or nothing")
     ellipse = np.column_stack([axes, np.deg2rad(table.values[:, 4])])
     for line, reason, outline in zip(table.line, reasons, ellipse, strict=True):
         if reason == MEASURED and not np.isfinite(outline).all():

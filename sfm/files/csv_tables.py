@@ -40,6 +40,7 @@ class CsvTable:
     values: FloatArray  # columns of numbers, (rows, columns)
     line: IntArray  # line of each row in the file, (rows,)
     word: str = "line"  # what the numbers count: row of arrays
+    numbers: tuple[str, ...] = ()  # of the columns of numbers
 
     def place(self, row: int) -> str:
         """Return in words where a row stands."""
@@ -50,6 +51,14 @@ class CsvTable:
         values = self.texts[self.names.index(column)]
         self.refuse_duplicates(values, (column,))
         return values
+
+    def part(self, names: tuple[str, ...]) -> FloatArray:
+        """Return columns of numbers, NaN for those that the file does not have, (rows, columns)."""
+        found = np.full((len(self.line), len(names)), np.nan)
+        for k, name in enumerate(names):
+            if name in self.numbers:
+                found[:, k] = self.values[:, self.numbers.index(name)]
+        return found
 
     def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
         """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
@@ -132,6 +141,7 @@ def read_table(
         tuple(tuple(column) for column in columns),
         np.array(values).reshape(len(lines), len(numbers)),
         np.array(lines, dtype=np.int64),
+        numbers=numbers,
     )
 
 
@@ -165,7 +175,7 @@ def array_table(
         for name, column in texts.items()
     )
     values = np.column_stack(list(numbers.values()))
-    table = CsvTable(Path(what), tuple(texts), names, values, np.arange(1, rows + 1), "row")
+    table = CsvTable(Path(what), tuple(texts), names, values, np.arange(1, rows + 1), "row", tuple(numbers))
     wrong = ~(np.abs(values) <= MAX_NUMBER)
     wrong &= ~(np.isnan(values) & np.isin(list(numbers), blank))
     table.refuse(values, wrong, tuple(numbers), f"a finite number of at most {MAX_NUMBER:g}")

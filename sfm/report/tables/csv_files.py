@@ -1,8 +1,4 @@
-"""The tables of a result: points, images, cameras, image points, what was left out, given values, tests.
-
-Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
-points: as measured). Numbers are written with enough digits to give the same number back.
-"""
+"""The tables of a survey's result: its solution, what was left out, given values, and tests."""
 
 from __future__ import annotations
 
@@ -18,7 +14,16 @@ from sfm.conventions import FloatArray
 from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
-from sfm.files.plain_text import csv_text
+from sfm.files.result_tables import (
+    CAMERAS_BALANCED,
+    GIVEN,
+    LEFT_OUT,
+    RELIABILITY,
+    TARGETS,
+    VARIANCE_COMPONENTS,
+    Beside,
+    write_solution,
+)
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
@@ -31,68 +36,23 @@ USUAL_R0 = 2 / 3  # of the largest image radius
 
 def write_tables(findings: Findings, folder: Path) -> None:
     """Write all tables of a result into an existing folder; `summary.write_summary` adds the figures."""
-    adjustment, statistics = findings.result.adjustment, findings.statistics
-    for name, header, rows in (
-        (
-            *("points", "id,X,Y,Z,sX,sY,sZ,rays,code,angle_deg,rms_px,limiting_sX,limiting_sY,limiting_sZ"),
-            point_rows(findings),
-        ),
-        (
-            "images",
-            "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,"
-            "rms_px,coverage",
-            photograph_rows(findings),
-        ),
-        ("cameras", "camera,parameter,value,sigma,unit", camera_rows(findings)),
-        (
-            "image_points",
-            "image,point,x_px,y_px,sx_px,sy_px,cxy_px2,vx_px,vy_px,rejected",
-            image_point_rows(adjustment),
-        ),
-        ("cameras_balanced", "camera,parameter,value,sigma,unit", balanced_rows(findings)),
-        ("targets", "image,x_px,y_px,a_px,b_px,angle_deg,reason", target_rows(findings)),
-        ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
-        (
-            "given",
-            "kind,name,coordinate,unit,given,difference,sigma,r,w",
-            given_rows(findings.given, findings.result),
-        ),
-        (
-            "reliability",
-            "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected,"
-            "errorx_px,errory_px",
-            reliability_rows(adjustment, statistics),
-        ),
-        ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
-    ):
-        if name == "cameras_balanced" and BALANCED_MODEL not in findings.interior.models:
-            continue
-        if name == "targets" and not len(findings.result.seen_targets.image):
-            continue
-        text = csv_text(header.split(","), rows)
-        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
+    result, statistics = findings.result, findings.statistics
+    a = result.adjustment
+    seen = [
+        (*(one.rays, one.code, one.angle_deg, one.rms_px), *one.limiting.tolist()) for one in findings.points
+    ]
+    used = [(one.points, one.rms_px, one.coverage) for one in findings.photographs]
+    beside = Beside(list(zip(*seen, strict=True)), list(zip(*used, strict=True)), a.residuals)
+    write_solution(folder, result.solution, a.network.image_points, a.rejected, beside)
+    LEFT_OUT.write_rows(folder, left_out_rows(findings))
+    GIVEN.write_rows(folder, given_rows(findings.given, result))
+    RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
+    VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
+    if BALANCED_MODEL in findings.interior.models:
+        CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
+    if len(result.seen_targets.image):
+        TARGETS.write_rows(folder, target_rows(findings))
     write_ply(folder / "points.ply", findings)
-
-
-def point_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return coordinates, sigmas, rays, code, intersection angle, RMS and limiting sigmas of every point."""
-    for one in findings.points:
-        seen = (one.rays, one.code, one.angle_deg, one.rms_px)
-        yield (one.name, *one.xyz, *one.sigma, *seen, *one.limiting)
-
-
-def photograph_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return exterior orientation, sigmas, camera, number of points, RMS and coverage of every photograph."""
-    for one in findings.photographs:
-        yield (one.name, *one.values, *one.sigma, one.camera, one.points, one.rms_px, one.coverage)
-
-
-def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return camera, parameter, value, sigma (empty where it was not adjusted) and unit."""
-    cameras = findings.result.adjustment.estimate.cameras
-    for camera, sigma in zip(cameras, findings.interior.sigmas, strict=True):
-        for name, value, s, unit in zip(camera.names, camera.parameters, sigma, camera.units, strict=True):
-            yield (camera.name, name, value, s, unit)
 
 
 def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
@@ -123,20 +83,6 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
         at_R0 = BALANCED.index("R0")
         for (name, value), s, unit in zip(rows, np.insert(sigma, at_R0, np.nan), UNITS, strict=True):
             yield (camera.name, name, -value if name == "c" else value, s, unit)
-
-
-def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
-    """Return image, point, position, what was stated of it, residuals and 0 or 1 for rejected.
-
-    Standard deviations and covariance are empty where there are none.
-    """
-    network = adjustment.network
-    seen = network.image_points
-    columns = (seen.xy, seen.stated_sigma, seen.stated_covariance, adjustment.residuals)
-    for (x, y, sx, sy, sxy, vx, vy), (image, point), rejected in zip(
-        np.column_stack(columns).tolist(), _names(network), adjustment.rejected.tolist(), strict=True
-    ):
-        yield image, point, x, y, sx, sy, sxy or None, vx, vy, int(rejected)
 
 
 def target_rows(findings: Findings) -> Iterable[Sequence[object]]:

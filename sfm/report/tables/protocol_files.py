@@ -8,58 +8,36 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
-from sfm.files.plain_text import csv_text
+from sfm.files.result_tables import (
+    CONTROL_POINTS,
+    EXTERIOR_CORRELATIONS,
+    IMAGE_COVARIANCES,
+    INTERIOR_CORRELATIONS,
+    POINT_COVARIANCES,
+    RESIDUALS,
+    write_covariances,
+)
 from sfm.report.findings.findings import Findings
-
-EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
-AXES = ("X", "Y", "Z")
 
 
 def write_protocol(findings: Findings, folder: Path) -> None:
     """Write the tables of the protocol into an existing folder."""
     a = findings.result.adjustment
-    for name, header, rows in (
-        (
-            "residuals",
-            "kind,name,accepted,rejected,rmsx_px,rmsy_px,largestx_px,largesty_px,largestx_at,largesty_at",
-            _residual_rows(findings),
-        ),
-        (
-            "control_points",
-            "use,point,coordinate,given,sigma_prior,adjusted,sigma_posterior,difference,test",
-            _control_rows(findings),
-        ),
-        ("interior_correlations", "camera,first,second,correlation", _correlation_rows(a)),
-        (
-            "exterior_correlations",
-            f"camera,parameter,image,{','.join(EXTERIOR)}",
-            _exterior_correlation_rows(findings),
-        ),
-        ("point_covariances", _header("id", AXES), _covariance_rows(a.network.points, a.covariance.points)),
-        (
-            "image_covariances",
-            _header("image", EXTERIOR),
-            _covariance_rows(a.network.images, a.covariance.exterior),
-        ),
+    RESIDUALS.write_rows(folder, _residual_rows(findings))
+    CONTROL_POINTS.write_rows(folder, _control_rows(findings))
+    INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
+    EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
+    for table, names, covariance in (
+        (POINT_COVARIANCES, a.network.points, a.covariance.points),
+        (IMAGE_COVARIANCES, a.network.images, a.covariance.exterior),
     ):
-        text = csv_text(header.split(","), rows)
-        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
-    interior: dict[str, Any] = {f"interior_{k}": Q for k, Q in enumerate(a.covariance.interior)}
-    np.savez_compressed(
-        folder / "covariances.npz",
-        point_names=np.array(a.network.points),
-        points=a.covariance.points,
-        image_names=np.array(a.network.images),
-        exterior=a.covariance.exterior,
-        camera_names=np.array([camera.name for camera in a.estimate.cameras]),
-        **interior,
-    )
+        rows, columns = np.triu_indices(covariance.shape[1])
+        table.write(folder, names, covariance[:, rows, columns])
+    write_covariances(folder, findings.result.solution, points=True)
 
 
 def _residual_rows(findings: Findings) -> Iterable[Sequence[object]]:
@@ -97,15 +75,3 @@ def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]
     for c, (parameter, camera) in enumerate(found.parameters):
         for image, rho in zip(found.images, found.rho[:, :, c], strict=True):
             yield (camera.removeprefix("camera "), parameter, image, *rho)
-
-
-def _header(name: str, parts: tuple[str, ...]) -> str:
-    pairs = [f"{one}_{other}" for k, one in enumerate(parts) for other in parts[k:]]
-    return ",".join((name, *pairs))
-
-
-def _covariance_rows(names: Sequence[str], covariance: FloatArray) -> Iterable[Sequence[object]]:
-    """Yield the upper triangle of each covariance matrix, row by row."""
-    rows, columns = np.triu_indices(covariance.shape[1])
-    for name, Q in zip(names, covariance, strict=True):
-        yield (name, *Q[rows, columns])

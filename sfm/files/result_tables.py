@@ -1,0 +1,260 @@
+"""The tables of a result: columns that are stated once, for those who write them and those who read them.
+
+Degrees in files, lengths in the object unit of the survey, sigmas are standard deviations a posteriori (those
+of image points: as measured). Numbers are written with enough digits to give the same number back.
+
+Source: RFC 4180 for CSV; docs/reference/results.md says what each column is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, angles_from_rotation
+from sfm.files.csv_tables import CsvTable, read_header, read_table
+from sfm.files.plain_text import csv_text
+from sfm.network import ImagePoints
+from sfm.solution import Solution
+
+COVARIANCES = "covariances.npz"
+
+
+KINDS = (
+    "name",  # text
+    "number",
+    "blank",  # numbers whose cells may be empty
+    "optional",  # the same, which may also be missing as a whole
+    "flag",  # 0 or 1, may be missing as a whole
+    "further",  # for people and other programs, not read again
+)
+
+
+class ResultTable:
+    """A table of a result: groups of columns that are known together or not at all."""
+
+    def __init__(self, stem: str, *groups: str) -> None:
+        """State the columns of a table.
+
+        Args:
+            stem: of the name of its file.
+            groups: kind and names of each group, as "number: X Y Z"; of the optional ones the first must be
+                there for the others to be read.
+        """
+        self.file = f"{stem}.csv"
+        self.groups = tuple(_group(text) for text in groups)
+
+    def names_of(self, *kinds: str) -> tuple[str, ...]:
+        """Return the names of the columns of some kinds, of all without any."""
+        return tuple(one for kind, names in self.groups if kind in (kinds or KINDS) for one in names)
+
+    def read(self, folder: Path) -> CsvTable:
+        """Read the names and numbers of the table of a result.
+
+        Raises:
+            SurveyFileError: what is missing or wrong, with file and line number.
+        """
+        path, blank = folder / self.file, self.names_of("blank", "optional")
+        optional = [names for kind, names in self.groups if kind == "optional"]
+        flags = self.names_of("flag")
+        if flags or optional[1:]:
+            header = read_header(path)
+            flags = tuple(one for one in flags if one in header)
+            optional = optional[:1] + [names for names in optional[1:] if {*names, *optional[0]} <= {*header}]
+        numbers = (*self.names_of("number"), *self.names_of("blank"), *flags)
+        return read_table(
+            path,
+            self.names_of("name"),
+            numbers,
+            tuple(one for names in optional for one in names),
+            ignored=None,
+            blank=blank,
+        )
+
+    def write(self, folder: Path, *values: Any) -> None:
+        """Write the table of a result.
+
+        Args:
+            folder: of the result.
+            values: of each group an array (n, columns), a sequence for each column, or of a single column one
+                sequence; None leaves the group out.
+        """
+        header: list[str] = []
+        columns: list[Sequence[object]] = []
+        for (_, names), value in zip(self.groups, values, strict=True):
+            if value is not None:
+                header += names
+                columns += _columns(value, len(names))
+        self._save(folder, header, zip(*columns, strict=True))
+
+    def write_rows(self, folder: Path, rows: Iterable[Sequence[object]]) -> None:
+        """Write the table of a result from rows of all columns."""
+        self._save(folder, self.names_of(), rows)
+
+    def _save(self, folder: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+        (folder / self.file).write_text(csv_text(header, rows), encoding="utf-8", newline="")
+
+
+def _group(text: str) -> tuple[str, tuple[str, ...]]:
+    kind, _, names = text.partition(": ")
+    if kind not in KINDS:
+        raise ValueError(f"columns '{text}', expected one of {', '.join(KINDS)} before the names")
+    return kind, tuple(names.split())
+
+
+def _columns(value: Any, count: int) -> list[Sequence[object]]:
+    """Return the columns of a group as sequences."""
+    if isinstance(value, np.ndarray):
+        value = value.T.tolist() if value.ndim == 2 else value.tolist()
+    columns = [value] if count == 1 else list(value)
+    if len(columns) != count:
+        raise ValueError(f"{len(columns)} columns of values for {count} columns of the table")
+    return columns
+
+
+EXTERIOR = "X0 Y0 Z0 omega phi kappa"
+
+
+def _covariance_table(stem: str, what: str, parts: str) -> ResultTable:
+    """Return a table of the upper triangles of covariance matrices."""
+    names = parts.split()
+    pairs = (f"{one}_{other}" for k, one in enumerate(names) for other in names[k:])
+    return ResultTable(stem, f"name: {what}", f"further: {' '.join(pairs)}")
+
+
+POINTS = ResultTable(
+    "points",
+    *("name: id", "number: X Y Z", "optional: sX sY sZ"),
+    "further: rays code angle_deg rms_px limiting_sX limiting_sY limiting_sZ",
+)
+IMAGES = ResultTable(
+    "images",
+    *("name: image", "number: X Y Z omega_deg phi_deg kappa_deg", "optional: sX sY sZ"),
+    *("further: somega_deg sphi_deg skappa_deg", "name: camera", "further: points rms_px coverage"),
+)
+CAMERAS = ResultTable(
+    "cameras", "name: camera parameter", "number: value", "optional: sigma", "further: unit"
+)
+IMAGE_POINTS = ResultTable(
+    "image_points",
+    *("name: image point", "number: x_px y_px", "optional: sx_px sy_px", "optional: cxy_px2"),
+    *("further: vx_px vy_px", "flag: rejected"),
+)
+CAMERAS_BALANCED = ResultTable("cameras_balanced", "further: camera parameter value sigma unit")
+TARGETS = ResultTable(
+    "targets", "name: image", "number: x_px y_px", "blank: a_px b_px angle_deg", "name: reason"
+)
+LEFT_OUT = ResultTable("left_out", "further: kind name image_points reason")
+GIVEN = ResultTable(
+    "given",
+    *("name: kind name coordinate", "further: unit", "number: given", "further: difference"),
+    *("blank: sigma", "further: r w"),
+)
+RELIABILITY = ResultTable(
+    "reliability",
+    *("name: image point", "further: vx_px vy_px rx ry", "blank: wx wy"),
+    "further: taux tauy mdbx_px mdby_px extx exty weight rejected errorx_px errory_px",
+)
+VARIANCE_COMPONENTS = ResultTable("variance_components", "further: kind group observations redundancy sigma0")
+RESIDUALS = ResultTable(
+    "residuals",
+    "further: kind name accepted rejected rmsx_px rmsy_px largestx_px largesty_px largestx_at largesty_at",
+)
+CONTROL_POINTS = ResultTable(
+    "control_points",
+    *("name: use point coordinate", "blank: given sigma_prior"),
+    "further: adjusted sigma_posterior difference test",
+)
+INTERIOR_CORRELATIONS = ResultTable("interior_correlations", "further: camera first second correlation")
+EXTERIOR_CORRELATIONS = ResultTable("exterior_correlations", f"further: camera parameter image {EXTERIOR}")
+POINT_COVARIANCES = _covariance_table("point_covariances", "id", "X Y Z")
+IMAGE_COVARIANCES = _covariance_table("image_covariances", "image", EXTERIOR)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Columns that a survey writes beside a solution, in the order of its rows."""
+
+    points: Sequence[Sequence[object]]  # rays, code, angle, RMS, limiting standard deviations
+    images: Sequence[Sequence[object]]  # points, RMS, coverage
+    residuals: FloatArray  # px, (k, 2)
+
+
+def write_solution(
+    folder: Path, solution: Solution, seen: ImagePoints, rejected: BoolArray, beside: Beside | None = None
+) -> None:
+    """Write the tables of points, photographs, cameras and image points.
+
+    Args:
+        folder: of the result.
+        solution: with coordinates of all points and photographs.
+        seen: its k image points, those rejected included.
+        rejected: which of them were rejected, (k,).
+        beside: further columns; without them columns of which nothing is known are left out, too.
+    """
+    network, estimate = solution.network, solution.estimate
+    every = beside is not None
+
+    def known(values: FloatArray | None) -> FloatArray | None:
+        return values if values is not None and (every or np.isfinite(values).any()) else None
+
+    point = known(_sigmas(solution.point_covariance))
+    position = known(_sigmas(solution.position_covariance))
+    exterior = None if position is None else _sigmas(solution.exterior_covariance)
+    angles = np.degrees(angles_from_rotation(estimate.rotation))
+    names = [estimate.cameras[k].name for k in network.camera]
+    POINTS.write(folder, network.points, estimate.points, point, beside and beside.points)
+    IMAGES.write(
+        folder,
+        *(network.images, np.hstack([estimate.position, angles]), position),
+        *(None if exterior is None else np.degrees(exterior[:, 3:]), names, beside and beside.images),
+    )
+    sigmas = solution.interior_sigma or [np.full(len(one.names), np.nan) for one in estimate.cameras]
+    CAMERAS.write_rows(
+        folder,
+        (
+            (camera.name, *row)
+            for camera, sigma in zip(estimate.cameras, sigmas, strict=True)
+            for row in zip(camera.names, camera.parameters, sigma, camera.units, strict=True)
+        ),
+    )
+    images, points = [network.images[i] for i in seen.image], [network.points[j] for j in seen.point]
+    between = seen.stated_covariance
+    IMAGE_POINTS.write(
+        folder,
+        *((images, points), seen.xy, known(seen.stated_sigma)),
+        [one or None for one in between.tolist()] if every or between.any() else None,
+        beside and beside.residuals,
+        rejected.astype(int) if every or rejected.any() else None,
+    )
+
+
+def write_covariances(folder: Path, solution: Solution, *, points: bool = False) -> None:
+    """Write covariances.npz: those of each exterior and each interior orientation as arrays, as far as known.
+
+    Args:
+        folder: of the result.
+        solution: with its covariances.
+        points: whether those of each point are written, too.
+    """
+    network = solution.network
+    arrays: dict[str, Any] = {}
+    if points and solution.point_covariance is not None:
+        arrays |= {"point_names": np.array(network.points), "points": solution.point_covariance}
+    if solution.exterior_covariance is not None:
+        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
+    arrays["camera_names"] = np.array([camera.name for camera in solution.estimate.cameras])
+    arrays |= {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
+    np.savez_compressed(folder / COVARIANCES, **arrays)
+
+
+def _sigmas(covariance: FloatArray | None) -> FloatArray | None:
+    """Return the standard deviations of covariance matrices (n, d, d), NaN where not known, (n, d)."""
+    if covariance is None:
+        return None
+    variance = np.einsum("nii->ni", covariance)
+    return np.asarray(np.sqrt(np.where(variance >= 0, variance, np.nan)))
