@@ -1,4 +1,4 @@
-"""Object points as a PLY point cloud in text form, read and written.
+"""Object points read from a PLY point cloud in text form; `sfm.files.ply` writes it.
 
 Vertices have x, y, z and, where they are known, the standard deviations sx, sy, sz; names of points follow
 as comments "name <id>", one for each vertex in order, which other programs pass over.
@@ -12,18 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.reading.text_lines import Lines, write_lines
+from adapters.reading.text_lines import Lines
 from sfm.conventions import FloatArray
-from sfm.errors import OutputError
 from sfm.files.csv_tables import MAX_ROWS
 from sfm.files.plain_text import shown
+from sfm.files.ply import SIGMAS
 
 NUMBER_TYPES = {
     *("char", "uchar", "short", "ushort", "int", "uint", "float", "double"),
     *("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"),
 }
 MAX_COLUMNS = 100
-SIGMAS = ("sx", "sy", "sz")
 
 
 def read_ply(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
@@ -80,29 +79,3 @@ def read_ply(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     if set(SIGMAS) <= set(columns):
         sigma = table[:, [columns.index(name) for name in SIGMAS]]
     return tuple(names) or tuple(f"{j + 1}" for j in range(count)), xyz, sigma
-
-
-def write_ply(path: Path, names: tuple[str, ...], xyz: FloatArray, sigma: FloatArray | None = None) -> None:
-    """Write points with their names and, if given, standard deviations (n, 3); points with NaN are left out.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    if any(" ".join(name.split()) != name for name in names):
-        raise OutputError("PLY: names of points cannot begin or end with a space or have two in a row")
-    table = np.asarray(xyz) if sigma is None else np.hstack([xyz, sigma])
-    kept = np.flatnonzero(np.isfinite(table).all(axis=1))
-    columns = ("x", "y", "z") if sigma is None else ("x", "y", "z", *SIGMAS)
-    write_lines(
-        path,
-        [
-            "ply",
-            "format ascii 1.0",
-            "comment kolinear",
-            *(f"comment name {names[j]}" for j in kept),
-            f"element vertex {len(kept)}",
-            *(f"property double {name}" for name in columns),
-            "end_header",
-            *(" ".join(repr(float(value)) for value in table[j]) for j in kept),
-        ],
-    )

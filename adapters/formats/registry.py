@@ -34,7 +34,6 @@ from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
 from adapters.formats.photomodeler import read_export, write_export
-from adapters.formats.ply import write_ply
 from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
@@ -46,6 +45,7 @@ from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links, refuse_links_out
+from sfm.files.ply import write_ply
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.solution import Solution
@@ -119,7 +119,7 @@ def _write_ply(path: Path, content: Content) -> None:
     result = content.result
     C = result.point_covariance
     sigma = None if C is None else np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    write_ply(path, result.network.points, result.estimate.points, sigma)
+    write_ply(path, result.estimate.points, names=result.network.points, sigma=sigma)
 
 
 _COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_opencv"))

@@ -110,7 +110,7 @@ def _columns(value: Any, count: int) -> list[Sequence[object]]:
     """Return the columns of a group as sequences."""
     if isinstance(value, np.ndarray):
         value = value.T.tolist() if value.ndim == 2 else value.tolist()
-    columns = [value] if count == 1 else list(value)
+    columns = [value] if count == 1 else list(value) or [()] * count
     if len(columns) != count:
         raise ValueError(f"{len(columns)} columns of values for {count} columns of the table")
     return columns

@@ -18,7 +18,6 @@ from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import Findings, with_remark
 from sfm.report.html.page import report_page
 from sfm.report.tables.csv_files import write_tables
-from sfm.report.tables.protocol_files import write_protocol
 from sfm.report.tables.summary import write_summary
 from sfm.report.text.text_report import text_report
 from sfm.report.viewer.embedded import viewer_of
@@ -116,7 +115,6 @@ def write_result(
             findings = with_remark(findings, remark("photographs_not_drawn", photographs=lost))
             result = findings.result
         write_tables(findings, folder)
-        write_protocol(findings, folder)
         if overlays:
             (folder / "overlays").mkdir()
         for overlay in overlays:

@@ -17,7 +17,7 @@ from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.tables.protocol_files import write_protocol
+from sfm.report.tables.csv_files import write_tables
 from sfm.report.text.text_report import text_report
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
@@ -95,7 +95,7 @@ def test_radial_parameters_are_tested_together() -> None:
 
 
 def test_the_files_hold_all_covariances(found: Findings, tmp_path: Path) -> None:
-    write_protocol(found, tmp_path)
+    write_tables(found, tmp_path)
     a = found.result.adjustment
     with np.load(tmp_path / "covariances.npz") as stored:
         np.testing.assert_array_equal(stored["points"], a.covariance.points)
@@ -109,7 +109,7 @@ def test_the_files_hold_all_covariances(found: Findings, tmp_path: Path) -> None
 
 
 def test_correlations_with_every_photograph_are_a_table(found: Findings, tmp_path: Path) -> None:
-    write_protocol(found, tmp_path)
+    write_tables(found, tmp_path)
     with (tmp_path / "exterior_correlations.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     a = found.result.adjustment

@@ -145,7 +145,7 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
     import numpy as np
 
     from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
-    from adapters.formats.ply import write_ply
+    from sfm.files.ply import write_ply
     from sfm.report.measurement import point_sigma, write_point_covariance
 
     points = found.points
@@ -163,6 +163,6 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
             circles.append(DxfCircle(fit.name, shape.origin, shape.axis, float(shape.form[0])))
     write_point_covariance(found, folder)
     known = sigma if np.isfinite(sigma).all() else None
-    write_ply(folder / "points.ply", names=points.names, xyz=points.xyz, sigma=known)
+    write_ply(folder / "points.ply", points.xyz, names=points.names, sigma=known)
     write_dxf(folder / "measurement.dxf", names=points.names, xyz=points.xyz, layers=layers, lines=lines,
               circles=circles, texts=texts)  # fmt: skip

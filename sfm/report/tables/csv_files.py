@@ -14,14 +14,22 @@ from sfm.conventions import FloatArray
 from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
+from sfm.files.ply import write_ply
 from sfm.files.result_tables import (
     CAMERAS_BALANCED,
+    CONTROL_POINTS,
+    EXTERIOR_CORRELATIONS,
     GIVEN,
+    IMAGE_COVARIANCES,
+    INTERIOR_CORRELATIONS,
     LEFT_OUT,
+    POINT_COVARIANCES,
     RELIABILITY,
+    RESIDUALS,
     TARGETS,
     VARIANCE_COMPONENTS,
     Beside,
+    write_covariances,
     write_solution,
 )
 from sfm.network import Network
@@ -31,6 +39,7 @@ from sfm.report.findings.given_residuals import Given
 from sfm.result import SurveyResult
 from sfm.solution import CONTROL_COVARIANCE, MEASURED
 
+CODED_COLOUR, UNCODED_COLOUR = (20, 140, 60), (120, 120, 120)  # in points.ply
 USUAL_R0 = 2 / 3  # of the largest image radius
 
 
@@ -48,11 +57,24 @@ def write_tables(findings: Findings, folder: Path) -> None:
     GIVEN.write_rows(folder, given_rows(findings.given, result))
     RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
     VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
+    RESIDUALS.write_rows(folder, _residual_rows(findings))
+    CONTROL_POINTS.write_rows(folder, _control_rows(findings))
+    INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
+    EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
+    for table, names, covariance in (
+        (POINT_COVARIANCES, a.network.points, a.covariance.points),
+        (IMAGE_COVARIANCES, a.network.images, a.covariance.exterior),
+    ):
+        rows, columns = np.triu_indices(covariance.shape[1])
+        table.write(folder, names, covariance[:, rows, columns])
+    write_covariances(folder, result.solution, points=True)
     if BALANCED_MODEL in findings.interior.models:
         CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
     if len(result.seen_targets.image):
         TARGETS.write_rows(folder, target_rows(findings))
-    write_ply(folder / "points.ply", findings)
+    colours = [UNCODED_COLOUR if one.code is None else CODED_COLOUR for one in findings.points]
+    unit = result.length_unit
+    write_ply(folder / "points.ply", a.estimate.points, colours=colours, unit=unit)
 
 
 def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
@@ -164,26 +186,38 @@ def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
             yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
 
 
-def write_ply(path: Path, findings: Findings) -> None:
-    """Write the object points as a PLY point cloud in text form: coded green, uncoded grey.
-
-    Source: Turk, The PLY polygon file format (1994).
-    """
-    points = findings.points
-    lines = [
-        "ply",
-        "format ascii 1.0",
-        f"comment kolinear, {_ascii(findings.result.length_unit)}",
-        f"element vertex {len(points)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-        "end_header",
-    ]
-    for point in points:
-        colour = "120 120 120" if point.code is None else "20 140 60"
-        lines.append(" ".join(f"{value:.17g}" for value in point.xyz) + " " + colour)
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+def _residual_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    for one in findings.protocol.residuals:
+        yield (
+            *(one.kind, one.name, one.accepted, one.rejected),
+            *(*one.rms_px, *one.largest_px, *one.largest_at),
+        )
 
 
-def _ascii(text: str) -> str:
-    return text.encode("ascii", "replace").decode().replace("\n", " ").replace("\r", " ")
+def _control_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    for one in findings.protocol.control:
+        yield (
+            *(one.use, one.point, one.coordinate, one.given, one.prior),
+            *(one.adjusted, one.posterior, one.difference, one.test),
+        )
+
+
+def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
+    """Yield all correlations of the interior parameters of each camera."""
+    for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
+        names = [camera.names[s] for s in np.flatnonzero(camera.free)[: len(Q)]]
+        sigma = np.sqrt(np.clip(np.diagonal(Q), 0, None))
+        for r, first in enumerate(names):
+            for c in range(r + 1, len(names)):
+                known = sigma[r] * sigma[c]
+                yield camera.name, first, names[c], Q[r, c] / known if known > 0 else np.nan
+
+
+def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Yield the correlations of every interior parameter with every photograph."""
+    found = findings.result.exterior_correlations
+    if found is None:
+        return
+    for c, (parameter, camera) in enumerate(found.parameters):
+        for image, rho in zip(found.images, found.rho[:, :, c], strict=True):
+            yield (camera.removeprefix("camera "), parameter, image, *rho)

@@ -22,7 +22,7 @@ from adapters.formats.bundle_text import (
 )
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
-from adapters.formats.ply import read_ply, write_ply
+from adapters.formats.ply import read_ply
 from adapters.formats.registry import FORMATS as FILE_FORMATS
 from adapters.formats.registry import (
     format_named,
@@ -41,6 +41,7 @@ from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.undistortion import undistort
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.files.ply import write_ply
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.places import ROOT, SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of
@@ -288,11 +289,11 @@ def test_ply_round_trip_and_damage(tmp_path: Path) -> None:
     xyz, sigma = rng.standard_normal((5, 3)), rng.random((5, 3))
     names = ("1", "2", "A b", "ü", "5")
     path = tmp_path / "points.ply"
-    write_ply(path, names, xyz, sigma)
+    write_ply(path, xyz, names=names, sigma=sigma)
     for found, truth in zip(read_ply(path), (names, xyz, sigma), strict=True):
         np.testing.assert_array_equal(found, truth)
     path.unlink()
-    write_ply(path, names, xyz)
+    write_ply(path, xyz, names=names)
     assert np.isnan(read_ply(path)[2]).all()
     text = path.read_text(encoding="utf-8")
     for cut in range(1, len(text.splitlines())):
