@@ -1,0 +1,147 @@
+"""Declared pages: tables on the page, in files and on the terminal; a new page in one file and one row."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import get_type_hints
+
+import numpy as np
+import pytest
+
+from sfm.conventions import FloatArray
+from sfm.remarks.remark import remark
+from sfm.remarks.verdict import judge
+from sfm.report.html.page import html
+from sfm.report.numbers import significant
+from sfm.report.page import (
+    MAX_ROWS,
+    YES,
+    Banner,
+    Column,
+    Folded,
+    Heading,
+    Link,
+    Mark,
+    Note,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    Tile,
+    axes,
+    facts,
+)
+from sfm.report.pages import PAGES, page_of, write_page
+
+EVIL = "<img src=x onerror=alert(1)>"
+
+
+@dataclass(frozen=True)
+class Levelling:
+    """Heights of points over those of a levelling: what the exercise shows on a page of its own."""
+
+    names: tuple[str, ...]
+    difference: FloatArray  # m, (n,)
+    sigma: float  # m
+
+
+def page(found: Levelling) -> Page:
+    """Return the page of a levelling; with its row in PAGES all that a new page needs."""
+    level, sigma = found.difference, found.sigma
+    columns = (
+        Column("point", "id"),
+        Column("difference", "dZ", "mm", "+.2f", 1000.0, unknown="not levelled"),
+        Column("within 3 sigma", "agrees", flag=YES),
+    )
+    rows = list(zip(found.names, level, np.abs(level) <= 3 * sigma, strict=True))
+    worst = f"{significant(1000 * np.nanmax(np.abs(level)))} mm at most"
+    return Page(
+        "levelling",
+        "Levelling",
+        "Heights",
+        judge((), {"good": worst, "fair": worst, "bad": worst}),
+        (
+            Section("Heights", (facts([("Sigma", f"{significant(1000 * sigma)} mm")]), Note("Levelled."))),
+            Section("Points", (Folded("all", (Table(columns, rows, "heights"),)),)),
+        ),
+        summary={"sigma": sigma, "largest": np.nanmax(np.abs(level)), "differences": level},
+    )
+
+
+@pytest.fixture
+def levelling(monkeypatch: pytest.MonkeyPatch) -> Levelling:
+    monkeypatch.setitem(PAGES, "Levelling", __name__)  # the row
+    return Levelling((EVIL, "=B", "C"), np.array([0.0012345, -0.02, np.nan]), 0.001)
+
+
+def test_a_new_page_is_one_file_and_one_row(levelling: Levelling, tmp_path: Path) -> None:
+    path = write_page(levelling, tmp_path / "out")
+    files = ("heights.csv", "levelling.html", "levelling.json", "manifest.json")
+    assert sorted(one.name for one in path.parent.iterdir()) == list(files)
+    with (path.parent / "heights.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows == [["id", "dZ", "agrees"], [EVIL, "0.0012345", "1"], ["'=B", "-0.02", "0"], ["C", "", "0"]]
+    assert json.loads((path.parent / "levelling.json").read_text()) == {
+        "sigma": 0.001,
+        "largest": 0.02,
+        "differences": [0.0012345, -0.02, None],
+    }
+    text = path.read_text()
+    assert EVIL not in text and "&lt;img src=x" in text
+    assert "<strong>20.0 mm at most</strong>" in text and "<h2>Points</h2>" in text
+    assert "<th class=n>difference [mm]</th>" in text and "<td class=n>+1.23</td>" in text
+    assert "<td>not levelled</td><td></td>" in text and "<td>yes</td>" in text
+    assert page_of(levelling).tables[0].text.splitlines()[1:] == [
+        f"{EVIL}            +1.23  yes",
+        f"=B{'-20.00':>43}",
+        f"C{'not levelled':>44}",
+    ]
+
+
+@pytest.mark.parametrize("shown", PAGES)
+def test_every_row_leads_to_a_declaration_of_its_type(shown: str) -> None:
+    hints = get_type_hints(import_module(PAGES[shown]).page)
+    assert next(iter(hints.values())).__name__ == shown and hints["return"] is Page
+
+
+def small(*parts: object, **options: object) -> Page:
+    return Page("x", "Kind", "Title", Banner("good", "Fine."), (Section("S", parts), None), **options)  # type: ignore[arg-type]
+
+
+def test_every_kind_of_part_is_rendered_and_escaped() -> None:
+    cells = (Mark(EVIL, "bad"), Link(EVIL, 'a b"/x.html'))
+    table = Table((Column(EVIL), Column(EVIL)), [cells], total=("sum", None))
+    parts = (Heading(EVIL), Paragraph(EVIL), Note(EVIL), Folded(EVIL, (table,), open=True), None)
+    text = html(small(*parts, tiles=(Tile(EVIL, EVIL, EVIL),)))
+    assert EVIL not in text and text.count("&lt;img src=x") == 11
+    assert '<span class="mark bad">&lt;img' in text and 'href="a%20b%22/x.html"' in text
+    assert "<details open>" in text and "<tr class=sum><th scope=row>sum</th><td></td></tr>" in text
+
+
+def test_remarks_of_a_verdict_stand_in_the_banner() -> None:
+    said = remark("photographs_not_drawn", photographs=[EVIL])
+    verdict = judge((said,), {"good": "g", "fair": "f", "bad": "b"})
+    text = html(Page("x", "Kind", "Title", verdict, ()))
+    assert f'<li class="{said.severity}">' in text and EVIL not in text
+
+
+def test_a_page_shows_the_first_rows_and_the_file_has_all() -> None:
+    rows = [(str(k), float(k)) for k in range(MAX_ROWS + 1)]
+    table = Table((Column("point", "id"), Column("X", "X", format=".1f")), rows, "points")
+    text = html(small(table))
+    assert text.count("<th scope=row>") == MAX_ROWS and f"The first {MAX_ROWS} of {MAX_ROWS + 1} rows" in text
+    assert len(table.csv.splitlines()) == MAX_ROWS + 2 and len(table.records) == MAX_ROWS + 1
+    assert Table(table.columns, rows[1:], "points").cut == ""
+
+
+def test_columns_of_the_page_and_of_files_are_apart() -> None:
+    columns = (Column(None, "id"), Column("shown"), *axes("d", "mm", ".1f", factor=1000.0, parts="XY"))
+    table = Table(columns, [("a", "b", 0.001, np.float64(np.inf))])
+    assert table.header == ("shown", ">dX [mm]", ">dY [mm]")
+    assert list(table.cells) == [("b", "1.0", "inf")]
+    assert table.csv == "id,dX,dY\na,0.001,\n"
+    assert table.records == [{"id": "a", "dX": 0.001, "dY": None}]
