@@ -91,9 +91,7 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
         sum(getattr(row, of) or 0 for row in rows) for of in ("photographs", "photographs_total", "points")
     )
     every = Table(
-        tuple(Column(name=field.name) for field in fields(SurveyRow)),
-        [astuple(row) for row in rows],
-        "batch",
+        tuple(Column(name=field.name) for field in fields(SurveyRow)), [astuple(row) for row in rows], "batch"
     )
     without = [row for row in rows if row.status != "done"]
     return Page(
@@ -102,8 +100,8 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
         name,
         judge(batch_remarks(rows), {"good": headline, "fair": headline, "bad": headline}),
         (
-            Section("Surveys", (_surveys(rows, above), Note(f"Files are below {above}") if above else None)),
-            Section("Without a result", (_without(without, above),)) if without else None,
+            Section("Surveys", _surveys(rows, above), Note(f"Files are below {above}") if above else None),
+            Section("Without a result", _without(without, above) if without else None),
         ),
         tiles=(
             Tile("Surveys", len(rows), f"{good} with a dependable result"),

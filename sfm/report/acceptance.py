@@ -72,8 +72,8 @@ def page(found: Acceptance) -> Page:
         a.name,
         a.verdict,
         (
-            Section("Figures", (figures, note, plot("errors", PICTURE, length_error_figure(found)))),
-            Section("Lengths", (Table(columns, list(rows), "lengths"),)),
+            Section("Figures", figures, note, plot("errors", PICTURE, length_error_figure(found))),
+            Section("Lengths", Table(columns, list(rows), "lengths")),
         ),
         summary=summary,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sfm.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, fixed, significant
-from sfm.report.page import YES, Column, Folded, Note, Page, Part, Section, Table, axes
+from sfm.report.page import YES, Column, Folded, Note, Page, Part, Section, Table, axes, values_of
 
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -31,14 +32,14 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
         xyz: coordinates of the common points in the first result, object unit, (n, 3).
     """
     first, second = found.names
-    known = [name for name, has in zip(found.names, found.has_sigma, strict=True) if has]
+    known = list(compress(found.names, found.has_sigma))
     tested = int(np.isfinite(found.statistic).sum())
     one_sided = len(known) == 1 and tested
     note = Note("The other result has none, and counts as free of error in the test.") if one_sided else None
     picture = None
     if len(found.points) >= 3 and _longest(found.point_difference) > 0:
         figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
-        picture = Section("Picture", (plot("differences", PICTURE, figure),))
+        picture = plot("differences", PICTURE, figure)
     columns = (
         Column("point", "id"),
         *axes("d", found.unit),
@@ -59,14 +60,11 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
         f"{second} minus {first}",
         verdict_of_comparison(found),
         (
-            Section("Figures", (_figures(found, known), note)),
-            Section("Test", _test(found, tested)) if tested else None,
-            picture,
-            *(Section(f"Camera {one.camera}", _camera(one, second)) for one in found.interior),
-            Section(
-                "Points",
-                (Folded(counted(len(rows), "point"), (Table(columns, rows, "differences"),)),),
-            ),
+            Section("Figures", _figures(found, known), note),
+            Section("Test", *_test(found, tested)),
+            Section("Picture", picture),
+            *(Section(f"Camera {one.camera}", *_camera(one, second)) for one in found.interior),
+            Section("Points", Folded(counted(len(rows), "point"), Table(columns, rows, "differences"))),
         ),
         summary=_summary(found, tested),
     )
@@ -100,6 +98,8 @@ def _figures(found: ResultComparison, known: list[str]) -> Table:
 
 
 def _test(found: ResultComparison, tested: int) -> tuple[Part, ...]:
+    if not tested:
+        return ()
     largest = _largest(found.statistic[np.isfinite(found.statistic)])
     moved = f"{found.significant.sum()} of {tested}" if found.majority else "not known"
     columns = (Column(), *(Column(name, format=significant) for name in ("value", "critical value")))
@@ -142,18 +142,14 @@ def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
     """Return what comparison.json holds."""
     verdict = verdict_of_comparison(found)
     return {
-        "results": list(found.names),
+        "results": found.names,
         "length_unit": found.unit,
-        "standard_deviations": list(found.has_sigma),
+        "standard_deviations": found.has_sigma,
         "same_image_points": found.same_share,
-        "paired": {
-            "points_by_name": found.pairing.points_by_name,
-            "points_by_image_points": found.pairing.points_by_image_points,
-            "points_by_place": found.pairing.points_by_place,
-            "images_by_name": found.pairing.images_by_name,
-        },
-        "alignment": found.alignment,
-        "scale_estimated": found.scale_estimated,
+        "paired": values_of(
+            found.pairing, "points_by_name points_by_image_points points_by_place images_by_name"
+        ),
+        **values_of(found, "alignment scale_estimated"),
         "scale": found.a_from_b.scale,
         "points": len(found.points),
         "images": len(found.images),
@@ -166,24 +162,16 @@ def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
         "untested": found.untested and found.untested.kind,
         "approximate": found.approximate,
         "tested": tested,
-        "global_test": {
-            "statistic": found.global_statistic,
-            "critical": found.global_critical,
-        },
-        "significant": [n for n, flag in zip(found.points, found.significant, strict=True) if flag],
+        "global_test": {"statistic": found.global_statistic, "critical": found.global_critical},
+        "significant": list(compress(found.points, found.significant)),
         "cameras": [
             {
                 "name": one.camera,
                 "model": one.model,
                 "difference": dict(zip(one.names, one.difference, strict=True)),
                 "sigma": dict(zip(one.names, one.sigma, strict=True)),
-                "conversion": None
-                if one.conversion is None
-                else {
-                    "from": one.conversion.source_model,
-                    "rms_px": one.conversion.rms_px,
-                    "max_px": one.conversion.max_px,
-                },
+                "conversion": one.conversion
+                and {"from": one.conversion.source_model} | values_of(one.conversion, "rms_px max_px"),
             }
             for one in found.interior
         ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,20 @@ from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, general, significant
-from sfm.report.page import YES, Column, Folded, Heading, Note, Page, Paragraph, Part, Section, Table, axes
+from sfm.report.page import (
+    YES,
+    Column,
+    Folded,
+    Heading,
+    Note,
+    Page,
+    Paragraph,
+    Part,
+    Section,
+    Table,
+    axes,
+    values_of,
+)
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -52,7 +66,6 @@ MICRO, DEGREES = 1e6, float(np.rad2deg(1.0))
 
 def page(found: EpochSeries) -> Page:
     """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
-    series = _series_picture(found)
     displacements = [row for pair in found.pairs for row in _rows(pair.displacements)]
     since = [row for pair in found.since_first for row in _rows(pair.displacements)]
     moved_on = [(row[2], row[1], *row[3:9], row[-2]) for row in since]
@@ -63,7 +76,7 @@ def page(found: EpochSeries) -> Page:
         " - ".join((found.names[0], found.names[-1])),
         verdict,
         (
-            Section("Series", (series,)) if series else None,
+            Section("Series", _series_picture(found)),
             *(_section(pair, k) for k, pair in enumerate(found.pairs)),
         ),
         viewer=_viewer(found),
@@ -171,16 +184,14 @@ def _section(pair: EpochPair, number: int) -> Section:
     points = (Table(_columns(factor, unit), _rows(found)), limits)
     return Section(
         " to ".join(d.names),
-        (
-            Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
-            shared if d.shared else None,
-            Paragraph(words_of_stable(found)),
-            _steps(found),
-            test,
-            _picture(found, number),
-            Folded(counted(len(d.points), "point"), points, open=bool(found.moved.any())),
-            *(part for block in pair.blocks for part in _block(block, factor, unit)),
-        ),
+        Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
+        shared if d.shared else None,
+        Paragraph(words_of_stable(found)),
+        _steps(found),
+        test,
+        _picture(found, number),
+        Folded(counted(len(d.points), "point"), *points, open=bool(found.moved.any())),
+        *(part for block in pair.blocks for part in _block(block, factor, unit)),
     )
 
 
@@ -227,7 +238,7 @@ def words_of_stable(found: Displacements) -> str:
         if found.congruency.robust is None or _same(found)
         else " by a robust start"
     )
-    undecided = [n for n, u in zip(found.differences.points, found.undecided, strict=True) if u]
+    undecided = list(compress(found.differences.points, found.undecided))
     left = f" Left out, and not shown to have moved: {_names(undecided)}." if undecided else ""
     gone = f" ({_names(removed)} in this order)" if removed and " one " in by else ""
     return (
@@ -247,31 +258,23 @@ def words_of_block(block: BlockMotion) -> str:
 def _pair(pair: EpochPair) -> dict[str, Any]:
     found = pair.displacements
     d = found.differences
-    names = np.array(d.points, dtype=object)
     return {
         "first": d.names[0],
         "second": d.names[1],
         "length_unit": d.unit,
         "points": len(d.points),
-        "only_first": list(d.only_first),
-        "only_second": list(d.only_second),
-        "untested": list(d.untested),
+        **values_of(d, "only_first only_second untested"),
         "no_change": d.motion,
-        "shared_given_values": list(d.shared),
-        "held_alike": list(d.held_alike),
-        "held_apart": list(d.held_apart),
-        "alpha": found.alpha,
-        "agreed": found.agreed,
-        "stable": names[found.stable].tolist(),
-        "moved": names[found.moved].tolist(),
-        "undecided": names[found.undecided].tolist(),
+        "shared_given_values": d.shared,
+        **values_of(d, "held_alike held_apart"),
+        **values_of(found, "alpha agreed"),
+        "stable": list(compress(d.points, found.stable)),
+        "moved": list(compress(d.points, found.moved)),
+        "undecided": list(compress(d.points, found.undecided)),
         "steps": _steps(found).records,
         "groups": [
             {
-                "name": one.name,
-                "points": list(one.points),
-                "model": one.model,
-                "centre": one.centre.tolist(),
+                **values_of(one, "name points model centre"),
                 "parameters": {
                     name: {"value": value, "sigma": sigma}
                     for name, value, sigma in zip(one.parameters, one.value, one.sigma, strict=True)

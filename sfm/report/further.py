@@ -48,8 +48,8 @@ def page(found: Further, *, result: Solution) -> Page:
         result.name,
         Banner(level, headline(found, result), (HIDDEN,)),
         (
-            Section("Photographs", (Table(columns, shot_rows(found.shots)), stations)),
-            Section("Weakest points", (Table(weak, weakest(found, result)), sigma)),
+            Section("Photographs", Table(columns, shot_rows(found.shots)), stations),
+            Section("Weakest points", Table(weak, weakest(found, result)), sigma),
         ),
         viewer=viewer_of(scene, Pictures()),
         files=(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from sfm.report.page import (
     Tile,
     axes,
     facts,
+    values_of,
 )
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
@@ -51,10 +53,7 @@ def page(found: Measurement, *, result: Solution) -> Page:
     points, u = found.points, found.unit
     groups = counted(len(found.groups), "group") if found.groups else ""
     quantities = quantity_table(found)
-    columns = (
-        *(Column("point", "id"), *axes("", u, ".9g"), *axes("s", u)),
-        Column("group", "group"),
-    )
+    columns = (*(Column("point", "id"), *axes("", u, ".9g"), *axes("s", u)), Column("group", "group"))
     rows = [
         (name, *xyz, *sigma, found.group_of(j))
         for j, (name, xyz, sigma) in enumerate(zip(points.names, points.xyz, point_sigma(found), strict=True))
@@ -65,13 +64,11 @@ def page(found: Measurement, *, result: Solution) -> Page:
         found.name,
         found.verdict,
         (
-            Section("Tolerances", _tolerances(found)) if found.tolerances else None,
-            Section("Shapes", tuple(part for fit in found.shapes for part in _shape(found, fit)))
-            if found.shapes
-            else None,
-            Section("Distances, angles and heights", (quantities,)) if quantities.rows else None,
-            Section("Alignment", _alignment(found.alignment, u)) if found.alignment else None,
-            Section("Points", (Folded(counted(len(rows), "point"), (Table(columns, rows, "points"),)),)),
+            Section("Tolerances", *_tolerances(found)),
+            Section("Shapes", *(part for fit in found.shapes for part in _shape(found, fit))),
+            Section("Distances, angles and heights", quantities if quantities.rows else None),
+            Section("Alignment", *_alignment(found.alignment, u)),
+            Section("Points", Folded(counted(len(rows), "point"), Table(columns, rows, "points"))),
         ),
         tiles=(
             Tile("Points", len(points.names), groups),
@@ -105,6 +102,8 @@ def write_point_covariance(found: Measurement, folder: Path) -> None:
 
 def _tolerances(found: Measurement) -> tuple[Part, ...]:
     """Return how many deviations are decided in which way, and every deviation."""
+    if not found.tolerances:
+        return ()
     u = found.unit
     columns = (
         *(Column(), Column("against"), Column("lower", "", u, significant)),
@@ -122,7 +121,7 @@ def _tolerances(found: Measurement) -> tuple[Part, ...]:
     parts: list[Part] = [Table(columns, rows), note]
     for k, one in enumerate(found.tolerances):
         caption = f"Deviations of {one.name} from {one.against}, with its limits."
-        folded = Folded(counted(len(one.points), "deviation"), (_deviations(found, [one], file=""),))
+        folded = Folded(counted(len(one.points), "deviation"), _deviations(found, [one], file=""))
         parts += [Heading(one.name), plot(f"deviations {k}", caption, deviation_figure(one, u)), folded]
     return tuple(parts)
 
@@ -174,7 +173,7 @@ def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
         Heading(f"{fit.name}: {fit.shape.kind.name}"),
         _parameters(found, [fit], file=""),
         facts(rows),
-        Folded(counted(len(fit.points), "point"), (points,)),
+        Folded(counted(len(fit.points), "point"), points),
     )
 
 
@@ -229,8 +228,10 @@ def quantity_table(found: Measurement) -> Table:
     return Table(columns, rows, "quantities")
 
 
-def _alignment(found: Alignment, u: str) -> tuple[Part, ...]:
+def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
     """Return how the points were aligned, and the differences from nominal points."""
+    if found is None:
+        return ()
     fit = found.fitted
     if fit is None:
         return (facts([("Method", METHODS[found.method])]),)
@@ -244,7 +245,7 @@ def _alignment(found: Alignment, u: str) -> tuple[Part, ...]:
     columns = (Column("point"), *axes("d", u, signed), Column("used", flag=USED))
     differences = [(n, *d, used) for n, d, used in zip(fit.names, fit.difference, fit.used, strict=True)]
     title = f"{len(fit.names)} differences, aligned minus nominal"
-    return facts(rows), Folded(title, (Table(columns, differences),))
+    return facts(rows), Folded(title, Table(columns, differences))
 
 
 def point_sigma(found: Measurement) -> FloatArray:
@@ -268,26 +269,18 @@ def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, floa
 
 def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
     """Return what measurement.json holds."""
-    alignment = None
+    alignment, best_fit = None, None
     if found.alignment is not None:
-        T, fit = found.alignment.aligned_from_object, found.alignment.fitted
-        alignment = {
-            "method": found.alignment.method,
-            "scale": T.scale,
-            "rotation": T.rotation.tolist(),
-            "translation": T.translation.tolist(),
-            "best_fit": None
-            if fit is None
-            else {
-                "points": int(fit.used.sum()),
-                "held_out": [n for n, used in zip(fit.names, fit.used, strict=True) if not used],
-                "rms": float(np.sqrt((fit.difference[fit.used] ** 2).mean())),
-                "sigma0": fit.sigma0,
-                "redundancy": fit.redundancy,
-                "statistic": fit.statistic,
-                "critical": fit.critical,
-            },
-        }
+        fit = found.alignment.fitted
+        if fit is not None:
+            best_fit = {
+                "points": fit.used.sum(),
+                "held_out": list(compress(fit.names, ~fit.used)),
+                "rms": np.sqrt((fit.difference[fit.used] ** 2).mean()),
+                **values_of(fit, "sigma0 redundancy statistic critical"),
+            }
+        placed = values_of(found.alignment.aligned_from_object, "scale rotation translation")
+        alignment = {"method": found.alignment.method, **placed, "best_fit": best_fit}
     return {
         "result": found.name,
         "length_unit": found.unit,
@@ -300,14 +293,10 @@ def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
         "quantities": quantities.records,
         "tolerances": [
             {
-                "name": one.name,
-                "against": one.against,
-                "lower": one.lower,
-                "upper": one.upper,
-                "coverage": one.coverage,
+                **values_of(one, "name against lower upper coverage"),
                 "points": len(one.points),
                 **{decision.replace(" ", "_"): one.count(decision) for decision in DECISIONS},
-                "missing": list(one.missing),
+                "missing": one.missing,
             }
             for one in found.tolerances
         ],
@@ -319,20 +308,13 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
         "name": fit.name,
         "kind": fit.shape.kind.name,
         "weights": fit.weights,
-        "points": int(fit.used.sum()),
+        "points": fit.used.sum(),
         "left_out": [found.points.names[j] for j in fit.points[~fit.used]],
         "parameters": [
-            {"name": f"{name}{f' {axis}' if axis else ''}", "value": v, "sigma": s, "unit": unit}
+            {"name": f"{name} {axis}".rstrip(), "value": v, "sigma": s, "unit": unit}
             for name, axis, v, s, unit in parameter_rows(fit, found.unit)
         ],
-        "covariance": fit.covariance,
-        "rms": fit.rms,
-        "form_error": fit.form_error,
-        "sigma0": fit.sigma0,
-        "redundancy": fit.redundancy,
-        "statistic": fit.statistic,
-        "critical": fit.critical,
-        "converged": fit.converged,
+        **values_of(fit, "covariance rms form_error sigma0 redundancy statistic critical converged"),
     }
 
 

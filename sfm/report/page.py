@@ -187,14 +187,6 @@ def facts(rows: Sequence[tuple[str, str]]) -> Table:
 
 
 @dataclass(frozen=True)
-class Heading:
-    """A heading within a section."""
-
-    text: str
-    kind: ClassVar[str] = "heading"
-
-
-@dataclass(frozen=True)
 class Paragraph:
     """Sentences."""
 
@@ -202,33 +194,35 @@ class Paragraph:
     kind: ClassVar[str] = "paragraph"
 
 
-@dataclass(frozen=True)
-class Note:
+class Note(Paragraph):
     """Sentences that explain what is beside them."""
 
-    text: str
-    kind: ClassVar[str] = "note"
+    kind = "note"
 
 
-@dataclass(frozen=True)
+class Heading(Paragraph):
+    """A heading within a section."""
+
+    kind = "heading"
+
+
 class Folded:
     """Parts that a click unfolds."""
 
-    summary: str
-    parts: tuple[Part, ...]
-    open: bool = False
     kind: ClassVar[str] = "folded"
 
+    def __init__(self, summary: str, *parts: Part, open: bool = False) -> None:
+        self.summary, self.parts, self.open = summary, parts, open
 
-Part = Table | Plot | Heading | Paragraph | Note | Folded
+
+Part = Table | Plot | Paragraph | Folded
 
 
-@dataclass(frozen=True)
 class Section:
-    """A part of a page with a title."""
+    """A part of a page with a title; parts that are None are left out, and a section without any."""
 
-    title: str
-    parts: tuple[Part | None, ...]  # None: left out
+    def __init__(self, title: str, *parts: Part | None) -> None:
+        self.title, self.parts = title, tuple(part for part in parts if part is not None)
 
 
 @dataclass(frozen=True)
@@ -257,7 +251,7 @@ class Page:
     kind: str  # line above the title
     title: str
     verdict: Verdict | Banner
-    sections: tuple[Section | None, ...]  # None: left out
+    sections: tuple[Section, ...]
     tiles: tuple[Tile, ...] = ()
     viewer: Viewer | None = None
     pictures_beside: bool = False  # whether the scene shows pictures that lie beside the page
@@ -273,7 +267,7 @@ class Page:
     @property
     def tables(self) -> tuple[Table, ...]:
         """The tables with a file."""
-        parts = [part for section in self.sections if section for part in _unfolded(section.parts)]
+        parts = [part for section in self.sections for part in _unfolded(section.parts)]
         found = (*self.files, *(part for part in parts if isinstance(part, Table)))
         return tuple(one for one in found if one.file)
 
@@ -300,9 +294,11 @@ def plain(value: Any) -> Any:
     return or_none(float(value)) if isinstance(value, float | np.floating) else value
 
 
-def _unfolded(parts: Iterable[Part | None]) -> Iterable[Part]:
+def values_of(one: object, names: str) -> dict[str, Any]:
+    """Return attributes by their names, for JSON."""
+    return {name: getattr(one, name) for name in names.split()}
+
+
+def _unfolded(parts: Iterable[Part]) -> Iterable[Part]:
     for part in parts:
-        if isinstance(part, Folded):
-            yield from _unfolded(part.parts)
-        elif part is not None:
-            yield part
+        yield from _unfolded(part.parts) if isinstance(part, Folded) else (part,)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,21 @@ from sfm.planning.shots import Shot
 from sfm.planning.sight import MIN_PIXELS
 from sfm.planning.stations import Stations
 from sfm.planning.wanted import ALPHA, found_displacement
-from sfm.report.numbers import (
-    NOT_DETERMINED,
-    finer_unit,
-    fixed,
-    or_unlimited,
-    placed,
-    raised,
-    significant,
+from sfm.report.numbers import NOT_DETERMINED, finer_unit, fixed, or_unlimited, placed, raised, significant
+from sfm.report.page import (
+    YES,
+    Column,
+    Folded,
+    Note,
+    Page,
+    Paragraph,
+    Part,
+    Section,
+    Table,
+    axes,
+    facts,
+    values_of,
 )
-from sfm.report.page import YES, Column, Folded, Note, Page, Paragraph, Part, Section, Table, axes, facts
 from sfm.report.phrases import NORMAL_95
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
@@ -69,11 +75,11 @@ def page(plan: Plan) -> Page:
         plan.name,
         verdict_of_plan(plan),
         (
-            Section("Figures", (facts(rows), prediction)),
-            Section("Photographs", (Table(columns, shot_rows(plan.shots)), axis)),
-            Section("Weak points", _weak(plan)),
-            Section("Camera", _camera(plan)),
-            Section("Points", (Folded(counted(len(points.rows), "point"), (points,)),)),
+            Section("Figures", facts(rows), prediction),
+            Section("Photographs", Table(columns, shot_rows(plan.shots)), axis),
+            Section("Weak points", *_weak(plan)),
+            Section("Camera", *_camera(plan)),
+            Section("Points", Folded(counted(len(points.rows), "point"), points)),
         ),
         viewer=viewer_of(plan_scene(plan), Pictures()),
         summary=_summary(plan),
@@ -250,18 +256,11 @@ def plan_scene(plan: Plan) -> ViewerScene:
 def _summary(plan: Plan) -> dict[str, Any]:
     """Return what plan.json holds."""
     p, c, camera = plan.prediction, plan.calibration, plan.prediction.camera
-    verdict = verdict_of_plan(plan)
     return {
-        "name": plan.name,
-        "unit": plan.unit,
-        **verdict.as_dict(),
-        "reached": plan.reached,
-        "shortfall": plan.shortfall,
-        "wanted": {
-            "sigma": plan.wanted.sigma,
-            "length_sigma": plan.wanted.length_sigma,
-            "displacement": plan.wanted.displacement,
-        },
+        **values_of(plan, "name unit"),
+        **verdict_of_plan(plan).as_dict(),
+        **values_of(plan, "reached shortfall"),
+        "wanted": values_of(plan.wanted, "sigma length_sigma displacement"),
         "photographs": len(p.stations),
         "stations": p.stations.places,
         "points": len(p.planned.names),
@@ -274,19 +273,14 @@ def _summary(plan: Plan) -> dict[str, Any]:
         "target": {
             "diameter": plan.seeing.diameter,
             "diameter_for_7_px": plan.target.diameter,
-            "contrast": plan.seeing.target.contrast,
-            "noise": plan.seeing.target.noise,
-            "blur_px": plan.seeing.target.blur_px,
+            **values_of(plan.seeing.target, "contrast noise blur_px"),
         },
         "coded_targets": len(plan.coded),
         "scale_bars": len(p.adjustment.network.scale_bars),
         "camera": {
-            "name": camera.name,
-            "model": camera.model,
-            "size_px": list(camera.size_px),
-            "pixel_mm": camera.pixel_mm.tolist(),
-            "parameters": dict(zip(camera.names, camera.parameters.tolist(), strict=True)),
-            "free": [n for n, f in zip(camera.names, camera.free, strict=True) if f],
+            **values_of(camera, "name model size_px pixel_mm"),
+            "parameters": dict(zip(camera.names, camera.parameters, strict=True)),
+            "free": list(compress(camera.names, camera.free)),
             "can_be_calibrated": None if c is None else c.good,
             "sigma": {} if c is None else dict(zip(c.parameters, c.sigma, strict=True)),
         },

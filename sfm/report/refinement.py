@@ -61,13 +61,11 @@ def page(found: Refinement, *, numbers: Numbers, title: str) -> Page:
         title,
         judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad}),
         (
-            Section("Before and after", _changes(found, numbers, unit)),
-            Section("Key points that took no part", _reasons(found)),
-            None
-            if found.targets is None
-            else Section("Targets, control and scale bars", _targets(found, unit)),
-            Section("Cameras", _cameras(found, numbers)),
-            Section("Photographs", _photographs(found, numbers, unit)),
+            Section("Before and after", *_changes(found, numbers, unit)),
+            Section("Key points that took no part", *_reasons(found)),
+            Section("Targets, control and scale bars", *_targets(found, unit)),
+            Section("Cameras", *_cameras(found, numbers)),
+            Section("Photographs", *_photographs(found, numbers, unit)),
         ),
         files=(_points(found, numbers),),
     )
@@ -115,6 +113,8 @@ def _reasons(found: Refinement) -> tuple[Part, ...]:
 
 def _targets(found: Refinement, unit: str) -> tuple[Part, ...]:
     """Return the targets that were adjusted with the key points, and what was given."""
+    if found.targets is None:
+        return ()
     after = found.adjustment
     given = given_of(after, unit)
     names = [after.network.points[j].removeprefix(PREFIX) for j in found.target_points]
@@ -158,44 +158,33 @@ def _common_px(a: Adjustment) -> str:
     return "none" if found is None else significant(found.sigmas_px(a.sigma0_px)[1])
 
 
-def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[str, ...]]:
+def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[object, ...]]:
     """Return rows of what the page compares: name, before, adjusted here, after."""
-    both = (found.readjusted, found.adjustment)
-    rows: list[tuple[str, ...]] = [
-        (
-            "RMS of key points, per coordinate [px]",
-            general(found.before_px, 4),
-            *(general(one.rms_px, 4) for one in both),
-        ),
-        ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
-        ("Errors that neighbours have in common [px]", "", *map(_common_px, both)),
-    ]
-    for name, of, factor in (
+    readjusted = found.readjusted
+    both = (readjusted, found.adjustment)
+    medians = (
         (f"Projection centre: median standard deviation [{unit}]", _centre_sigmas, 1.0),
         ("Rotation: median standard deviation [mdeg]", _rotation_sigmas, 1000.0),
         (f"Point: median standard deviation of a coordinate [{unit}]", _point_sigmas, 1.0),
-    ):
-        rows.append((name, "", *(significant(factor * float(np.median(of(one)))) for one in both)))
-    rows.append(("Photographs", str(len(found.images)), *(str(len(one.network.images)) for one in both)))
-    points = (len(found.points), len(found.readjusted.network.points), int(found.points_anew.sum()))
-    rows.append(("Points", *(str(one) for one in points)))
-    rows.append(("Points whose windows do not overlap, adjusted", "", "", str(int(found.points.sum()))))
-    used = (found.key_points, int((~found.readjusted.rejected).sum()), found.refined)
-    rows.append(("Key points with a point", *(str(one) for one in used)))
-    kept = numbers.written - found.refined
-    rows.append(("Key points with a point in the files", rows[-1][1], "", str(numbers.written)))
-    rows.append(("of these, as they came", rows[-1][1], "", str(kept)))
-    rows.append(
-        (
-            "RMS of the key points in the files, per coordinate [px]",
-            general(found.before_px, 4),
-            "",
-            general(numbers.written_px, 4),
-        )
     )
-    if found.targets is not None:
-        rows.append(("Targets", "", "", str(len(found.target_points))))
-    return rows
+    rms = [general(px, 4) for px in (found.before_px, *(one.rms_px for one in both), numbers.written_px)]
+    return [
+        ("RMS of key points, per coordinate [px]", *rms[:3]),
+        ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
+        ("Errors that neighbours have in common [px]", "", *map(_common_px, both)),
+        *(
+            (name, "", *(significant(factor * float(np.median(of(one)))) for one in both))
+            for name, of, factor in medians
+        ),
+        ("Photographs", len(found.images), *(len(one.network.images) for one in both)),
+        ("Points", len(found.points), len(readjusted.network.points), found.points_anew.sum()),
+        ("Points whose windows do not overlap, adjusted", "", "", found.points.sum()),
+        ("Key points with a point", found.key_points, (~readjusted.rejected).sum(), found.refined),
+        ("Key points with a point in the files", found.key_points, "", numbers.written),
+        ("of these, as they came", found.key_points, "", numbers.written - found.refined),
+        ("RMS of the key points in the files, per coordinate [px]", rms[0], "", rms[3]),
+        *([("Targets", "", "", len(found.target_points))] if found.targets else []),
+    ]
 
 
 def _centre_sigmas(one: Adjustment) -> FloatArray:

@@ -62,26 +62,22 @@ def page(found: Validation) -> Page:
         (
             Section(
                 "Optima",
-                (
-                    Table((Column(), Column("networks", format=str)), optima),
-                    Note(
-                        f"Same optimum: the costs differ by no more than a difference of "
-                        f"{general(SAME_SIGMAS, 6)} standard deviations in one direction."
-                    ),
+                Table((Column(), Column("networks", format=str)), optima),
+                Note(
+                    f"Same optimum: the costs differ by no more than a difference of "
+                    f"{general(SAME_SIGMAS, 6)} standard deviations in one direction."
                 ),
             ),
             Section(
                 "Largest differences",
-                (
-                    Table((Column(), Column("largest difference")), differences),
-                    Paragraph(
-                        "A point's sigma counts all that is uncertain (marginal); with photographs and "
-                        f"cameras held, as {other} gives it, it is smaller: by {ratio} in the median."
-                    ),
+                Table((Column(), Column("largest difference")), differences),
+                Paragraph(
+                    "A point's sigma counts all that is uncertain (marginal); with photographs and "
+                    f"cameras held, as {other} gives it, it is smaller: by {ratio} in the median."
                 ),
             ),
-            Section("Time", (plot("time", TIME_CAPTION, time_figure(found)),)),
-            Section("All networks", (Folded(counted(len(found.trials), "network"), (trials,)),)),
+            Section("Time", plot("time", TIME_CAPTION, time_figure(found))),
+            Section("All networks", Folded(counted(len(found.trials), "network"), trials)),
         ),
         summary={
             "backend": found.backend,

@@ -65,8 +65,8 @@ def page(found: Levelling) -> Page:
         "Heights",
         judge((), {"good": worst, "fair": worst, "bad": worst}),
         (
-            Section("Heights", (facts([("Sigma", f"{significant(1000 * sigma)} mm")]), Note("Levelled."))),
-            Section("Points", (Folded("all", (Table(columns, rows, "heights"),)),)),
+            Section("Heights", facts([("Sigma", f"{significant(1000 * sigma)} mm")]), Note("Levelled.")),
+            Section("Points", Folded("all", Table(columns, rows, "heights"))),
         ),
         summary={"sigma": sigma, "largest": np.nanmax(np.abs(level)), "differences": level},
     )
@@ -109,17 +109,18 @@ def test_every_row_leads_to_a_declaration_of_its_type(shown: str) -> None:
 
 
 def small(*parts: object, **options: object) -> Page:
-    return Page("x", "Kind", "Title", Banner("good", "Fine."), (Section("S", parts), None), **options)  # type: ignore[arg-type]
+    return Page("x", "Kind", "Title", Banner("good", "Fine."), (Section("S", *parts), Section("Empty", None)), **options)  # type: ignore[arg-type]
 
 
 def test_every_kind_of_part_is_rendered_and_escaped() -> None:
     cells = (Mark(EVIL, "bad"), Link(EVIL, 'a b"/x.html'))
     table = Table((Column(EVIL), Column(EVIL)), [cells], total=("sum", None))
-    parts = (Heading(EVIL), Paragraph(EVIL), Note(EVIL), Folded(EVIL, (table,), open=True), None)
+    parts = (Heading(EVIL), Paragraph(EVIL), Note(EVIL), Folded(EVIL, table, open=True), None)
     text = html(small(*parts, tiles=(Tile(EVIL, EVIL, EVIL),)))
     assert EVIL not in text and text.count("&lt;img src=x") == 11
     assert '<span class="mark bad">&lt;img' in text and 'href="a%20b%22/x.html"' in text
-    assert "<details open>" in text and "<tr class=sum><th scope=row>sum</th><td></td></tr>" in text
+    assert "Empty" not in text and "<details open>" in text
+    assert "<tr class=sum><th scope=row>sum</th><td></td></tr>" in text
 
 
 def test_remarks_of_a_verdict_stand_in_the_banner() -> None:

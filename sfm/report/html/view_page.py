@@ -67,7 +67,7 @@ def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
             f"{', '.join(counted(len(them), noun) for them, noun in counts)}.",
             tuple(Line("note", note) for note in viewer.notes),
         ),
-        (Section("Figures", (figures, Folded("Object points", (Table(columns, rows),)))),),
+        (Section("Figures", figures, Folded("Object points", Table(columns, rows))),),
         viewer=viewer,
         pictures_beside=bool(pictures.beside),
     )
