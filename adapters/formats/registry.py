@@ -46,7 +46,7 @@ from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.ply import write_ply
-from sfm.files.whole_files import whole_folder
+from sfm.files.whole_files import whole_file, whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.solution import Solution
 
@@ -119,7 +119,8 @@ def _write_ply(path: Path, content: Content) -> None:
     result = content.result
     C = result.point_covariance
     sigma = None if C is None else np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    write_ply(path, result.estimate.points, names=result.network.points, sigma=sigma)
+    with whole_file(path) as part:
+        write_ply(part, result.estimate.points, names=result.network.points, sigma=sigma)
 
 
 _COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_opencv"))

@@ -12,7 +12,6 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
-from sfm.files.whole_files import whole_file
 
 SIGMAS = ("sx", "sy", "sz")
 COLOURS = ("red", "green", "blue")
@@ -30,7 +29,7 @@ def write_ply(
     """Write points; those with NaN are left out.
 
     Args:
-        path: the file.
+        path: the file; whoever wants it whole or not at all gives one of `sfm.files.whole_files`.
         xyz: coordinates, (n, 3).
         names: of the points, which follow as comments "name <id>" in their order; none without.
         sigma: standard deviations, (n, 3).
@@ -38,7 +37,7 @@ def write_ply(
         unit: of lengths, for a comment.
 
     Raises:
-        OutputError: the file cannot be written, or a name has spaces that a comment does not keep.
+        OutputError: a name has spaces that a comment does not keep.
     """
     if any(" ".join(name.split()) != name for name in names):
         raise OutputError("PLY: names of points cannot begin or end with a space or have two in a row")
@@ -56,5 +55,4 @@ def write_ply(
     for j in kept:
         row = (*table[j].tolist(), *(colours[j] if colours else ()))
         lines.append(" ".join(map(repr, row)))
-    with whole_file(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

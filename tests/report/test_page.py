@@ -109,7 +109,8 @@ def test_every_row_leads_to_a_declaration_of_its_type(shown: str) -> None:
 
 
 def small(*parts: object, **options: object) -> Page:
-    return Page("x", "Kind", "Title", Banner("good", "Fine."), (Section("S", *parts), Section("Empty", None)), **options)  # type: ignore[arg-type]
+    sections = (Section("S", *parts), Section("Empty", None))  # type: ignore[arg-type]
+    return Page("x", "Kind", "Title", Banner("good", "Fine."), sections, **options)  # type: ignore[arg-type]
 
 
 def test_every_kind_of_part_is_rendered_and_escaped() -> None:
