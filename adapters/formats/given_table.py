@@ -19,8 +19,8 @@ ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates
 
 
-class _Summary(Content):
-    """The part of summary.json that is read."""
+class Statistics(Content):
+    """Unit of weight as summary.json states it."""
 
     sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
     sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
@@ -49,7 +49,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
     path = folder / GIVEN.file
-    summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
+    summary = read_json(folder / "summary.json", Statistics, "the summary of a result")
     if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return GivenValues(
             *(ScaleBars(), ObjectPoints(), (), ExteriorObservations()),

@@ -17,28 +17,23 @@ from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
 from adapters.formats.content import Content
-from adapters.formats.covariance_arrays import read_covariances
-from adapters.formats.given_table import read_given, write_given
+from adapters.formats.given_table import Statistics, read_given, write_given
 from adapters.formats.known_points import read_known_points
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.covariance_file import read_covariance, write_covariance
+from sfm.files import result_tables as tables
+from sfm.files.covariance_file import (
+    read_covariance,
+    read_covariances,
+    write_covariance,
+    write_covariances,
+)
 from sfm.files.csv_tables import CsvTable
 from sfm.files.json_files import Content as Json
 from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.open_folders import refuse_links_out
-from sfm.files.result_tables import (
-    CAMERAS,
-    GIVEN,
-    IMAGE_POINTS,
-    IMAGES,
-    POINTS,
-    RELIABILITY,
-    write_covariances,
-    write_solution,
-)
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.network_check import CORRELATION_LIMIT
 from sfm.solution import Solution
@@ -58,7 +53,7 @@ def read_result(folder: Path) -> Solution:
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}
-    table = IMAGES.read(folder)
+    table = tables.IMAGES.read(folder)
     images = table.keys("image")
     for line, name in zip(table.line, table.texts[1], strict=True):
         if name not in index:
@@ -66,7 +61,7 @@ def read_result(folder: Path) -> Solution:
     camera = np.array([index[name] for name in table.texts[1]], dtype=np.int64)
     rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
-    table = POINTS.read(folder)
+    table = tables.POINTS.read(folder)
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
@@ -104,10 +99,10 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
         SurveyFileError: what is missing or wrong, with file and line number.
     """
     seen, rejected = _image_points(folder, network.images, network.points)
-    path = folder / RELIABILITY.file
+    path = folder / tables.RELIABILITY.file
     if not path.is_file():
         return seen, rejected, np.full((len(seen), 2), np.nan)
-    table = RELIABILITY.read(folder)
+    table = tables.RELIABILITY.read(folder)
     keys = [(network.images[i], network.points[j]) for i, j in zip(seen.image, seen.point, strict=True)]
     if keys != list(zip(*table.texts, strict=True)):
         raise SurveyFileError(f"{path}: its rows are not those of image_points.csv beside it")
@@ -126,12 +121,12 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
     Raises:
         SurveyFileError: the table is damaged.
     """
-    path = folder / GIVEN.file
+    path = folder / tables.GIVEN.file
     if not path.is_file():
         return None, ()
     if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return (), ()
-    kinds, names, _ = GIVEN.read(folder).texts
+    kinds, names, _ = tables.GIVEN.read(folder).texts
     found = {
         kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
         for kind in ("scale bar", "control point")
@@ -183,7 +178,7 @@ def write_content(folder: Path, content: Content) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_solution(folder, result, seen, np.arange(len(seen)) >= len(network.image_points))
+        tables.write_solution(folder, result, seen, np.arange(len(seen)) >= len(network.image_points))
         if result.covariance is not None:
             write_covariance(folder, result.covariance, network.points, result.covariance_points)
         if result.exterior_covariance is not None or any(map(len, result.interior_covariance)):
@@ -236,7 +231,7 @@ def read_content(folder: Path) -> Content:
             rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
         ),
     )
-    summary = read_json(folder / "summary.json", _Statistics, "the summary of a result")
+    summary = read_json(folder / "summary.json", Statistics, "the summary of a result")
     return Content(
         replace(result, network=network, estimate=replace(result.estimate, cameras=cameras)),
         seen.select(rejected),
@@ -285,13 +280,6 @@ def _with_shared(result: Solution) -> tuple[Camera, ...]:
     return tuple(made)
 
 
-class _Statistics(Json):
-    """Unit of weight as the summary states it."""
-
-    sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
-    sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
-
-
 class _CameraEntry(Json):
     """A camera as the summary names it."""
 
@@ -330,7 +318,7 @@ def _summary(path: Path) -> _Summary:
 
 def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
     """Cameras in the order of the summary, and the sigmas of their parameters."""
-    table = CAMERAS.read(folder)
+    table = tables.CAMERAS.read(folder)
     values, sigma = table.values[:, 0], table.values[:, 1:]
     table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
     keys = tuple(zip(*table.texts, strict=True))
@@ -380,8 +368,8 @@ def _image_points(
     folder: Path, images: tuple[str, ...], points: tuple[str, ...]
 ) -> tuple[ImagePoints, BoolArray]:
     """Read the image points, and which of them were rejected."""
-    path = folder / IMAGE_POINTS.file
-    table = IMAGE_POINTS.read(folder)
+    path = folder / tables.IMAGE_POINTS.file
+    table = tables.IMAGE_POINTS.read(folder)
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
     index = []
     files = ("images.csv", "points.csv")

@@ -1,10 +1,12 @@
-"""The covariance of all object points together, in a file beside the table of the points.
+"""Covariances of a result, in files beside its tables.
 
     point_covariance.npy    upper triangle, by rows, of the matrix of X Y Z of every row of points.csv
     point_covariance_points.csv    id of the points that it is of, where it is not of all
+    covariances.npz    image_names (m,), exterior (m, 6, 6)    X0, Y0, Z0, omega, phi, kappa of a photograph
+                       camera_names (a,), interior_0 (f, f) ...    free parameters of each camera
+                       point_names (n,), points (n, 3, 3)    X, Y, Z of a point; of surveys, not read again
 
-In object units squared; a plain array of NumPy's format 1.0, from which nothing is run. Its size is checked
-before it is read.
+In object units and rad; arrays of NumPy, from which nothing is run. Sizes are checked before they are read.
 
 Source: NumPy, Enhancement Proposal 1 (a simple file format for NumPy arrays).
 """
@@ -12,7 +14,9 @@ Source: NumPy, Enhancement Proposal 1 (a simple file format for NumPy arrays).
 from __future__ import annotations
 
 import re
+import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +26,12 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
 
+if TYPE_CHECKING:
+    from sfm.solution import Solution
+
 NAME = "point_covariance.npy"
+ARRAYS = "covariances.npz"
+MAX_BYTES = 2**31  # of the arrays unpacked
 POINTS_NAME = "point_covariance_points.csv"
 MAX_POINTS = 1000  # of whom a matrix is kept: 36 MB
 MAX_WORK = (
@@ -121,3 +130,59 @@ def read_covariance(
     if (np.abs(np.diagonal(matrix) - variance) > SAME * np.maximum(variance, 0.0) + 1e-300).any():
         raise SurveyFileError(f"{path}: its standard deviations are not those of points.csv beside it")
     return matrix, points
+
+
+def write_covariances(folder: Path, solution: Solution, *, points: bool = False) -> None:
+    """Write covariances.npz: those of each exterior and each interior orientation as arrays, as far as known.
+
+    Args:
+        folder: of the result.
+        solution: with its covariances.
+        points: whether those of each point are written, too.
+    """
+    network = solution.network
+    arrays: dict[str, Any] = {}
+    if points and solution.point_covariance is not None:
+        arrays |= {"point_names": np.array(network.points), "points": solution.point_covariance}
+    if solution.exterior_covariance is not None:
+        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
+    arrays["camera_names"] = np.array([camera.name for camera in solution.estimate.cameras])
+    arrays |= {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
+    np.savez_compressed(folder / ARRAYS, **arrays)
+
+
+def read_covariances(folder: Path, result: Solution) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
+    """Return the covariances of the exterior (m, 6, 6) and of each interior orientation, None and () without.
+
+    Args:
+        folder: of the result; the file may be missing.
+        result: that the tables beside it say.
+
+    Raises:
+        SurveyFileError: the file is damaged or belongs to other tables.
+    """
+    path = folder / ARRAYS
+    if not path.is_file():
+        return None, ()
+    images, cameras = result.network.images, result.estimate.cameras
+    free = [int(camera.free.sum()) for camera in cameras]
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise SurveyFileError(f"{path}: arrays of more than {MAX_BYTES} bytes, no more are read")
+        with np.load(path, allow_pickle=False) as arrays:
+            known = {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
+    except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
+        raise SurveyFileError(f"{path}: is no array of NumPy") from error
+    exterior = known.get("exterior")
+    interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
+    fits = exterior is None or (
+        tuple(known.get("image_names", ())) == images and exterior.shape == (len(images), 6, 6)
+    )
+    fits &= all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
+    matrices = interior if exterior is None else (exterior, *interior)
+    if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
+        raise SurveyFileError(
+            f"{path}: covariances of other photographs or cameras than the tables beside it"
+        )
+    return exterior, interior

@@ -9,7 +9,6 @@ Source: RFC 4180 for CSV; docs/reference/results.md says what each column is.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,6 @@ from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_text
 from sfm.network import ImagePoints
 from sfm.solution import Solution
-
-COVARIANCES = "covariances.npz"
-
 
 KINDS = (
     "name",  # text
@@ -173,19 +169,15 @@ INTERIOR_CORRELATIONS = ResultTable("interior_correlations", "further: camera fi
 EXTERIOR_CORRELATIONS = ResultTable("exterior_correlations", f"further: camera parameter image {EXTERIOR}")
 POINT_COVARIANCES = _covariance_table("point_covariances", "id", "X Y Z")
 IMAGE_COVARIANCES = _covariance_table("image_covariances", "image", EXTERIOR)
-
-
-@dataclass(frozen=True)
-class Beside:
-    """Columns that a survey writes beside a solution, in the order of its rows."""
-
-    points: Sequence[Sequence[object]]  # rays, code, angle, RMS, limiting standard deviations
-    images: Sequence[Sequence[object]]  # points, RMS, coverage
-    residuals: FloatArray  # px, (k, 2)
+TABLES = tuple(one for one in list(globals().values()) if isinstance(one, ResultTable))
 
 
 def write_solution(
-    folder: Path, solution: Solution, seen: ImagePoints, rejected: BoolArray, beside: Beside | None = None
+    folder: Path,
+    solution: Solution,
+    seen: ImagePoints,
+    rejected: BoolArray,
+    *further: Sequence[Sequence[object]] | FloatArray,
 ) -> None:
     """Write the tables of points, photographs, cameras and image points.
 
@@ -194,10 +186,12 @@ def write_solution(
         solution: with coordinates of all points and photographs.
         seen: its k image points, those rejected included.
         rejected: which of them were rejected, (k,).
-        beside: further columns; without them columns of which nothing is known are left out, too.
+        further: further columns of points, photographs and image points, as a survey has them; without them
+            columns of which nothing is known are left out, too.
     """
     network, estimate = solution.network, solution.estimate
-    every = beside is not None
+    every = bool(further)
+    of_points, of_images, residuals = further or (None, None, None)
 
     def known(values: FloatArray | None) -> FloatArray | None:
         return values if values is not None and (every or np.isfinite(values).any()) else None
@@ -207,11 +201,11 @@ def write_solution(
     exterior = None if position is None else _sigmas(solution.exterior_covariance)
     angles = np.degrees(angles_from_rotation(estimate.rotation))
     names = [estimate.cameras[k].name for k in network.camera]
-    POINTS.write(folder, network.points, estimate.points, point, beside and beside.points)
+    POINTS.write(folder, network.points, estimate.points, point, of_points)
     IMAGES.write(
         folder,
         *(network.images, np.hstack([estimate.position, angles]), position),
-        *(None if exterior is None else np.degrees(exterior[:, 3:]), names, beside and beside.images),
+        *(None if exterior is None else np.degrees(exterior[:, 3:]), names, of_images),
     )
     sigmas = solution.interior_sigma or [np.full(len(one.names), np.nan) for one in estimate.cameras]
     CAMERAS.write_rows(
@@ -228,28 +222,9 @@ def write_solution(
         folder,
         *((images, points), seen.xy, known(seen.stated_sigma)),
         [one or None for one in between.tolist()] if every or between.any() else None,
-        beside and beside.residuals,
+        residuals,
         rejected.astype(int) if every or rejected.any() else None,
     )
-
-
-def write_covariances(folder: Path, solution: Solution, *, points: bool = False) -> None:
-    """Write covariances.npz: those of each exterior and each interior orientation as arrays, as far as known.
-
-    Args:
-        folder: of the result.
-        solution: with its covariances.
-        points: whether those of each point are written, too.
-    """
-    network = solution.network
-    arrays: dict[str, Any] = {}
-    if points and solution.point_covariance is not None:
-        arrays |= {"point_names": np.array(network.points), "points": solution.point_covariance}
-    if solution.exterior_covariance is not None:
-        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
-    arrays["camera_names"] = np.array([camera.name for camera in solution.estimate.cameras])
-    arrays |= {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
-    np.savez_compressed(folder / COVARIANCES, **arrays)
 
 
 def _sigmas(covariance: FloatArray | None) -> FloatArray | None:

@@ -6,7 +6,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.display import counted
 from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import Given, GivenResiduals
-from sfm.report.numbers import finer_unit_of, general, signed, significant
+from sfm.report.numbers import finer_unit_of, general, signed, significant, with_exponent
 from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes
 from sfm.report.phrases import words_of_w
 

@@ -146,13 +146,11 @@ FILTERS = {
         plus,
         scientific,
         general,
-        placed,
         significant,
         signed,
         or_unlimited,
         or_fixed,
         with_exponent,
-        with_sigma,
     )
 } | {one.__name__: one for one in (to_precision, raised)}
 """what the templates call"""

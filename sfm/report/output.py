@@ -8,8 +8,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sfm.files.covariance_file import write_covariance
+from sfm.files.covariance_file import ARRAYS, POINTS_NAME, write_covariance
+from sfm.files.covariance_file import NAME as POINT_COVARIANCE
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
+from sfm.files.result_tables import TABLES
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
@@ -29,34 +31,8 @@ from sfm.runtime.progress import SILENT, Progress
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 
 WRITTEN = (
-    "summary.json",
-    "points.csv",
-    "images.csv",
-    "cameras.csv",
-    "cameras_balanced.csv",
-    "image_points.csv",
-    "point_covariance.npy",
-    "point_covariance_points.csv",
-    "targets.csv",
-    "left_out.csv",
-    "given.csv",
-    "reliability.csv",
-    "variance_components.csv",
-    "residuals.csv",
-    "control_points.csv",
-    "interior_correlations.csv",
-    "exterior_correlations.csv",
-    "point_covariances.csv",
-    "image_covariances.csv",
-    "covariances.npz",
-    "report.txt",
-    "points.ply",
-    "report.html",
-    "colmap",
-    "overlays",
-    "pictures",
-    "plots",
-    "log.jsonl",
+    *("summary.json", *(table.file for table in TABLES), POINT_COVARIANCE, POINTS_NAME, ARRAYS),
+    *("report.txt", "report.html", "points.ply", "colmap", "overlays", "pictures", "plots", "log.jsonl"),
     MANIFEST,
 )
 

@@ -296,7 +296,7 @@ def plain(value: Any) -> Any:
 
 def values_of(one: object, names: str) -> dict[str, Any]:
     """Return attributes by their names, for JSON."""
-    return {name: getattr(one, name) for name in names.split()}
+    return {name: plain(getattr(one, name)) for name in names.split()}
 
 
 def _unfolded(parts: Iterable[Part]) -> Iterable[Part]:

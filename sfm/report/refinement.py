@@ -163,19 +163,16 @@ def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[object,
     readjusted = found.readjusted
     both = (readjusted, found.adjustment)
     medians = (
-        (f"Projection centre: median standard deviation [{unit}]", _centre_sigmas, 1.0),
-        ("Rotation: median standard deviation [mdeg]", _rotation_sigmas, 1000.0),
-        (f"Point: median standard deviation of a coordinate [{unit}]", _point_sigmas, 1.0),
+        f"Projection centre: median standard deviation [{unit}]",
+        "Rotation: median standard deviation [mdeg]",
+        f"Point: median standard deviation of a coordinate [{unit}]",
     )
     rms = [general(px, 4) for px in (found.before_px, *(one.rms_px for one in both), numbers.written_px)]
     return [
         ("RMS of key points, per coordinate [px]", *rms[:3]),
         ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
         ("Errors that neighbours have in common [px]", "", *map(_common_px, both)),
-        *(
-            (name, "", *(significant(factor * float(np.median(of(one)))) for one in both))
-            for name, of, factor in medians
-        ),
+        *((name, "", *s) for name, *s in zip(medians, *map(_median_sigmas, both), strict=True)),
         ("Photographs", len(found.images), *(len(one.network.images) for one in both)),
         ("Points", len(found.points), len(readjusted.network.points), found.points_anew.sum()),
         ("Points whose windows do not overlap, adjusted", "", "", found.points.sum()),
@@ -187,21 +184,11 @@ def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[object,
     ]
 
 
-def _centre_sigmas(one: Adjustment) -> FloatArray:
-    return _root_mean(one.covariance.exterior[:, :3, :3])
-
-
-def _rotation_sigmas(one: Adjustment) -> FloatArray:
-    return np.degrees(_root_mean(one.covariance.exterior[:, 3:, 3:]))
-
-
-def _point_sigmas(one: Adjustment) -> FloatArray:
-    return _root_mean(one.covariance.points)
-
-
-def _root_mean(covariance: FloatArray) -> FloatArray:
-    """Return the standard deviation of one coordinate, the mean of three, (n,)."""
-    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3))
+def _median_sigmas(one: Adjustment) -> list[str]:
+    """Return the medians of what one coordinate of centres, rotations (mdeg) and points has, RMS of three."""
+    C = one.covariance
+    parts = (C.exterior[:, :3, :3], np.degrees(1e3) ** 2 * C.exterior[:, 3:, 3:], C.points)
+    return [significant(float(np.median(np.sqrt(np.einsum("nii->n", Q) / 3)))) for Q in parts]
 
 
 def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:

@@ -14,24 +14,9 @@ from sfm.conventions import FloatArray
 from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
+from sfm.files import result_tables as tables
+from sfm.files.covariance_file import write_covariances
 from sfm.files.ply import write_ply
-from sfm.files.result_tables import (
-    CAMERAS_BALANCED,
-    CONTROL_POINTS,
-    EXTERIOR_CORRELATIONS,
-    GIVEN,
-    IMAGE_COVARIANCES,
-    INTERIOR_CORRELATIONS,
-    LEFT_OUT,
-    POINT_COVARIANCES,
-    RELIABILITY,
-    RESIDUALS,
-    TARGETS,
-    VARIANCE_COMPONENTS,
-    Beside,
-    write_covariances,
-    write_solution,
-)
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
@@ -51,27 +36,27 @@ def write_tables(findings: Findings, folder: Path) -> None:
         (*(one.rays, one.code, one.angle_deg, one.rms_px), *one.limiting.tolist()) for one in findings.points
     ]
     used = [(one.points, one.rms_px, one.coverage) for one in findings.photographs]
-    beside = Beside(list(zip(*seen, strict=True)), list(zip(*used, strict=True)), a.residuals)
-    write_solution(folder, result.solution, a.network.image_points, a.rejected, beside)
-    LEFT_OUT.write_rows(folder, left_out_rows(findings))
-    GIVEN.write_rows(folder, given_rows(findings.given, result))
-    RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
-    VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
-    RESIDUALS.write_rows(folder, _residual_rows(findings))
-    CONTROL_POINTS.write_rows(folder, _control_rows(findings))
-    INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
-    EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
+    further = (list(zip(*seen, strict=True)), list(zip(*used, strict=True)), a.residuals)
+    tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
+    tables.LEFT_OUT.write_rows(folder, left_out_rows(findings))
+    tables.GIVEN.write_rows(folder, given_rows(findings.given, result))
+    tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
+    tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
+    tables.RESIDUALS.write_rows(folder, _residual_rows(findings))
+    tables.CONTROL_POINTS.write_rows(folder, _control_rows(findings))
+    tables.INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
+    tables.EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
     for table, names, covariance in (
-        (POINT_COVARIANCES, a.network.points, a.covariance.points),
-        (IMAGE_COVARIANCES, a.network.images, a.covariance.exterior),
+        (tables.POINT_COVARIANCES, a.network.points, a.covariance.points),
+        (tables.IMAGE_COVARIANCES, a.network.images, a.covariance.exterior),
     ):
         rows, columns = np.triu_indices(covariance.shape[1])
         table.write(folder, names, covariance[:, rows, columns])
     write_covariances(folder, result.solution, points=True)
     if BALANCED_MODEL in findings.interior.models:
-        CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
+        tables.CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
     if len(result.seen_targets.image):
-        TARGETS.write_rows(folder, target_rows(findings))
+        tables.TARGETS.write_rows(folder, target_rows(findings))
     colours = [UNCODED_COLOUR if one.code is None else CODED_COLOUR for one in findings.points]
     unit = result.length_unit
     write_ply(folder / "points.ply", a.estimate.points, colours=colours, unit=unit)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.report.page import plain, values_of
 from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
 from sfm.result import SurveyResult
 
@@ -152,11 +154,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "further_observations": {
             kind.kind: _given_values(kind, "name", "component") for kind in given.further
         },
-        "eccentricity": None
-        if result.eccentricity is None
-        else {
-            name: or_none(getattr(result.eccentricity, name)) for name in ("largest_px", "rms_px", "sigma_px")
-        },
+        "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
         "comparison": summary_of_comparison(findings),
         "baseline": summary_of_baseline(result),
@@ -176,8 +174,7 @@ def _datum_points(adjustment: Adjustment) -> list[str] | None:
     """Return the names of chosen datum points, None where all points carry the datum."""
     if adjustment.datum_points is None:
         return None
-    names = adjustment.network.points
-    return [name for name, on in zip(names, adjustment.datum_points, strict=True) if on]
+    return list(compress(adjustment.network.points, adjustment.datum_points))
 
 
 def _geometry(findings: Findings) -> dict[str, Any]:
@@ -211,12 +208,8 @@ def _control(findings: Findings) -> dict[str, Any] | None:
     if check is not None:
         return {
             "role": "check",
-            "scale": or_none(check.scale),
-            "rms": [or_none(value) for value in check.rms],
-            "differences": {
-                name: [or_none(value) for value in difference]
-                for name, difference in zip(check.points, check.differences, strict=True)
-            },
+            **values_of(check, "scale rms"),
+            "differences": plain(dict(zip(check.points, check.differences, strict=True))),
         }
     if found is None:
         return None
@@ -224,7 +217,7 @@ def _control(findings: Findings) -> dict[str, Any] | None:
     return {
         "role": "datum",
         "points": [
-            {"id": name} | {c: [or_none(value) for value in getattr(found, c)[k]] for c in columns}
+            {"id": name} | {c: plain(getattr(found, c)[k]) for c in columns}
             for k, name in enumerate(found.names)
         ],
     }
@@ -243,11 +236,9 @@ def _scale_bars(findings: Findings) -> list[dict[str, Any]]:
 
 def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, Any]]:
     """Return every given value of a kind; the keys are what its name and coordinate are called."""
-    numbers = ("given", "difference", "sigma", "r", "w")
     return [
         dict(zip(keys, (one.name, one.coordinate), strict=False))
-        | {"unit": one.unit}
-        | {number: or_none(getattr(one, number)) for number in numbers}
+        | values_of(one, "unit given difference sigma r w")
         for one in (found.values if found is not None else ())
     ]
 
@@ -260,16 +251,8 @@ def summary_of_comparison(findings: Findings) -> dict[str, Any] | None:
     both, difference = found.both, found.both.comparison
     other = found.backend_conditional
     return {
-        "backend": both.backend,
-        "agree": both.agree,
-        "outcome": both.outcome,
-        "gap": or_none(both.gap),
-        "model": both.model,
-        "stopped_early": both.stopped_early,
-        "max_sigmas": or_none(difference.max_sigmas),
-        "max_position": or_none(difference.max_position),
-        "max_rotation_deg": or_none(difference.max_rotation_deg),
-        "max_point": or_none(difference.max_point),
+        **values_of(both, "backend agree outcome gap model stopped_early"),
+        **values_of(difference, "max_sigmas max_position max_rotation_deg max_point"),
         "max_interior_px": or_none(found.max_interior_px),
         "object_size": or_none(difference.object_size),
         "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
@@ -280,16 +263,13 @@ def summary_of_comparison(findings: Findings) -> dict[str, Any] | None:
             f"{both.backend}_conditional": None if other is None else or_none(other.rms),
         },
         "exceeded": list(difference.exceeded),
-        "held": list(both.held),
-        "unshared": list(both.unshared),
-        "freed": list(both.freed),
+        **values_of(both, "held unshared freed"),
         "conversions": [
             {
                 "camera": one.camera.name,
                 "from": one.source_model,
                 "to": one.camera.model,
-                "rms_px": or_none(one.rms_px),
-                "max_px": or_none(one.max_px),
+                **values_of(one, "rms_px max_px"),
             }
             for one in both.conversions
         ],
@@ -311,9 +291,5 @@ def summary_of_baseline(result: SurveyResult) -> dict[str, Any] | None:
         "rms_px": pair(found.rms_px),
         "seconds": pair(found.seconds),
         "targets": found.targets,
-        "target_rms_px": or_none(found.target_rms_px),
-        "point_rms": or_none(found.point_rms),
-        "max_point": or_none(found.max_point),
-        "position_rms": or_none(found.position_rms),
-        "max_rotation_deg": or_none(found.max_rotation_deg),
+        **values_of(found, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
     }

@@ -9,6 +9,7 @@ from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import Spread
 from sfm.report.findings.findings import Findings
+from sfm.report.page import values_of
 from sfm.report.phrases import words_of_test, words_of_weights
 
 
@@ -37,12 +38,7 @@ def summary_of_statistics(findings: Findings) -> dict[str, Any]:
         "tau_test": _coordinate_test(found.tau, found.largest_tau),
         "observations": {
             "image_coordinates": counts.image,
-            "control": counts.control,
-            "exterior": counts.exterior,
-            "interior": counts.interior,
-            "scale_bars": counts.scale_bars,
-            "constraints": counts.constraints,
-            "total": counts.total,
+            **values_of(counts, "control exterior interior scale_bars constraints total"),
         },
         "redundancy_number": {
             "sum": or_none(found.redundancy_sum),
@@ -54,10 +50,7 @@ def summary_of_statistics(findings: Findings) -> dict[str, Any]:
         "sigma0_by_kind": _components(found.kinds),
         "sigma0_by_camera": _components(found.cameras),
         "sigma0_by_photograph": _components(found.photographs),
-        "correlations": [
-            {"first": pair.first, "second": pair.second, "value": or_none(pair.value)}
-            for pair in found.correlations
-        ],
+        "correlations": [values_of(pair, "first second value") for pair in found.correlations],
         "orientation_correlations": [
             {
                 "parameter": one.parameter,
@@ -69,19 +62,9 @@ def summary_of_statistics(findings: Findings) -> dict[str, Any]:
             for one in result.orientation_correlations
         ],
         "significance": [
-            {
-                "camera": test.camera,
-                "parameter": test.parameter,
-                "t": or_none(test.t),
-                "probability": or_none(test.probability),
-                "significant": bool(test.significant),
-            }
-            for test in found.significance
+            values_of(test, "camera parameter t probability significant") for test in found.significance
         ],
-        "not_significant": [
-            {"camera": test.camera, "parameter": test.parameter, "t": or_none(test.t)}
-            for test in found.not_significant
-        ],
+        "not_significant": [values_of(test, "camera parameter t") for test in found.not_significant],
     }
 
 
@@ -90,30 +73,11 @@ def summary_of_consistency(findings: Findings) -> dict[str, Any]:
     found = findings.consistency
     return {
         "large_residuals": list(found.large),
-        "doubtful": [
-            {
-                "point": one.point,
-                "rejected": one.rejected,
-                "instead": one.instead,
-                "misfit": or_none(one.misfit),
-                "other": or_none(one.other),
-            }
-            for one in found.doubtful
-        ],
-        "uneven_photographs": None
-        if found.uneven is None
-        else {
-            "probability": or_none(found.uneven.probability),
-            "worst": found.uneven.worst,
-            "largest": or_none(found.uneven.largest),
-            "median": or_none(found.uneven.median),
-        },
+        "doubtful": [values_of(one, "point rejected instead misfit other") for one in found.doubtful],
+        "uneven_photographs": found.uneven and values_of(found.uneven, "probability worst largest median"),
         "other_solutions": [
             {
-                "camera": one.camera,
-                "c": or_none(one.c),
-                "unit": one.unit,
-                "reflected": one.reflected,
+                **values_of(one, "camera c unit reflected"),
                 "moved_over_sigma": or_none(one.moved),
                 "vPv_ratio": or_none(one.vPv),
             }
