@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import compress
 from typing import Any
 
 import numpy as np
 
 from sfm.adjustment.quality.statistics import POWER
-from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.epochs.blocks import BlockMotion
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.findings import verdict_of_epochs
 from sfm.epochs.series import EpochPair, EpochSeries
-from sfm.report.figures.comparisons import difference_figure, series_figure
+from sfm.report.figures.comparisons import difference_figure, plot_series
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, general, significant
@@ -35,21 +33,13 @@ from sfm.report.page import (
     axes,
     values_of,
 )
-from sfm.report.viewer.embedded import Viewer, viewer_of
-from sfm.report.viewer.pictures import cut_pictures
-from sfm.report.viewer.scene import ViewerScene
-from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.solution import Solution
-
-MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
+from sfm.report.viewer.product_scenes import displacements_viewer
 
 NAMED = 12  # points in a sentence
-DRAWN = 12  # points of a series that are drawn, those that moved farthest
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
 )
-BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
 STEPS = (
     Column("points", "points", format=str),
     Column("Omega", "omega", format=significant),
@@ -76,10 +66,10 @@ def page(found: EpochSeries) -> Page:
         " - ".join((found.names[0], found.names[-1])),
         verdict,
         (
-            Section("Series", _series_picture(found)),
+            Section("Series", plot_series(found)),
             *(_section(pair, k) for k, pair in enumerate(found.pairs)),
         ),
-        viewer=_viewer(found),
+        viewer=displacements_viewer(found),
         summary={
             "epochs": found.names,
             "changed": found.changed,
@@ -287,56 +277,12 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
     }
 
 
-def _viewer(found: EpochSeries) -> Viewer | None:
-    """Return the scene of the first epoch with the displacements to the last; None without photographs."""
-    if not found.first.result.estimate.oriented.any():
-        return None
-    scene = scene_of_displacements(found.since_first[-1].displacements, found.first.result)
-    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
-
-
 def _picture(found: Displacements, number: int) -> Plot | None:
     if not np.linalg.norm(found.displacement, axis=1).max() > 0:
         return None
     d = found.differences
     figure = difference_figure(d.xyz, found.displacement, found.moved, d.unit)
     return plot(f"displacements-{number}", PICTURE, figure)
-
-
-def _series_picture(found: EpochSeries) -> Plot | None:
-    """Return the series of the points that moved farthest; None with two epochs, or where none moved."""
-    if len(found.names) < 3:
-        return None
-    pairs = [pair.displacements for pair in found.since_first]
-    moved: dict[str, float] = {}
-    for one in pairs:
-        for k in np.flatnonzero(one.moved):
-            name = one.differences.points[k]
-            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(one.displacement[k])))
-    chosen = sorted(moved, key=lambda name: -moved[name])[:DRAWN]
-    if not chosen:
-        return None
-    factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
-    rows = [_along(name, pairs) for name in chosen]
-    length, sigma = (factor * np.array([row[k] for row in rows]) for k in (0, 1))
-    return plot("series", BANDS, series_figure(found.names, tuple(chosen), length, sigma, unit))
-
-
-def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
-    """Displacements of a point since the first epoch along its last direction, and their sigmas."""
-    rows = [one.differences.points.index(name) if name in one.differences.points else -1 for one in pairs]
-    last, k = next((one, k) for one, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
-    direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
-    length, sigma = [0.0], [0.0]
-    for one, k in zip(pairs, rows, strict=True):
-        if k < 0:
-            length.append(np.nan)
-            sigma.append(np.nan)
-            continue
-        Q = one.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
-        length.append(float(one.displacement[k] @ direction))
-        sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
-    return length, sigma
 
 
 def _typical(found: Displacements) -> float:
@@ -351,37 +297,3 @@ def _same(found: Displacements) -> bool:
 
 def _names(names: Iterable[str]) -> str:
     return listed(names, most=NAMED)
-
-
-def scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
-    """Return the scene of an epoch with the displacement of every point and what the test says of it.
-
-    Standard deviations and ellipsoids are those of the displacements.
-
-    Args:
-        found: displacements from this epoch to another one.
-        first: the epoch.
-    """
-    names = first.network.points
-    row = {name: j for j, name in enumerate(names)}
-    tested = np.array([row[name] for name in found.differences.points], dtype=np.int64)
-    covariance = np.full((len(names), 3, 3), np.nan)
-    covariance[tested] = point_blocks(found.covariance, 3)
-    scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
-    displacement = np.full((len(names), 3), np.nan)
-    displacement[tested] = found.displacement
-    state = [UNTESTED] * len(names)
-    for k, j in enumerate(tested.tolist()):
-        state[j] = MOVED if found.moved[k] else STABLE if found.stable[k] else ""
-    kept = [row[name] for name in scene.points]
-    return replace(
-        scene,
-        name=" to ".join(found.differences.names),
-        displacement=displacement[kept],
-        state=tuple(state[j] for j in kept),
-        notes=(
-            *scene.notes,
-            f"Displacements from {found.differences.names[0]} to {found.differences.names[1]}; standard "
-            "deviations and ellipsoids are those of the displacements.",
-        ),
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -34,9 +33,7 @@ from sfm.report.page import (
     facts,
     values_of,
 )
-from sfm.report.viewer.embedded import Viewer, viewer_of
-from sfm.report.viewer.pictures import cut_pictures
-from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.report.viewer.product_scenes import measurement_viewer
 from sfm.solution import Solution
 
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}
@@ -82,7 +79,7 @@ def page(found: Measurement, *, result: Solution) -> Page:
                 for one in found.tolerances[:3]
             ),
         ),
-        viewer=scene_viewer(found, result),
+        viewer=measurement_viewer(found, result),
         summary=_summary(found, quantities),
         files=(
             _parameters(found, found.shapes),
@@ -334,41 +331,3 @@ def words_of_measured(found: Measurement) -> str:
     total = sum(counts.values())
     told = [f"{count} {decision}" for decision, count in counts.items() if count]
     return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(told)}."
-
-
-def scene_viewer(found: Measurement, result: Solution) -> Viewer | None:
-    """Return the scene in the system of the measurement; None without photographs."""
-    if not result.estimate.oriented.any():
-        return None
-    estimate, n = result.estimate, int(result.estimate.determined.sum())
-    positions = result.position_covariance
-    if found.alignment is not None:
-        estimate = found.alignment.aligned_from_object.apply_estimate(estimate)
-        positions = None
-    kept = np.flatnonzero(result.estimate.determined)
-    covariance = np.full((len(result.network.points), 3, 3), np.nan)
-    covariance[kept] = found.points.blocks[:n]
-    moved = replace(
-        result,
-        estimate=estimate,
-        point_covariance=covariance,
-        position_covariance=positions,
-        covariance=None,
-        unit=found.unit,
-    )
-    scene = scene_of_stored(moved)
-    deviation = worst_deviation(found)[:n]
-    if np.isfinite(deviation).any():
-        scene = replace(scene, deviation=deviation)
-    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
-
-
-def worst_deviation(found: Measurement) -> FloatArray:
-    """Return of each point its largest deviation from what tolerances, else shapes, say; NaN without any."""
-    worst = np.full(len(found.points.names), np.nan)
-    judged: list[Deviations | ShapeFit] = [*found.tolerances] or [*found.shapes]
-    for one in judged:
-        value = one.value if isinstance(one, Deviations) else one.deviation
-        larger = ~(np.abs(value) <= np.abs(worst[one.points]))
-        worst[one.points[larger]] = value[larger]
-    return worst

@@ -11,7 +11,6 @@ import numpy as np
 from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
-from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
 from sfm.planning.shots import Shot
@@ -34,11 +33,7 @@ from sfm.report.page import (
     values_of,
 )
 from sfm.report.phrases import NORMAL_95
-from sfm.report.viewer.embedded import viewer_of
-from sfm.report.viewer.pictures import Pictures
-from sfm.report.viewer.scene import ViewerScene
-from sfm.report.viewer.stored_scene import scene_of_stored
-from sfm.solution import Solution
+from sfm.report.viewer.product_scenes import plan_viewer
 
 NAMED = 12  # weak points that are listed
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
@@ -81,7 +76,7 @@ def page(plan: Plan) -> Page:
             Section("Camera", *_camera(plan)),
             Section("Points", Folded(counted(len(points.rows), "point"), points)),
         ),
-        viewer=viewer_of(plan_scene(plan), Pictures()),
+        viewer=plan_viewer(plan),
         summary=_summary(plan),
         files=(
             Table(tuple(Column(name=name) for name in IMAGE_POINTS), seen, "image_points"),
@@ -232,25 +227,6 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
     if a.undetermined:
         rows.append(("not determined", _first(a.undetermined)))
     return rows
-
-
-def plan_scene(plan: Plan) -> ViewerScene:
-    """Return the scene of a plan: stations, rays and all points, those not determined included."""
-    p = plan.prediction
-    a = p.adjustment
-    m, n = np.nonzero(p.sight.seen)
-    network = Network(
-        p.stations.names,
-        np.zeros(len(p.stations), dtype=np.int64),
-        p.planned.names,
-        ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
-    )
-    estimate = Estimate((p.camera,), p.stations.position, p.stations.rotation, p.planned.xyz)
-    covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
-    of_position = np.full((len(p.stations), 3, 3), np.nan)
-    used = p.photograph >= 0
-    of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
-    return scene_of_stored(Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit))
 
 
 def _summary(plan: Plan) -> dict[str, Any]:

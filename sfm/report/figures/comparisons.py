@@ -8,9 +8,14 @@ from matplotlib.figure import Figure
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import program_name
-from sfm.report.figures.plots import ALONE_IN, BLUE, RED, alone, plan_axes
+from sfm.epochs.displacements import Displacements
+from sfm.epochs.series import EpochSeries
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import ALONE_IN, BLUE, RED, alone, plan_axes, plot
 from sfm.report.numbers import finer_unit, significant
 
+DRAWN = 12  # points of a series that are drawn, those that moved farthest
+BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
 
 
@@ -80,7 +85,7 @@ def time_figure(validation: Validation) -> Figure:
     return picture
 
 
-def series_figure(
+def _series_figure(
     names: tuple[str, ...], points: tuple[str, ...], length: FloatArray, sigma: FloatArray, unit: str
 ) -> Figure:
     """Draw the displacement of points from epoch to epoch, with the band of two standard deviations.
@@ -103,3 +108,39 @@ def series_figure(
     axes.set_ylabel(f"displacement [{unit}]")
     axes.legend(fontsize=8, ncols=4, loc="upper left")
     return picture
+
+
+def plot_series(found: EpochSeries) -> Plot | None:
+    """Return the series of the points that moved farthest; None with two epochs, or where none moved."""
+    if len(found.names) < 3:
+        return None
+    pairs = [pair.displacements for pair in found.since_first]
+    moved: dict[str, float] = {}
+    for one in pairs:
+        for k in np.flatnonzero(one.moved):
+            name = one.differences.points[k]
+            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(one.displacement[k])))
+    chosen = sorted(moved, key=lambda name: -moved[name])[:DRAWN]
+    if not chosen:
+        return None
+    factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
+    rows = [_along(name, pairs) for name in chosen]
+    length, sigma = (factor * np.array([row[k] for row in rows]) for k in (0, 1))
+    return plot("series", BANDS, _series_figure(found.names, tuple(chosen), length, sigma, unit))
+
+
+def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
+    """Displacements of a point since the first epoch along its last direction, and their sigmas."""
+    rows = [one.differences.points.index(name) if name in one.differences.points else -1 for one in pairs]
+    last, k = next((one, k) for one, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
+    direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
+    length, sigma = [0.0], [0.0]
+    for one, k in zip(pairs, rows, strict=True):
+        if k < 0:
+            length.append(np.nan)
+            sigma.append(np.nan)
+            continue
+        Q = one.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        length.append(float(one.displacement[k] @ direction))
+        sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
+    return length, sigma
