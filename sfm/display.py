@@ -37,15 +37,28 @@ def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
 def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in columns of text, the first to the left and the others to the right."""
     lines = [header, *rows] if any(header) else list(rows)
-    widths = [max(len(line[k]) for line in lines) for k in range(len(header))] if lines else []
-    told = [
+    return "\n".join([title, *aligned(lines, [k == 0 for k in range(len(header))])])
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
+    """Return rows of cells as lines with columns below one another.
+
+    Args:
+        rows: of as many cells each.
+        left: which columns stand at the left; the others, of numbers, stand at the right.
+
+    Examples:
+        >>> aligned([("point", "rays"), ("A", "12")], [True, False])
+        ['point  rays', 'A        12']
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
         "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+            cell.ljust(width) if at_left else cell.rjust(width)
+            for cell, width, at_left in zip(row, widths, left, strict=True)
         ).rstrip()
-        for line in lines
+        for row in rows
     ]
-    return "\n".join([title, *told])
 
 
 def bound(text: str) -> str:

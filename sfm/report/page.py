@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from sfm.display import counted
+from sfm.display import aligned, counted
 from sfm.files.plain_text import csv_text, or_none
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.figures.plot_data import Plot
@@ -170,15 +170,7 @@ class Table:
         rows = [[str(cell) for cell in row] for row in self.cells]
         if not self.facts:
             rows.insert(0, [one.heading for one in shown])
-        width = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = (
-            "  ".join(
-                cell.ljust(w) if one.format is None else cell.rjust(w)
-                for cell, w, one in zip(row, width, shown, strict=True)
-            )
-            for row in rows
-        )
-        return "".join(f"{line.rstrip()}\n" for line in lines)
+        return "\n".join((*aligned(rows, [one.format is None for one in shown]), ""))
 
 
 def facts(rows: Sequence[tuple[str, str]]) -> Table:

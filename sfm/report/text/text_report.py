@@ -15,7 +15,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sfm.adjustment.quality.statistics import STRONG
-from sfm.display import NO_BREAK, bound
+from sfm.display import NO_BREAK, aligned, bound
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of
 from sfm.report.phrases import NORMAL_95, PHRASES
@@ -102,14 +102,8 @@ def facts(text: str) -> str:
 def columns(text: str, left: int) -> str:
     """Set lines of cells between bars in columns; the first `left` ones to the left, numbers to the right."""
     rows = [_cells(line) for line in text.splitlines() if line.strip()]
-    widths = [min(max(len(row[c]) for row in rows), MAX_CHARACTERS) for c in range(len(rows[0]))]
-    lines = (
-        "  ".join(
-            f"{cell[:MAX_CHARACTERS]:<{width}}" if c < left else f"{cell:>{width}}"
-            for c, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    )
+    rows = [[cell[:MAX_CHARACTERS] if c < left else cell for c, cell in enumerate(row)] for row in rows]
+    lines = aligned(rows, [c < left for c in range(len(rows[0]))])
     return "".join(f"  {line}".rstrip() + "\n" for line in lines)
 
 
