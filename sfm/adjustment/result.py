@@ -145,7 +145,8 @@ class Adjustment:
     @property
     def has_scale(self) -> bool:
         """Whether lengths are in the object unit: from what was given, or placed on control."""
-        return self.datum == "control" or self.expected_defect < MOTIONS or len(self.network.control) >= 2
+        given = self.datum == "control" or self.expected_defect < MOTIONS or len(self.network.scale_bars) > 0
+        return given or len(self.network.control) >= 2
 
     @property
     def vPv(self) -> float:

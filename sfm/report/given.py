@@ -105,7 +105,7 @@ def _further(found: GivenResiduals) -> tuple[Part, ...]:
          words_of_w(one.w, one.r))
         for one in found.values
     ]  # fmt: skip
-    table = Folded(counted(len(rows), "value"), (Table(columns, rows),), open=len(rows) < MAX_OPEN)
+    table = Folded(counted(len(rows), "value"), Table(columns, rows), open=len(rows) < MAX_OPEN)
     return Heading(f"Observations: {found.kind}"), Note(R_AND_W), table
 
 
