@@ -88,6 +88,7 @@ def _of_centres(
     Both relative to the mean distance of the centres from the middle of the object.
     """
     seen, squares = network.image_points, []
+    usual_px = float(np.sqrt(np.median(np.trace(seen.covariance, axis1=1, axis2=2)) / 2))
     for half in _halves(estimate.points, estimate.position, way):
         one, other = (_adjusted(network, estimate, points) for points in (half, ~half))
         a, b = one.estimate, other.estimate
@@ -101,7 +102,8 @@ def _of_centres(
         )
         covariance = np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
         if correlation is not None:
-            covariance += correlated_sum(seen.image, seen.xy, Z, correlation)
+            relative = usual_px * np.linalg.inv(np.linalg.cholesky(seen.covariance))
+            covariance += correlated_sum(seen.image, seen.xy, relative, Z, correlation)
         found = ((moved.position - a.position) ** 2).sum()
         squares.append((found / scale**2, np.trace(covariance) / scale**2, (covariance**2).sum() / scale**4))
     found, predicted, spread = np.mean(squares, axis=0).tolist()

@@ -55,8 +55,10 @@ class Marginal:
     @cached_property
     def correlated(self) -> CorrelatedPart | None:
         """Part of the covariance due to correlated errors; None where they are independent."""
-        correlation = self.adjustment.error_correlation
-        return None if correlation is None else correlated_part(self.influence, correlation)
+        a = self.adjustment
+        if a.error_correlation is None:
+            return None
+        return correlated_part(self.influence, a.error_correlation, a.usual_px)
 
     def of_independent_errors(self) -> Covariance:
         """Return the covariance of points, exterior and interior orientation without the correlated part."""

@@ -40,22 +40,18 @@ class Covariance:
 class ErrorCorrelation:
     """Errors of image points that neighbours in a photograph have in common, and those that each has alone.
 
-    In units of the standard deviations a posteriori, x and y alike, their covariance in one photograph is
-    `common` exp(-d / length_px) at distance d, and `alone` more for an image point by itself.
+    Each alone has `alone` times its own variance a posteriori. What moves neighbours moves them by as many
+    px, precise ones and others, x and y alike: their covariance in one photograph is
+    `common` exp(-d / length_px) at distance d.
     """
 
-    alone: float  # variance over sigma0^2
-    common: float
+    alone: float  # variance over that a posteriori
+    common: float  # over sigma0_px^2, that of a usual image point
     length_px: float  # distance at which the common part has fallen to 1/e
 
     def sigmas_px(self, sigma0_px: float) -> tuple[float, float]:
         """Return the standard deviations of what an image coordinate has alone and of the common part, px."""
         return self.alone**0.5 * sigma0_px, self.common**0.5 * sigma0_px
-
-    @property
-    def variance_change(self) -> float:
-        """Variance of an image point over sigma0^2, less 1: residuals show little of long waves."""
-        return self.alone + self.common - 1.0
 
 
 @dataclass(frozen=True)
@@ -207,7 +203,12 @@ class Adjustment:
     @property
     def sigma0_px(self) -> float:
         """A posteriori standard deviation of an image coordinate, the median of the accepted, px."""
-        return self.sigma0 * _median_sigma(self.image_covariance[~self.rejected])
+        return self.sigma0 * self.usual_px
+
+    @property
+    def usual_px(self) -> float:
+        """A priori standard deviation of an image coordinate, the median of the accepted, px."""
+        return _median_sigma(self.image_covariance[~self.rejected])
 
     @property
     def stated_px(self) -> float:

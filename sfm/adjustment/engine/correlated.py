@@ -3,6 +3,8 @@
 Least squares with weights of independent errors stays unbiased where the errors of a photograph are
 correlated, but is less precise than its cofactors say. With the influence Z of the errors e on the unknowns,
 dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; with R = I it is the usual one.
+R has what each image point has alone, in units of its own standard deviation, and what a photograph does to
+neighbours alike, in px: whitened, it is the larger the more precise an image point is.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.6 and 3.2;
 covariance function: Moritz (1980), Advanced Physical Geodesy, sec. 22; Foerstner and Wrobel (2016), sec. 4.2.
@@ -110,6 +112,7 @@ class CorrelatedPart:
 
     influence: Influence
     correlation: ErrorCorrelation
+    relative: FloatArray  # whitening of each image point over that of a usual one, (k, 2, 2)
     middle: FloatArray  # of the scores of reduced unknowns and datum, Z'(R - I) Z, (reduced + d, reduced + d)
     points: FloatArray  # of each object point, (n, 3, 3)
 
@@ -126,17 +129,16 @@ class CorrelatedPart:
         o, own = influence.linear.layout.observations, influence.linear.own
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
-        for rows, K in _matrices(o.image, o.xy, self.correlation):
+        for one in _photographs(o.image, o.xy, self.relative, self.correlation):
+            rows = one.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
             columns, S = influence.scores_of(rows)
             O, at = own[rows[chosen]], place[o.point[rows[chosen]]]
-            KS = (K[chosen] @ S.reshape(len(rows), -1)).reshape(len(chosen), 2, -1)
-            half = (O.transpose(0, 2, 1) @ KS @ C[columns]).reshape(-1, C.shape[1])
+            half = (O.transpose(0, 2, 1) @ one.times(S, chosen) @ C[columns]).reshape(-1, C.shape[1])
             lines = (u + 3 * at[:, None] + np.arange(3)).ravel()
             added[lines] += half
             added[:, lines] += half.T
-            pairs = np.einsum("ocx,op,pcy->oxpy", O, K[np.ix_(chosen, chosen)], O, optimize=True)
-            added[np.ix_(lines, lines)] += pairs.reshape(len(lines), len(lines))
+            added[np.ix_(lines, lines)] += one.between(O, chosen)
         return np.asarray(added)
 
     def added_to(self, covariance: Covariance, variance: float, optimum: Optimum) -> Covariance:
@@ -161,55 +163,92 @@ class CorrelatedPart:
         )
 
 
-def correlated_part(influence: Influence, correlation: ErrorCorrelation) -> CorrelatedPart:
-    """Return what the correlation of the errors adds to the cofactors of all unknowns."""
+def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_px: float) -> CorrelatedPart:
+    """Return what the correlation of the errors adds to the cofactors of all unknowns.
+
+    Args:
+        influence: how errors move the unknowns.
+        correlation: of the errors.
+        usual_px: a priori standard deviation of a usual image coordinate, px.
+    """
     linear, r = influence.linear, len(influence.unknowns)
+    relative = usual_px * linear.whitening
     o, n = linear.layout.observations, len(linear.layout.point_free)
     middle, added = np.zeros((r, r)), np.zeros((n, 3, 3))
-    for rows, K in _matrices(o.image, o.xy, correlation):
+    for one in _photographs(o.image, o.xy, relative, correlation):
+        rows = one.rows
         columns, S = influence.scores_of(rows)
-        KS = (K @ S.reshape(len(rows), -1)).reshape(S.shape)
+        KS = one.times(S)
         middle[np.ix_(columns, columns)] += np.tensordot(S, KS, axes=((0, 1), (0, 1)))
         j, own = o.point[rows], linear.own[rows].transpose(0, 2, 1)
         right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
         half = own @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
-        alone = correlation.variance_change * own @ own.transpose(0, 2, 1)
-        np.add.at(added, j, half + half.transpose(0, 2, 1) + alone)
+        np.add.at(added, j, half + half.transpose(0, 2, 1) + own @ one.variances() @ own.transpose(0, 2, 1))
     D = influence.unknowns.T @ middle @ influence.unknowns
     for first in range(0, n, POINTS_AT_ONCE):
         C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
         through = np.einsum("rpa,rpb->pab", C.reshape(r, -1, 3), (D @ C).reshape(r, -1, 3))
         added[first : first + POINTS_AT_ONCE] += through
-    return CorrelatedPart(influence, correlation, middle, added)
+    return CorrelatedPart(influence, correlation, relative, middle, added)
 
 
 def correlated_sum(
-    image: IntArray, xy: FloatArray, Z: FloatArray, correlation: ErrorCorrelation
+    image: IntArray, xy: FloatArray, relative: FloatArray, Z: FloatArray, correlation: ErrorCorrelation
 ) -> FloatArray:
     """Return Z'(R - I) Z: what correlation adds to the covariance of functions of errors, for sigma0 = 1.
 
     Args:
         image: photograph of each image point, (k,).
         xy: image points, px, (k, 2).
+        relative: whitening of each image point over that of a usual one, (k, 2, 2).
         Z: derivatives of the functions by the errors in units of their standard deviations, (k, 2, u).
         correlation: of the errors.
     """
     total = np.zeros((Z.shape[2], Z.shape[2]))
-    for rows, K in _matrices(image, xy, correlation):
-        own = Z[rows]
-        KZ = (K @ own.reshape(len(rows), -1)).reshape(own.shape)
-        total += np.tensordot(own, KZ, axes=((0, 1), (0, 1)))
+    for one in _photographs(image, xy, relative, correlation):
+        own = Z[one.rows]
+        total += np.tensordot(own, one.times(own), axes=((0, 1), (0, 1)))
     return total
 
 
-def _matrices(
-    image: IntArray, xy: FloatArray, correlation: ErrorCorrelation
-) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Yield the image points of each photograph and R - I of them."""
+@dataclass(frozen=True)
+class _Photograph:
+    """R - I of the image points of a photograph: (alone - 1) I and G C G' with G their relative whitening."""
+
+    rows: IntArray  # its image points, (r,)
+    alone: float
+    common: FloatArray  # C, (r, r)
+    relative: FloatArray  # G, (r, 2, 2)
+
+    def times(self, Z: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
+        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u)."""
+        of_shift = (np.swapaxes(self.relative, 1, 2) @ Z).reshape(len(Z), -1)
+        moved = (self.common[some] @ of_shift).reshape(-1, *Z.shape[1:])
+        return np.asarray((self.alone - 1.0) * Z[some] + self.relative[some] @ moved)
+
+    def between(self, O: FloatArray, some: IntArray) -> FloatArray:
+        """Return O'(R - I) O of functions of some image points, three of each (s, 2, 3), (3 s, 3 s)."""
+        of_shift = np.swapaxes(self.relative[some], 1, 2) @ O
+        common = self.common[np.ix_(some, some)]
+        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, common, of_shift, optimize=True)
+        own = np.arange(len(some))
+        pairs[own, :, own] += (self.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
+        return np.asarray(pairs.reshape(3 * len(some), 3 * len(some)))
+
+    def variances(self) -> FloatArray:
+        """Return R - I of each image point by itself, (r, 2, 2)."""
+        shift = np.diagonal(self.common)[:, None, None]
+        together = shift * self.relative @ np.swapaxes(self.relative, 1, 2)
+        return np.asarray((self.alone - 1.0) * np.eye(2) + together)
+
+
+def _photographs(
+    image: IntArray, xy: FloatArray, relative: FloatArray, correlation: ErrorCorrelation
+) -> Iterator[_Photograph]:
+    """Yield R - I of the image points of each photograph."""
     for rows in rows_of(image, int(image.max(initial=-1)) + 1):
-        K = cdist(xy[rows], xy[rows])  # 0.3 GB of 6000 image points: no copies
-        K /= -correlation.length_px
-        np.exp(K, out=K)
-        K *= correlation.common
-        K[np.diag_indices(len(rows))] = correlation.variance_change
-        yield rows, K
+        C = cdist(xy[rows], xy[rows])  # 0.3 GB of 6000 image points: no copies
+        C /= -correlation.length_px
+        np.exp(C, out=C)
+        C *= correlation.common
+        yield _Photograph(rows, correlation.alone, C, relative[rows])

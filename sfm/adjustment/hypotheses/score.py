@@ -59,6 +59,7 @@ class Reduced:
     redundancy: int
     xy: FloatArray  # measured position of each, px, (k, 2)
     correlation: ErrorCorrelation | None  # of the errors of neighbours
+    sigma0_px: float  # a posteriori, of a usual image coordinate, px
 
     @property
     def count(self) -> int:
@@ -108,7 +109,8 @@ class Reduced:
         if self.correlation is None:
             return 1.0
         H, _, squares, left, _ = self._eliminated(D)
-        variance = H + correlated_sum(self.image, self.xy, left, self.correlation)
+        relative = self.sigma0_px * self.F
+        variance = H + correlated_sum(self.image, self.xy, relative, left, self.correlation)
         effects = determined_inverse(H, squares) @ variance
         first = float(np.trace(effects))
         return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
@@ -210,7 +212,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
-        *(seen.xy[used], a.error_correlation),
+        *(seen.xy[used], a.error_correlation, a.sigma0_px),
     )
 
 
