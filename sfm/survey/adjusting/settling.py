@@ -14,6 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
+from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed
@@ -107,6 +108,8 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
             iterations += adjustment.iterations
         estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
+        if task.survey.tie_points is not None and task.reject != "none":
+            accepted[accepted] = ~_of_wrong_windows(adjustment)
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
@@ -273,6 +276,25 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     xyz = np.full_like(estimate.points, np.nan)
     position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
     return Estimate(part.cameras, position, rotation, xyz, part.mounts)
+
+
+def _of_wrong_windows(adjustment: Adjustment) -> BoolArray:
+    """Return which accepted image points are of points whose residuals are together larger than chance, (a,).
+
+    A window of texture that is a little wrong in several photographs, as at an edge behind which the
+    background moves, passes the tests of its single rays. Points that control or scale bars name stay, for
+    people to look at.
+    """
+    network, used = adjustment.network, ~adjustment.rejected
+    seen, v, n = network.image_points.select(used), adjustment.residuals[used], len(network.points)
+    P = np.linalg.inv(adjustment.image_covariance[used])
+    vPv = np.bincount(seen.point, np.einsum("ka,kab,kb->k", v, P, v), minlength=n)
+    redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # cameras held: too cautious by a little
+    limit = chi2_isf(level_of_single(FALSE_ALARM, n), np.maximum(redundancy, 1))
+    large = (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
+    bars = network.scale_bars
+    large[np.concatenate([network.control.point, bars.start, bars.end])] = False
+    return np.asarray(large[seen.point])
 
 
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
