@@ -95,6 +95,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
     rays = network.rays()
     everything = np.ones(len(network.image_points), dtype=bool)
     accepted = everything if accepted is None else accepted
+    wrong: BoolArray | None = None
     images, points = determined(network, estimate, everything, task.needed, task.least)
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
@@ -108,8 +109,11 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
             iterations += adjustment.iterations
         estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
-        if task.survey.tie_points is not None and task.reject != "none":
-            accepted[accepted] = ~_of_wrong_windows(adjustment)
+        if wrong is None:  # once: each round would find more, as errors of windows are not quite normal
+            wrong = np.zeros(len(points), dtype=bool)
+            if task.survey.tie_points is not None and task.reject != "none":
+                wrong[points] = _wrong_windows(adjustment)
+        accepted &= ~wrong[network.image_points.point]
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
@@ -278,8 +282,8 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     return Estimate(part.cameras, position, rotation, xyz, part.mounts)
 
 
-def _of_wrong_windows(adjustment: Adjustment) -> BoolArray:
-    """Return which accepted image points are of points whose residuals are together larger than chance, (a,).
+def _wrong_windows(adjustment: Adjustment) -> BoolArray:
+    """Return which points of an adjustment have residuals that are together larger than chance, (n,).
 
     A window of texture that is a little wrong in several photographs, as at an edge behind which the
     background moves, passes the tests of its single rays. Points that control or scale bars name stay, for
@@ -294,7 +298,7 @@ def _of_wrong_windows(adjustment: Adjustment) -> BoolArray:
     large = (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
     bars = network.scale_bars
     large[np.concatenate([network.control.point, bars.start, bars.end])] = False
-    return np.asarray(large[seen.point])
+    return np.asarray(large)
 
 
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
