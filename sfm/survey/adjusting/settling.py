@@ -285,9 +285,8 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
 def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     """Return which points of an adjustment have residuals that are together larger than chance, (n,).
 
-    A window of texture that is a little wrong in several photographs, as at an edge behind which the
-    background moves, passes the tests of its single rays. Points that control or scale bars name stay, for
-    people to look at.
+    A window of texture that is a little wrong in several photographs passes the tests of its single rays.
+    Points that control or scale bars name stay, for people to look at.
     """
     network, used = adjustment.network, ~adjustment.rejected
     seen, v, n = network.image_points.select(used), adjustment.residuals[used], len(network.points)
