@@ -7,6 +7,7 @@ epochs and files take it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -125,7 +126,8 @@ class Solution:
             return self
         some = points_kept_together(self.network.points)
         try:
-            found = self.joint(some, np.zeros(0, dtype=np.int64))
+            # by a copy, which takes the normal equations with it: they are larger than all else
+            found = copy(self.joint)(some, np.zeros(0, dtype=np.int64))
         except GeometryError:  # normal equations that cannot be solved have no covariance at all
             return self
         if not np.isfinite(found).all():

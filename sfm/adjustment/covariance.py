@@ -138,7 +138,7 @@ class JointOnDemand:
 
     @cached_property
     def _marginal(self) -> Marginal:
-        return marginal_of(self._adjustment)
+        return marginal_of(self._adjustment, cross=False)
 
     def __call__(self, points: IntArray, images: IntArray) -> FloatArray:
         """Return that of X Y Z of points (p,) and X0 Y0 Z0 omega phi kappa of photographs (m,), by indices.

@@ -17,6 +17,7 @@ from sfm.cli.outlets import guard_outlets
 from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import closed_current_folder, refuse_folder_settings
 from sfm.runtime.installation import load_adapters, refuse_mixed_installation
+from sfm.runtime.memory import share_freed_memory
 
 YOUNG_OBJECTS = 100_000  # that Python waits for before it looks for cycles, far more than usual
 BAD_INPUT = 2  # exit code where a person must put something right
@@ -54,6 +55,7 @@ def _begin() -> None:
 
     At the end Python would look through all objects again, for half a second.
     """
+    share_freed_memory()  # before there is a second thread
     gc.set_threshold(YOUNG_OBJECTS)
     atexit.register(gc.freeze)
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours

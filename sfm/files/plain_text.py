@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import islice
 from typing import cast
@@ -47,18 +47,22 @@ def or_none(value: float) -> float | None:
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV (RFC 4180), each row as long as the header.
+    """Return a table as CSV (RFC 4180), each row as long as the header."""
+    return "".join(csv_blocks(header, rows))
+
+
+def csv_blocks(header: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """Yield a table as CSV, block by block of its rows, see `csv_text`.
 
     Column by column, since a survey of natural texture has millions of cells, most of them numbers.
     """
-    lines = [",".join(map(_quoted, header))]
+    yield ",".join(map(_quoted, header)) + "\n"
     rows = iter(rows)
     while block := list(islice(rows, BLOCK)):
         columns = [_column(values) for values in zip(*block, strict=True)]
         if len(columns) == 1:
             columns = [[cell or '""' for cell in columns[0]]]  # an empty line is no row
-        lines += map(",".join, zip(*columns, strict=True))
-    return "\n".join(lines) + "\n"
+        yield "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
 
 
 def as_cell(text: str) -> str:

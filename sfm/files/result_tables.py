@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, angles_from_rotation
 from sfm.files.csv_tables import CsvTable, read_header, read_table
-from sfm.files.plain_text import csv_text
+from sfm.files.plain_text import csv_blocks
 from sfm.network import ImagePoints
 from sfm.solution import Solution
 
@@ -92,7 +92,8 @@ class ResultTable:
         self._save(folder, self.names_of(), rows)
 
     def _save(self, folder: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-        (folder / self.file).write_text(csv_text(header, rows), encoding="utf-8", newline="")
+        with (folder / self.file).open("w", encoding="utf-8", newline="") as file:
+            file.writelines(csv_blocks(header, rows))
 
 
 def _group(text: str) -> tuple[str, tuple[str, ...]]:

@@ -1,9 +1,13 @@
-"""Photographs in grey, as many at a time as there is place for: each is needed with many others."""
+"""Photographs in grey, as many at a time as there is place for: each is needed with many others.
+
+Where all are needed in turn, again and again, the oldest one is needed next: of more photographs than there
+is place for, forgetting it would read every one every time. So one by chance is forgotten.
+"""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
+from random import Random
 from threading import Lock
 
 from sfm.conventions import AnyArray
@@ -14,7 +18,7 @@ GREY_BYTES = 100_000_000  # of these in single precision
 
 
 class GreyPhotographs:
-    """Photographs that are read when they are needed; the oldest are forgotten. Threads may share it.
+    """Photographs that are read when they are needed; others are forgotten. Threads may share it.
 
     More are kept as they were read, which takes a quarter of the memory, than in single precision.
     """
@@ -34,35 +38,36 @@ class GreyPhotographs:
             grey_bytes: of all that are kept in single precision; the last two are, whatever their size.
         """
         self._read = read
-        self._stored: OrderedDict[int, AnyArray] = OrderedDict()
-        self._grey: OrderedDict[int, AnyArray] = OrderedDict()
+        self._stored: dict[int, AnyArray] = {}
+        self._grey: dict[int, AnyArray] = {}
         self._most = memory_bytes, grey_bytes
+        self._chance = Random(0)
         self._lock = Lock()
 
     def __getitem__(self, i: int) -> Grey:
         """Return one photograph."""
         with self._lock:
-            grey, stored = _latest(self._grey, i), _latest(self._stored, i)
+            grey, stored = self._grey.get(i), self._stored.get(i)
+            if grey is not None:
+                self._use(i, grey)
         if grey is None:
             if stored is None:
                 stored = self._read(i)
             grey = grey_of(stored)
             with self._lock:
-                _keep(self._stored, i, stored, self._most[0], least=0)
-                _keep(self._grey, i, grey, self._most[1], least=2)
+                self._use(i, grey)
+                self._stored[i] = stored
+                while _bytes(self._stored) > self._most[0]:
+                    del self._stored[self._chance.choice(list(self._stored))]
+                while len(self._grey) > 2 and _bytes(self._grey) > self._most[1]:
+                    del self._grey[next(iter(self._grey))]
         return Grey(grey)
 
-
-def _latest(kept: OrderedDict[int, AnyArray], i: int) -> AnyArray | None:
-    """Return a photograph that is kept, from now on as the latest one, or None."""
-    if i in kept:
-        kept.move_to_end(i)
-    return kept.get(i)
+    def _use(self, i: int, grey: AnyArray) -> None:
+        """Keep a photograph as the one that was needed last."""
+        self._grey.pop(i, None)
+        self._grey[i] = grey
 
 
-def _keep(kept: OrderedDict[int, AnyArray], i: int, photograph: AnyArray, most: int, *, least: int) -> None:
-    """Keep a photograph and forget the oldest of more bytes than `most`, but for the last ones."""
-    kept[i] = photograph
-    kept.move_to_end(i)
-    while len(kept) > least and sum(one.nbytes for one in kept.values()) > most:
-        kept.popitem(last=False)
+def _bytes(kept: dict[int, AnyArray]) -> int:
+    return sum(one.nbytes for one in kept.values())

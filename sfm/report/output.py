@@ -26,6 +26,7 @@ from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
 from sfm.report.viewer.result_scene import scene_of_result
 from sfm.result import StageTime
+from sfm.runtime.memory import give_back_memory
 from sfm.runtime.progress import SILENT, Progress
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
@@ -79,6 +80,7 @@ def write_result(
         if plot_process is not None:
             plot_process.begin(shown)
         scene = scene_of_result(findings)
+        give_back_memory()
         # one after another: beside Python at work threads of short calls wait for each turn
         overlays = draw_overlays(result, jobs=jobs, progress=progress)
         files = {one.image: one.path for one in result.photographs}

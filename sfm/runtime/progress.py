@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from typing import Protocol, TypeVar
 
 from sfm.runtime.faults import working_on
-from sfm.runtime.memory import give_back_memory
+from sfm.runtime.memory import give_back_memory, share_freed_memory
 
 T = TypeVar("T")
 
@@ -73,6 +73,7 @@ class StageClock:
     """Announces stages and keeps how long each took."""
 
     def __init__(self, progress: Progress) -> None:
+        share_freed_memory()
         self.progress = progress
         self.seconds: list[tuple[str, float]] = []
 

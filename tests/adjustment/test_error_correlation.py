@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -131,6 +132,21 @@ def test_every_covariance_has_the_common_errors(unequal: tuple[Network, Estimate
     assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9, abs=1e-15)
     none = with_error_correlation(plain, ErrorCorrelation(alone=1.0, common=0.0, length_px=200.0))
     assert none.covariance.points == pytest.approx(plain.covariance.points, rel=1e-9, abs=1e-15)
+
+
+def test_common_errors_take_little_memory() -> None:
+    """Neither all image points by all unknowns nor all by all of a photograph: these took 7 kB each."""
+    network, truth = make_network(seed_of("memory"), images=20, points=2000, planar=True, noise_px=0.3)
+    a = adjust(network, truth, reject="none", redundancy_numbers=False)
+    tracemalloc.start()
+    a = with_error_correlation(a, ErrorCorrelation(alone=0.8, common=0.2, length_px=200.0))
+    peak = tracemalloc.get_traced_memory()[1]
+    solution, before = a.solution, tracemalloc.get_traced_memory()[0]
+    found = solution.with_joint_covariance.covariance
+    kept = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert peak < 2500 * len(network.image_points)
+    assert found is not None and kept < 1.2 * found.nbytes  # and no normal equations
 
 
 def sigma_of_centres(adjustment: Adjustment) -> float:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
-from sfm.files.plain_text import as_cell, as_plain, csv_text, from_cell, is_plain
+from sfm.files.plain_text import BLOCK, as_cell, as_plain, csv_blocks, csv_text, from_cell, is_plain
 from sfm.rendering.scene_file import read_scene
 from sfm.survey.inputs.survey import read_survey
 
@@ -155,3 +155,11 @@ def test_numbers_of_a_table_stay_numbers() -> None:
     assert (
         csv_text(("a",), [(np.float64(-2.5),), (-3,), (float("-inf"),), (None,)]) == 'a\n-2.5\n-3\n""\n""\n'
     )
+
+
+def test_long_tables_are_written_block_by_block() -> None:
+    taken: list[int] = []
+    rows = ((k,) for k in range(2 * BLOCK + 1) if taken.append(k) is None)  # type: ignore[func-returns-value]
+    blocks = csv_blocks(("a",), rows)
+    assert (next(blocks), len(next(blocks).splitlines()), len(taken)) == ("a\n", BLOCK, BLOCK)
+    assert "".join(blocks).splitlines() == [str(k) for k in range(BLOCK, 2 * BLOCK + 1)]

@@ -429,15 +429,29 @@ def test_few_photographs_are_in_memory_as_floats_at_a_time() -> None:
         return photographs[i]
 
     three = GreyPhotographs(reading, memory_bytes=3 * 40 * 50, grey_bytes=2 * 4 * 40 * 50)
-    for i in (0, 1, 2, 0, 3, 0, 1, 4):  # the one that has not been asked for longest is forgotten
+    for i in (0, 1, 2, 0, 3, 0, 1, 4):
         one = three[i]
         assert one.pixels.dtype == np.float32 and (one.pixels == i).all()
         alive.append(weakref.ref(one.pixels))
         del one
         assert len({id(one()) for one in alive if one() is not None}) <= 2
-    assert read == [0, 1, 2, 3, 1, 4]
+    assert read[:4] == [0, 1, 2, 3]
     with pytest.raises(PhotographError, match="not finite"):
         GreyPhotographs(lambda i: np.full((9, 9), np.nan))[0]
+
+
+def test_photographs_that_are_needed_in_turn_are_not_read_every_time() -> None:
+    """As they are where the oldest one of more than there is place for gives way."""
+    read: list[int] = []
+
+    def reading(i: int) -> AnyArray:
+        read.append(i)
+        return np.full((40, 50), i, np.uint8)
+
+    four = GreyPhotographs(reading, memory_bytes=4 * 40 * 50, grey_bytes=0)
+    for turn in range(100):
+        assert four[turn % 5].pixels[0, 0] == turn % 5
+    assert len(read) < 60
 
 
 def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:

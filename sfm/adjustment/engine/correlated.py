@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix
 from scipy.spatial.distance import cdist
 
 from sfm.adjustment.engine.iterate import Optimum
@@ -28,6 +28,7 @@ from sfm.network import rows_of
 from sfm.observations.exterior import exterior_jacobian
 
 POINTS_AT_ONCE = 2000
+BYTES_AT_ONCE = 16_000_000  # of the correlations of some image points with all others of a photograph
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,8 @@ class Influence:
     """How the errors of image points move the unknowns of an adjustment in its datum."""
 
     linear: Linearised
-    through: csr_matrix  # what the object points take from the reduced unknowns, (reduced, 3n)
-    scores: csr_matrix  # right side of the reduced normal equations by errors, (2k, reduced)
-    scores_of_datum: FloatArray  # and what moves the datum by itself, (2k, d)
+    through: csc_matrix  # what the object points take from the reduced unknowns, (reduced, 3n)
+    of_datum: FloatArray  # parameters of the datum by the object points, (n, 3, d)
     unknowns: FloatArray  # reduced unknowns and parameters of the datum of both, (reduced + d, reduced + d)
     H: FloatArray  # motions of the reduced unknowns, (reduced, d)
     H_points: FloatArray  # motions of the object points, (3n, d)
@@ -47,8 +47,9 @@ class Influence:
         point, reduced = self.linear.layout.observations.point, len(self.H)
         coordinates = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         right = self.unknowns @ np.hstack([self.of_reduced()[:, unknowns], self.of_points(coordinates)])
-        Z = np.asarray(self.scores @ right[:reduced] + self.scores_of_datum @ right[reduced:])
-        Z = Z.reshape(len(point), 2, -1)
+        A, B, of_unknowns = self.linear.A, self.linear.B, right[:reduced]
+        Z = np.asarray(A @ of_unknowns - B @ (self.through.T @ of_unknowns)).reshape(len(point), 2, -1)
+        Z += self._scores_of_datum(np.arange(len(point))) @ right[reduced:]
         place = np.full(len(self.linear.layout.point_free), -1)
         place[points] = len(unknowns) + 3 * np.arange(len(points))
         for axis in range(3):
@@ -57,13 +58,21 @@ class Influence:
         return Z
 
     def scores_of(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
-        """Return which of `unknowns` some image points reach, and their scores, (k, 2, columns)."""
+        """Return which of `unknowns` some image points reach, and their scores, (k, 2, columns).
+
+        Scores are the right side of the reduced normal equations and of the datum, by errors. Of all image
+        points they would take more memory than all else of an adjustment.
+        """
         both = (2 * rows[:, None] + np.arange(2)).ravel()
-        scores, reduced = self.scores[both], len(self.H)
+        scores, reduced = self.linear.A[both] - self.linear.B[both] @ self.through.T, len(self.H)
         some = np.flatnonzero(np.bincount(scores.indices, minlength=reduced))
-        S = np.hstack([scores[:, some].toarray(), self.scores_of_datum[both]])
+        S = scores[:, some].toarray().reshape(len(rows), 2, len(some))
         columns = np.concatenate([some, np.arange(reduced, len(self.unknowns))])
-        return columns, S.reshape(len(rows), 2, len(columns))
+        return columns, np.concatenate([S, self._scores_of_datum(rows)], axis=2)
+
+    def _scores_of_datum(self, rows: IntArray) -> FloatArray:
+        """Return what moves the datum by itself, by the errors of some image points, (k, 2, d)."""
+        return self.linear.own[rows] @ self.of_datum[self.linear.layout.observations.point[rows]]
 
     def of_reduced(self) -> FloatArray:
         """Return the reduced unknowns in the datum by those in any and its parameters."""
@@ -83,23 +92,20 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
         weight: factor on the weight of each image point, (k,).
     """
     linear, motions = linearise(optimum, layout, weight), optimum.motions
-    through = linear.through.tolil()
     n, d = len(layout.point_free), len(motions.inverse)
     kept = (3 * layout.kept[:, None] + np.arange(3)).ravel()
-    through[layout.kept_start + np.arange(len(kept)), kept] = -1.0
-    through = csr_matrix(through)
+    of_kept = (-np.ones(len(kept)), (layout.kept_start + np.arange(len(kept)), kept))
+    through = csc_matrix(linear.through + csc_matrix(of_kept, shape=(layout.reduced, 3 * n)))
     B = motions.constraints.reshape(3 * n, d)
     of_datum = (motions.on_reduced - through @ B) @ motions.inverse.T
     Q = linear.cofactor()
     whole = np.eye(layout.reduced + d)
     whole[: layout.reduced, : layout.reduced] = Q
     whole[: layout.reduced, layout.reduced :] = Q @ of_datum
-    own = linear.own @ (motions.constraints @ motions.inverse.T)[layout.observations.point]
     return Influence(
         linear,
         through,
-        linear.scores,
-        own.reshape(2 * len(linear.own), d),
+        motions.constraints @ motions.inverse.T,
         whole,
         motions.reduced,
         motions.points.reshape(3 * n, d),
@@ -216,30 +222,39 @@ class _Photograph:
     """R - I of the image points of a photograph: (alone - 1) I and G C G' with G their relative whitening."""
 
     rows: IntArray  # its image points, (r,)
-    alone: float
-    common: FloatArray  # C, (r, r)
+    xy: FloatArray  # px, (r, 2)
     relative: FloatArray  # G, (r, 2, 2)
+    correlation: ErrorCorrelation
 
-    def times(self, Z: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
-        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u)."""
+    def times(self, Z: FloatArray, some: IntArray | None = None) -> FloatArray:
+        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u); C is formed by parts."""
+        some = np.arange(len(self.rows)) if some is None else some
         of_shift = (np.swapaxes(self.relative, 1, 2) @ Z).reshape(len(Z), -1)
-        moved = (self.common[some] @ of_shift).reshape(-1, *Z.shape[1:])
-        return np.asarray((self.alone - 1.0) * Z[some] + self.relative[some] @ moved)
+        parts = np.array_split(some, 1 + 8 * len(some) * len(self.xy) // BYTES_AT_ONCE)
+        moved = np.concatenate([self.common(part, slice(None)) @ of_shift for part in parts])
+        moved = moved.reshape(len(some), *Z.shape[1:])
+        return np.asarray((self.correlation.alone - 1.0) * Z[some] + self.relative[some] @ moved)
 
     def between(self, O: FloatArray, some: IntArray) -> FloatArray:
         """Return O'(R - I) O of functions of some image points, three of each (s, 2, 3), (3 s, 3 s)."""
         of_shift = np.swapaxes(self.relative[some], 1, 2) @ O
-        common = self.common[np.ix_(some, some)]
-        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, common, of_shift, optimize=True)
+        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(some, some), of_shift, optimize=True)
         own = np.arange(len(some))
-        pairs[own, :, own] += (self.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
+        pairs[own, :, own] += (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
         return np.asarray(pairs.reshape(3 * len(some), 3 * len(some)))
 
     def variances(self) -> FloatArray:
         """Return R - I of each image point by itself, (r, 2, 2)."""
-        shift = np.diagonal(self.common)[:, None, None]
-        together = shift * self.relative @ np.swapaxes(self.relative, 1, 2)
-        return np.asarray((self.alone - 1.0) * np.eye(2) + together)
+        together = self.correlation.common * self.relative @ np.swapaxes(self.relative, 1, 2)
+        return np.asarray((self.correlation.alone - 1.0) * np.eye(2) + together)
+
+    def common(self, some: IntArray, others: IntArray | slice) -> FloatArray:
+        """Return C of some image points by others, (s, o)."""
+        C = cdist(self.xy[some], self.xy[others])
+        C /= -self.correlation.length_px
+        np.exp(C, out=C)
+        C *= self.correlation.common
+        return np.asarray(C)
 
 
 def _photographs(
@@ -247,8 +262,4 @@ def _photographs(
 ) -> Iterator[_Photograph]:
     """Yield R - I of the image points of each photograph."""
     for rows in rows_of(image, int(image.max(initial=-1)) + 1):
-        C = cdist(xy[rows], xy[rows])  # 0.3 GB of 6000 image points: no copies
-        C /= -correlation.length_px
-        np.exp(C, out=C)
-        C *= correlation.common
-        yield _Photograph(rows, correlation.alone, C, relative[rows])
+        yield _Photograph(rows, xy[rows], relative[rows], correlation)

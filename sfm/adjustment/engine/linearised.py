@@ -25,7 +25,7 @@ from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.kernels.options import kernel
 
 
@@ -46,11 +46,6 @@ class Linearised:
         """W V^-1: what a reduced unknown takes from the points, (reduced, 3n)."""
         return self.A.T @ self.B @ self.V_inverse
 
-    @property
-    def scores(self) -> csr_matrix:
-        """M': the right side of the reduced normal equations by errors, (2k, reduced)."""
-        return csr_matrix(self.A - self.B @ self.through.T)
-
     def cofactor(self) -> FloatArray:
         """Return a cofactor matrix of the reduced unknowns, in any datum, (reduced, reduced)."""
         return self.solve(np.eye(self.layout.reduced))
@@ -63,7 +58,7 @@ class Linearised:
     def residuals(self, errors: FloatArray) -> FloatArray:
         """Return the residuals that errors of the image points leave, whitened, both (2k, e)."""
         of_points = self.B.T @ errors
-        dx = self.solve(self.A.T @ errors - self.through @ of_points)
+        dx = self.solve(self.A.T @ (errors - self.B @ (self.V_inverse @ of_points)))
         moved = self.A @ dx
         return np.asarray(errors - moved - self.B @ (self.V_inverse @ (of_points - self.B.T @ moved)))
 
@@ -85,20 +80,13 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     column = np.concatenate(
         [6 * o.pose[:, None] + np.arange(6), o.free_column[o.camera[o.image], :f]], axis=1
     )
+    by_cameras = _of_rays(A, column, np.ones(k, dtype=bool), layout.reduced)
     slot = np.full(n, -1)
     slot[layout.kept] = np.arange(len(layout.kept))
     kept = slot[o.point] >= 0
     of_kept = layout.kept_start + 3 * slot[o.point[kept]][:, None] + np.arange(3)
-    rows = np.arange(2 * k).reshape(k, 2)
-    in_A = (
-        np.concatenate([A.ravel(), B[kept].ravel()]),
-        (
-            np.concatenate([np.repeat(rows, 6 + f), np.repeat(rows[kept], 3)]),
-            np.concatenate([np.repeat(column, 2, axis=0).ravel(), np.repeat(of_kept, 2, axis=0).ravel()]),
-        ),
-    )
+    by_kept = _of_rays(B[kept], of_kept, kept, layout.reduced)
     of_point = 3 * o.point[~kept][:, None] + np.arange(3)
-    in_B = (B[~kept].ravel(), (np.repeat(rows[~kept], 3), np.repeat(of_point, 2, axis=0).ravel()))
     half = solve_lower(b.L, np.tile(np.eye(3), (n, 1, 1)))
     V_inverse = half.transpose(0, 2, 1) @ half
     F = np.zeros((k, 2, 2))
@@ -106,12 +94,26 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     return Linearised(
         layout,
         optimum.factor,
-        csr_matrix(in_A, shape=(2 * k, layout.reduced)),
-        csr_matrix(in_B, shape=(2 * k, 3 * n)),
+        by_cameras + by_kept if kept.any() else by_cameras,
+        _of_rays(B[~kept], of_point, ~kept, 3 * n),
         csr_matrix(bsr_matrix((V_inverse, np.arange(n), np.arange(n + 1)))),
         np.where(kept[:, None, None], 0.0, B) @ V_inverse[o.point],
         F,
     )
+
+
+def _of_rays(values: FloatArray, column: IntArray, which: BoolArray, columns: int) -> csr_matrix:
+    """Return the derivatives of all image points, (2k, columns), of those of some.
+
+    Args:
+        values: derivatives of x and y by q unknowns each, (s, 2, q).
+        column: of these unknowns, (s, q).
+        which: image points with derivatives, s of them, (k,).
+        columns: how many there are.
+    """
+    first = np.concatenate([[0], np.cumsum(np.repeat(which, 2) * column.shape[1])])
+    entries = (values.ravel(), np.repeat(column, 2, axis=0).ravel(), first)
+    return csr_matrix(entries, shape=(2 * len(which), columns))
 
 
 @kernel

@@ -16,6 +16,7 @@ from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
+from sfm.files.plain_text import BLOCK
 from sfm.files.ply import write_ply
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
@@ -137,14 +138,10 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
     a, found = adjustment, statistics.reliability
     tests = (a.residuals, a.redundancy_numbers, a.standardised, a.tau, found.minimal_bias, found.external)
     error = _gross_error(a.residuals, a.redundancy_numbers)
-    for names, values, rejected, size in zip(
-        _names(network),
-        np.column_stack((*tests, a.weights)).tolist(),
-        a.rejected.tolist(),
-        error.tolist(),
-        strict=True,
+    for names, values, rejected in zip(
+        _names(network), _listed((*tests, a.weights, error)), a.rejected.tolist(), strict=True
     ):
-        yield (*names, *values, int(rejected), *size)
+        yield (*names, *values[:-2], int(rejected), *values[-2:])
 
 
 def _names(network: Network) -> Iterator[tuple[str, str]]:
@@ -206,3 +203,9 @@ def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]
     for c, (parameter, camera) in enumerate(found.parameters):
         for image, rho in zip(found.images, found.rho[:, :, c], strict=True):
             yield (camera.removeprefix("camera "), parameter, image, *rho)
+
+
+def _listed(columns: Sequence[FloatArray]) -> Iterator[list[float]]:
+    """Yield the values of every image point in columns (k,) or (k, 2), block by block."""
+    for first in range(0, len(columns[0]), BLOCK):
+        yield from np.column_stack([column[first : first + BLOCK] for column in columns]).tolist()

@@ -28,6 +28,7 @@ from sfm.matching.radiometry import Grey
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
+from sfm.runtime.memory import give_back_memory
 from sfm.runtime.progress import reported
 
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
@@ -144,8 +145,10 @@ def find_covering_points(
     in_order = [i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(own[i]) >= NEIGHBOURS]
     for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
         cover(i, min_rays, more=True)
+        give_back_memory()
     for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
         cover(i, 2, more=False)
+        give_back_memory()
     return _joined(found)
 
 
