@@ -123,11 +123,11 @@ def _residuals(
 
     Args:
         found: the residuals.
-        what: the names stand for.
+        what: names of the first column, in the singular.
         factor: from the object unit to that of the page.
         gap: between the letter and the name of a coordinate.
         unknown: in place of a standard deviation that is not known.
-        rms: whether the root mean squares of d stand below.
+        rms: whether a last row has the root mean squares of d.
     """
     letters = (
         ("d", signed, factor, ""),

@@ -329,5 +329,5 @@ def words_of_measured(found: Measurement) -> str:
         return ", ".join(parts) + "."
     counts = {one: sum(t.count(one) for t in found.tolerances) for one in DECISIONS}
     total = sum(counts.values())
-    told = [f"{count} {decision}" for decision, count in counts.items() if count]
-    return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(told)}."
+    parts = [f"{count} {decision}" for decision, count in counts.items() if count]
+    return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(parts)}."

@@ -193,15 +193,15 @@ def _median_sigmas(one: Adjustment) -> list[str]:
 
 def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:
     """Return the photographs with standard deviations and residuals; NaN where they were not adjusted."""
-    seen, own, m = found.model.image_points, found.adjustment, len(found.images)
-    used = ~own.rejected
+    seen, a, m = found.model.image_points, found.adjustment, len(found.images)
+    used = ~a.rejected
     used[len(found.rows) :] = False  # targets
     after = np.full(m, np.nan)
     after[found.images] = _rms_of(
-        own.residuals[used], own.network.image_points.image[used], int(found.images.sum())
+        a.residuals[used], a.network.image_points.image[used], int(found.images.sum())
     )
     sigma = np.full((m, 6), np.nan)
-    sigma[found.images] = np.sqrt(np.diagonal(own.covariance.exterior, axis1=1, axis2=2))
+    sigma[found.images] = np.sqrt(np.diagonal(a.covariance.exterior, axis1=1, axis2=2))
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
     columns = (
         *(Column(None, "image_id"), Column("photograph", "name")),
@@ -242,15 +242,15 @@ def _coordinates(
     found: Refinement, name: str, names: Sequence[object], points: IntArray, file: str, unit: str = ""
 ) -> Table:
     """Return name, coordinates, their standard deviations and rays of points of the adjustment."""
-    own = found.adjustment
-    rays = np.bincount(own.network.image_points.point[~own.rejected], minlength=len(own.network.points))
-    sigma = np.sqrt(np.diagonal(own.covariance.points[points], axis1=1, axis2=2))
+    a = found.adjustment
+    rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
+    sigma = np.sqrt(np.diagonal(a.covariance.points[points], axis1=1, axis2=2))
     columns = (
         *(Column(name, name), *axes("", unit, ".9g")),
         *(Column(f"sigma {one}", f"s{one}", unit, significant) for one in "XYZ"),
         Column("photographs", "rays", format=str),
     )
-    xyz = own.estimate.points[points]
+    xyz = a.estimate.points[points]
     rows = [(n, *at, *s, r) for n, at, s, r in zip(names, xyz, sigma, rays[points], strict=True)]
     return Table(columns, rows, file)
 

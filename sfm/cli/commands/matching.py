@@ -12,8 +12,14 @@ from sfm.files.csv_tables import read_table
 from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, match_points
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.patches import draw_patches
-from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
-from sfm.report.matching import NAMES, matches_json, matches_table
+from sfm.report.matching import (
+    NAMES,
+    matches_json,
+    matches_table,
+    picture_file,
+    refuse_outputs,
+    whole_outputs,
+)
 
 
 def match_command(
@@ -64,7 +70,7 @@ def match_command(
     if not 0.0 <= min_correlation <= 1.0:
         raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
     inputs = (left_path, right_path, *(() if points is None else (points,)))
-    refuse_outputs(out, picture, inputs, NAMES, as_json)
+    refuse_outputs(out, picture, inputs, as_json)
     if points is not None:
         names, xy, start = read_points_to_match(points)
     else:
