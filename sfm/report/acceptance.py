@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.display import counted
 from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.measurements import length_error_figure
@@ -26,9 +27,9 @@ def page(found: Acceptance) -> Page:
     figures = facts(
         [
             ("Limit", limit),
-            ("Lengths", f"{len(a.error)} on {lines} lines"),
+            ("Lengths", f"{len(a.error)} on {counted(lines, 'line')}"),
             ("Largest error", f"{significant(a.largest)} {u}"),
-            *((one.capitalize(), f"{a.count(one)} lengths") for one in DECISIONS if a.count(one)),
+            *((one.capitalize(), counted(a.count(one), "length")) for one in DECISIONS if a.count(one)),
             ("Body diagonal", f"{general(a.diagonal, 6)} {u}"),
         ]
     )

@@ -112,7 +112,7 @@ def _further(found: GivenResiduals) -> tuple[Part, ...]:
 def _exterior(found: GivenResiduals) -> Part:
     factor, finer = finer_unit_of(found.units[0][0], found.difference)
     count = len(found.names)
-    title = f"{', '.join(found.coordinates)} of {count} photographs [{finer}]"
+    title = f"{', '.join(found.coordinates)} of {counted(count, 'photograph')} [{finer}]"
     return Folded(title, _residuals(found, "photograph", factor, gap=" ", rms=True), open=count < MAX_OPEN)
 
 

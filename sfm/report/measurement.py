@@ -241,7 +241,7 @@ def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
     ]
     columns = (Column("point"), *axes("d", u, signed), Column("used", flag=USED))
     differences = [(n, *d, used) for n, d, used in zip(fit.names, fit.difference, fit.used, strict=True)]
-    title = f"{len(fit.names)} differences, aligned minus nominal"
+    title = f"{counted(len(fit.names), 'difference')}, aligned minus nominal"
     return facts(rows), Folded(title, Table(columns, differences))
 
 
