@@ -124,15 +124,16 @@ class Table:
     @property
     def cells(self) -> Iterable[tuple[str | Mark | Link, ...]]:
         """The rows as the page shows them."""
-        return map(self._cells, self.rows[:MAX_ROWS])
+        return self._cells(self.rows[:MAX_ROWS])
 
     @property
-    def sums(self) -> tuple[str | Mark | Link, ...]:
-        """The last row as the page shows it, empty without one."""
-        return () if self.total is None else self._cells(self.total)
+    def sums(self) -> Iterable[tuple[str | Mark | Link, ...]]:
+        """The last row as the page shows it, nothing without one."""
+        return self._cells([] if self.total is None else [self.total])
 
-    def _cells(self, row: Sequence[Any]) -> tuple[str | Mark | Link, ...]:
-        return tuple(one.cell(row[k]) for k, one in self.shown)
+    def _cells(self, rows: Iterable[Sequence[Any]]) -> Iterable[tuple[str | Mark | Link, ...]]:
+        shown = self.shown
+        return (tuple(one.cell(row[k]) for k, one in shown) for row in rows)
 
     @property
     def cut(self) -> str:
@@ -165,9 +166,9 @@ class Table:
 
     @property
     def text(self) -> str:
-        """The table in columns of plain text, numbers at the right."""
+        """All rows in columns of plain text, numbers at the right."""
         shown = [one for _, one in self.shown]
-        rows = [[str(cell) for cell in row] for row in self.cells]
+        rows = [[str(cell) for cell in row] for row in self._cells(self.rows)]
         if not self.facts:
             rows.insert(0, [one.heading for one in shown])
         return "\n".join((*aligned(rows, [one.format is None for one in shown]), ""))
