@@ -15,6 +15,7 @@ from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
+from sfm.report.page import Banner
 from sfm.report.phrases import (
     words_left_out,
     words_of_calibration,
@@ -66,7 +67,7 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     return verdict.level != "bad"
 
 
-def tell_verdict(verdict: Verdict) -> None:
+def tell_verdict(verdict: Verdict | Banner) -> None:
     """Print a verdict: its headline in its colour, then its remarks."""
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)

@@ -265,6 +265,16 @@ class Page:
         return tuple(one for one in found if one.file)
 
     @property
+    def text(self) -> str:
+        """The tables of the sections for the terminal, those left out that a click unfolds."""
+        lines: list[str] = []
+        for section in self.sections:
+            tables = [part for part in section.parts if isinstance(part, Table)]
+            lines += [section.title] if tables else []
+            lines += [f"  {line}" for table in tables for line in table.text.splitlines()]
+        return "\n".join(lines)
+
+    @property
     def texts(self) -> dict[str, str]:
         """The text files beside the page, by their names."""
         found = {f"{one.file}.csv": one.csv for one in self.tables}

@@ -56,7 +56,11 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
     Raises:
         OutputError: the folder holds something else or cannot be written, or another run is writing it.
     """
-    page = page_of(found, **beside)
+    return write_declared(page_of(found, **beside), out, also=also)
+
+
+def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None = None) -> Path:
+    """Write a declared page and its files as `write_page` does."""
     with locked(out.parent / f".{out.name}.lock", out):
         remove_leftovers(out)
         with whole_folder(out, "the result", replaceable=True) as folder:

@@ -238,6 +238,6 @@ def test_more_photographs_for_a_result(tmp_path: Path, capsys: pytest.CaptureFix
     out = tmp_path / "more"
     assert plan(tmp_path / "five", "--photographs", 2, "--out", out, command="more") == 0
     printed = capsys.readouterr().out
-    assert "2 more photographs: sigma of the worst point from" in printed and "new 2: " in printed
+    assert "2 more photographs: sigma of the worst point from" in printed and "\n  new 2  " in printed
     points = rows(out / "points.csv")
     assert all(float(row["sigma_with_more"]) < float(row["sigma"]) for row in points)

@@ -95,6 +95,7 @@ def test_a_new_page_is_one_file_and_one_row(levelling: Levelling, tmp_path: Path
     assert "<strong>20.0 mm at most</strong>" in text and "<h2>Points</h2>" in text
     assert "<th class=n>difference [mm]</th>" in text and "<td class=n>+1.23</td>" in text
     assert "<td>not levelled</td><td></td>" in text and "<td>yes</td>" in text
+    assert page_of(levelling).text.splitlines() == ["Heights", "  Sigma  1.00 mm"]  # points are folded
     assert page_of(levelling).tables[0].text.splitlines()[1:] == [
         f"{EVIL}            +1.23  yes",
         f"=B{'-20.00':>43}",

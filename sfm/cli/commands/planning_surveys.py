@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
-from sfm.display import counted
 from sfm.runtime.faults import working_on
 
 
@@ -74,11 +73,11 @@ def more_command(
 
         from adapters.formats.given_table import read_given
         from adapters.formats.result_tables import read_result
+        from sfm.cli.console import tell_verdict
         from sfm.errors import GeometryError
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.further import further_photographs
-        from sfm.report.further import headline, weakest
-        from sfm.report.pages import write_page
+        from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress
 
@@ -99,15 +98,8 @@ def more_command(
         found = further_photographs(
             network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
         )
-    page = write_page(found, out, result=stored)
-    print(headline(found, stored))
-    for name, before, after in weakest(found, stored):
-        print(f"  point {name}: {before} -> {after}")
-    for shot in found.shots:
-        place = ", ".join(f"{x:.6g}" for x in shot.position)
-        print(
-            f"  {shot.station}: {place} {stored.unit}, azimuth {shot.azimuth_deg:.0f} deg, elevation "
-            f"{shot.elevation_deg:.0f} deg, roll {shot.roll_deg:.0f} deg, shows "
-            f"{counted(shot.points, 'point')}"
-        )
-    print(f"Report: {page}")
+    page = page_of(found, result=stored)
+    path = write_declared(page, out)
+    tell_verdict(page.verdict)
+    print(page.text)
+    print(f"Report: {path}")

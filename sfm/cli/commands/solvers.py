@@ -34,22 +34,18 @@ def validate(
         from sfm.cli.console import tell_verdict
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.pages import write_page
-        from sfm.report.validation import ended, in_words, largest, verdict_of_validation
+        from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress_bar import drawn_progress
 
     load_pycolmap()  # without it there is nothing to compare, which is no verdict on a network
     refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
-    page = write_page(found, out)
-    tell_verdict(verdict_of_validation(found))
-    for kind, count in found.counts():
-        print(f"{count} of {networks} networks: {ended(kind)}")
-    print("Largest differences:")
-    for name, value, unit in largest(found):
-        print(f"  {name}: {in_words(value, unit)}")
-    print(f"Report: {page}")
+    page = page_of(found)
+    path = write_declared(page, out)
+    tell_verdict(page.verdict)
+    print(page.text)
+    print(f"Report: {path}")
     if not found.passed:
         raise SystemExit(WORSE)
 
