@@ -28,6 +28,7 @@ NO_SCALE = "network units"
 OBJECT_UNITS = "object units"
 """unit of lengths in a network of which nobody has said which one it is"""
 CONTROL_COVARIANCE = "control covariance"  # kind of a row of given.csv
+MOUNT = ("X", "Y", "Z", "omega", "phi", "kappa")  # of a camera in the axes of its rig
 MEASURED = "measured"
 """what targets.csv says of a target in the place of a reason for its rejection"""
 
@@ -104,12 +105,33 @@ class Solution:
     )
     exterior_covariance: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, unit and rad, (m, 6, 6)
     interior_covariance: tuple[FloatArray, ...] = ()  # of the free parameters of each camera, (f, f)
+    rig_covariance: FloatArray | None = (
+        None  # of `interior_covariance` of all cameras and then X, Y, Z, omega,
+    )
+    # phi, kappa of the mount of each, together, unit and rad, (s, s)
     joint: JointCovariance | None = None  # of an adjustment in memory; None where only what is above is known
 
     @property
     def has_scale(self) -> bool:
         """Whether lengths are in a known unit, from scale bars or control."""
         return self.unit not in ("", NO_SCALE)
+
+    @property
+    def mount_covariance(self) -> FloatArray | None:
+        """Covariance of X, Y, Z, omega, phi, kappa of each camera in its rig, (a, 6, 6)."""
+        Q = self.rig_covariance
+        return None if Q is None else mount_blocks(Q, len(Q) - 6 * len(self.estimate.cameras))
+
+    @property
+    def rig_parameters(self) -> tuple[str, ...]:
+        """Camera and parameter of each row of `rig_covariance`, in words, (s,)."""
+        cameras = self.estimate.cameras
+        interior = [
+            f"{camera.name} {name}"
+            for camera, Q in zip(cameras, self.interior_covariance, strict=False)
+            for name in np.array(camera.names)[camera.free][: len(Q)]
+        ]
+        return (*interior, *(f"{camera.name} {name}" for camera in cameras for name in MOUNT))
 
     @property
     def solution(self) -> Solution:
@@ -240,6 +262,12 @@ class Solution:
 
     def _repr_html_(self) -> str:
         return html_table(f"Result {self.name}", ("", ""), self._rows())
+
+
+def mount_blocks(covariance: FloatArray, first: int) -> FloatArray:
+    """Return the covariance of each mount of those of all together, which begin at a row, (a, 6, 6)."""
+    rows = first + np.arange(len(covariance) - first if len(covariance) else 0).reshape(-1, 6)
+    return np.asarray(covariance[rows[:, :, None], rows[:, None]])
 
 
 def solution_of(result: Any, what: str) -> Solution:

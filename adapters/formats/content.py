@@ -149,6 +149,33 @@ def _full(content: Content) -> FloatArray:
     return np.concatenate([part.ravel() for part in parts])[:, None] if parts else np.zeros((0, 1))
 
 
+def _rigs(content: Content) -> FloatArray:
+    estimate = content.result.estimate
+    if estimate.mounts is None or content.result.network.moment is None:
+        return np.zeros((0, 20))
+    mounts = estimate.mounts
+    rigs = [float(crc32(name.encode())) for name in mounts.rig]
+    on = [a for a, name in enumerate(mounts.rig) if name]
+    R = mounts.rotation.reshape(-1, 9)
+    rows = np.column_stack([np.arange(len(rigs)), rigs, mounts.position, R, mounts.free])
+    return np.asarray(rows[on])
+
+
+def _moments(content: Content) -> FloatArray:
+    """Return photographs of one moment and their first one, (n, 2)."""
+    moment = content.result.network.moment
+    if moment is None or content.result.estimate.mounts is None:
+        return np.zeros((0, 2))
+    _, first, of, count = np.unique(moment, return_index=True, return_inverse=True, return_counts=True)
+    together = np.flatnonzero(count[of] > 1)
+    return np.column_stack([together, first[of[together]]]).astype(float)
+
+
+def _rig_covariance(content: Content) -> FloatArray:
+    Q = content.result.rig_covariance
+    return np.zeros((0, 1)) if Q is None else np.asarray(Q)
+
+
 def _statistics(content: Content) -> FloatArray:
     found = (content.result.redundancy, content.sigma0, content.sigma0_px)
     return np.array([value for value in found if value is not None], dtype=float)[:, None]
@@ -221,6 +248,9 @@ KINDS = (
     Kind("interior sigmas", "standard deviations of interior parameters", _interior_sigmas),
     Kind("joint covariance", "rows of the covariance of all coordinates", _joint),
     Kind("covariances", "covariances of exterior and interior orientation", _full),
+    Kind("rigs", "cameras on rigs", _rigs),
+    Kind("moments", "photographs of one moment with others", _moments),
+    Kind("rig covariance", "rows of the covariance of mounts and interior orientation", _rig_covariance),
     Kind("statistics", "values of redundancy and sigma0", _statistics),
     Kind("datum", "kind of datum", lambda content: _word(content.result.datum)),
     Kind("unit", "unit of lengths", lambda content: _word(content.result.unit)),
@@ -237,7 +267,9 @@ KINDS = (
 ALL = frozenset(kind.name for kind in KINDS)
 
 
-CONVERTED = frozenset({"interior", "interior correlations", "interior sigmas", "covariances"})
+CONVERTED = frozenset(
+    {"interior", "interior correlations", "interior sigmas", "covariances", "rig covariance"}
+)
 
 
 def with_cameras(content: Content, network: Network, estimate: Estimate) -> tuple[Content, frozenset[str]]:
@@ -268,6 +300,7 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
         interior_sigma=None,
         exterior_covariance=None,
         interior_covariance=(),
+        rig_covariance=None,
     )
     content = replace(content, result=result)
     return replace(content, rejected=_no_image_points()) if "rejected" in gone else content, gone

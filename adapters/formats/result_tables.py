@@ -34,6 +34,7 @@ from sfm.files.csv_tables import CsvTable
 from sfm.files.json_files import Content as Json
 from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.open_folders import refuse_links_out
+from sfm.files.rig_tables import read_rigs, write_rigs
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.network_check import CORRELATION_LIMIT
 from sfm.solution import Solution
@@ -65,12 +66,14 @@ def read_result(folder: Path) -> Solution:
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
+    mounts, moment = read_rigs(folder, [one.name for one in cameras], network)
+    network = replace(network, moment=moment)
     known = table.values.shape[1] > 3
     joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
     found = Solution(
         summary.survey or folder.name,
         network,
-        Estimate(cameras, position, rotation, table.values[:, :3].copy()),
+        Estimate(cameras, position, rotation, table.values[:, :3].copy(), mounts),
         _covariance(table, table.values[:, 3:]),
         position_covariance,
         sigmas,
@@ -80,8 +83,7 @@ def read_result(folder: Path) -> Solution:
         summary.datum.kind if summary.datum else "",
         covariance_points=of_points,
     )
-    exterior, interior = read_covariances(folder, found)
-    return replace(found, exterior_covariance=exterior, interior_covariance=interior)
+    return read_covariances(folder, found)
 
 
 def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, BoolArray, FloatArray]:
@@ -181,7 +183,9 @@ def write_content(folder: Path, content: Content) -> None:
         tables.write_solution(folder, result, seen, np.arange(len(seen)) >= len(network.image_points))
         if result.covariance is not None:
             write_covariance(folder, result.covariance, network.points, result.covariance_points)
-        if result.exterior_covariance is not None or any(map(len, result.interior_covariance)):
+        write_rigs(folder, result)
+        full = (result.exterior_covariance, result.rig_covariance)
+        if any(Q is not None for Q in full) or any(map(len, result.interior_covariance)):
             write_covariances(folder, result)
         write_given(folder, network, estimate)
         text = json.dumps(summary, indent=2, ensure_ascii=False)

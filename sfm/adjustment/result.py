@@ -11,7 +11,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
-from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution
+from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
 # Of an image coordinate. Computed ones are exact to some 1e-15 of themselves, and to 1e-10 where errors of
 # control strain their network; measured ones to 1e-7 at best.
@@ -32,8 +32,15 @@ class Covariance:
     interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order; the variance of one
     # that is not determined is infinite, (f, f)
     points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
-    mounts: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))  # of X, Y, Z (object unit) and
-    # omega, phi, kappa (rad) of each camera in its rig; 0 of reference cameras; none without rigs, (a, 6, 6)
+    rigs: FloatArray = field(
+        default_factory=lambda: np.zeros((0, 0))
+    )  # of `interior` of all cameras and then
+    # X, Y, Z (object unit), omega, phi, kappa (rad) of each in its rig, together; none without rigs, (s, s)
+
+    @property
+    def mounts(self) -> FloatArray:
+        """Covariance of X, Y, Z, omega, phi, kappa of each camera in its rig; 0 of references, (a, 6, 6)."""
+        return mount_blocks(self.rigs, sum(map(len, self.interior)))
 
 
 @dataclass(frozen=True)
@@ -135,6 +142,7 @@ class Adjustment:
             datum=self.datum,
             exterior_covariance=exterior,
             interior_covariance=self.covariance.interior,
+            rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=JointOnDemand(self),
         )
 
@@ -158,7 +166,7 @@ class Adjustment:
             c.exterior / unit,
             tuple(Q / unit for Q in c.interior),
             c.points_limiting / unit,
-            c.mounts / unit,
+            c.rigs / unit,
         )
 
     @property

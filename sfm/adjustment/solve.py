@@ -259,7 +259,9 @@ def _result(
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
         interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
-        result = Covariance(empty, np.full((m, 6, 6), np.nan), interior, empty)
+        shared = len(layout.rig_terms(optimum.state)[0])
+        rigs = np.full((shared, shared), np.nan)
+        result = Covariance(empty, np.full((m, 6, 6), np.nan), interior, empty, rigs)
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
         result = without_held(result, layout, optimum)

@@ -4,7 +4,9 @@
     point_covariance_points.csv    id of the points that it is of, where it is not of all
     covariances.npz    image_names (m,), exterior (m, 6, 6)    X0, Y0, Z0, omega, phi, kappa of a photograph
                        camera_names (a,), interior_0 (f, f) ...    free parameters of each camera
-                       point_names (n,), points (n, 3, 3)    X, Y, Z of a point; of surveys, not read again
+                       rig_parameters (s,), rigs (s, s)    of all of these and X, Y, Z, omega, phi, kappa
+                      of each mount, together; where there are rigs
+                      point_names (n,), points (n, 3, 3)    X, Y, Z of a point; of surveys, not read again
 
 In object units and rad; arrays of NumPy, from which nothing is run. Sizes are checked before they are read.
 
@@ -15,6 +17,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,11 +151,13 @@ def write_covariances(folder: Path, solution: Solution, *, points: bool = False)
         arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
     arrays["camera_names"] = np.array([camera.name for camera in solution.estimate.cameras])
     arrays |= {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
+    if solution.rig_covariance is not None:
+        arrays |= {"rig_parameters": np.array(solution.rig_parameters), "rigs": solution.rig_covariance}
     np.savez_compressed(folder / ARRAYS, **arrays)
 
 
-def read_covariances(folder: Path, result: Solution) -> tuple[FloatArray | None, tuple[FloatArray, ...]]:
-    """Return the covariances of the exterior (m, 6, 6) and of each interior orientation, None and () without.
+def read_covariances(folder: Path, result: Solution) -> Solution:
+    """Return a result with the covariances of exterior orientation, interior orientation and rigs.
 
     Args:
         folder: of the result; the file may be missing.
@@ -163,7 +168,7 @@ def read_covariances(folder: Path, result: Solution) -> tuple[FloatArray | None,
     """
     path = folder / ARRAYS
     if not path.is_file():
-        return None, ()
+        return result
     images, cameras = result.network.images, result.estimate.cameras
     free = [int(camera.free.sum()) for camera in cameras]
     try:
@@ -180,9 +185,14 @@ def read_covariances(folder: Path, result: Solution) -> tuple[FloatArray | None,
         tuple(known.get("image_names", ())) == images and exterior.shape == (len(images), 6, 6)
     )
     fits &= all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
-    matrices = interior if exterior is None else (exterior, *interior)
+    rigs = known.get("rigs")
+    found = replace(result, exterior_covariance=exterior, interior_covariance=interior, rig_covariance=rigs)
+    if rigs is not None:
+        names = found.rig_parameters
+        fits &= tuple(known.get("rig_parameters", ())) == names and rigs.shape == (len(names), len(names))
+    matrices = (*interior, *(Q for Q in (exterior, rigs) if Q is not None))
     if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
         raise SurveyFileError(
             f"{path}: covariances of other photographs or cameras than the tables beside it"
         )
-    return exterior, interior
+    return found

@@ -12,6 +12,7 @@ from sfm.files.covariance_file import ARRAYS, POINTS_NAME, write_covariance
 from sfm.files.covariance_file import NAME as POINT_COVARIANCE
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
 from sfm.files.result_tables import TABLES
+from sfm.files.rig_tables import MOMENTS, MOUNTS
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
@@ -32,7 +33,15 @@ from sfm.runtime.progress import SILENT, Progress
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 
 WRITTEN = (
-    *("summary.json", *(table.file for table in TABLES), POINT_COVARIANCE, POINTS_NAME, ARRAYS),
+    *(
+        "summary.json",
+        *(table.file for table in TABLES),
+        MOUNTS,
+        MOMENTS,
+        POINT_COVARIANCE,
+        POINTS_NAME,
+        ARRAYS,
+    ),
     *("report.txt", "report.html", "points.ply", "colmap", "overlays", "pictures", "plots", "log.jsonl"),
     MANIFEST,
 )

@@ -87,9 +87,13 @@ def _given_mounts(survey: Survey) -> MountObservations:
     """
     number = {camera.name: a for a, camera in enumerate(survey.cameras)}
     mounted = {name for rig in survey.rigs for name in rig.cameras[1:]}
+    references = {rig.cameras[0] for rig in survey.rigs}
     cameras: list[int] = []
+    rows: list[tuple[FloatArray, FloatArray]] = []
     for table in survey.mounts:
         for k, name in enumerate(table.names):
+            if name in references and not table.value[k].any() and not table.sigma[k].any():
+                continue
             if name not in mounted:
                 some = listed(sorted(mounted))
                 raise SurveyFileError(
@@ -102,8 +106,8 @@ def _given_mounts(survey: Survey) -> MountObservations:
                     "together or none of them"
                 )
             cameras.append(number[name])
-    value = np.concatenate([np.zeros((0, 6)), *(table.value for table in survey.mounts)])
-    sigma = np.concatenate([np.zeros((0, 6)), *(table.sigma for table in survey.mounts)])
+            rows.append((table.value[k], sigma))
+    value, sigma = np.array(rows).reshape(-1, 2, 6).swapaxes(0, 1)
     covariance = np.eye(6) * sigma[:, None, :] ** 2
     return MountObservations(np.array(cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance)
 

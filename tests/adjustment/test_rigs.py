@@ -20,7 +20,7 @@ from sfm.adjustment.engine.solvers.fronts import fronts_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.unknowns import Unknowns, start_weights, step, unknowns_of
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -187,3 +187,15 @@ def test_a_rig_is_more_precise_than_its_photographs_alone() -> None:
         return float(np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2).mean()) / a.sigma0)
 
     assert rms(rig) < rms(alone)
+
+
+@pytest.mark.parametrize("correlation", [None, ErrorCorrelation(alone=0.5, common=0.8, length_px=300.0)])
+def test_covariance_of_rigs_is_that_of_the_inverse(correlation: ErrorCorrelation | None) -> None:
+    """Interior orientation and mounts together, against columns of the inverse, with J of their angles."""
+    network, truth = make_rig(seed_of("joint rigs"), moments=5, points=20, free=("c",))
+    a = replace(adjust(network, truth, reject="none"), error_correlation=correlation)
+    marginal = marginal_of(a)
+    columns, J = marginal.layout.rig_terms(marginal.optimum.state)
+    exact = J @ marginal.joint(columns, np.zeros(0, dtype=np.int64)) @ J.T
+    scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact))) + (exact == 0)
+    assert np.abs((marginal.covariance().rigs - exact) / scale).max() < 1e-8

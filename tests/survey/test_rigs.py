@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
@@ -69,6 +71,13 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     )
     assert abs(mount.base / size - np.linalg.norm(truth.mounts.position[1])) < 4 * mount.base_sigma / size
     write_result(found, tmp_path / "out")
+    again = read_result(tmp_path / "out")
+    assert again.estimate.mounts is not None and again.estimate.mounts.rig == ("stereo", "stereo")
+    np.testing.assert_array_equal(again.rig_covariance, result.adjustment.covariance.rigs)
+    shutil.copy(tmp_path / "out" / "mounts.csv", tmp_path)
+    path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
+    (given,) = run_survey(read_survey(path)).network.observations
+    assert len(given) == 1  # the row of the reference is none
     (stored,) = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["rigs"]
     assert stored["mounts"][0]["base"] == {"value": mount.base, "sigma": mount.base_sigma}
     assert set(stored["mounts"][0]["rotation_deg"]) == {"omega", "phi", "kappa"}

@@ -102,18 +102,18 @@ def marginal_covariance(
     for own in layout.interior_column:
         Q = cofactors.border[np.ix_(own - first, own - first)]
         interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
-    columns, J = layout.mount_terms(optimum.state)
-    at = np.maximum(columns - first, 0)
-    of_mounts = np.zeros((len(at), 6, 6))
-    if cofactors.border.size:
-        of_mounts = cofactors.border[at[:, :, None], at[:, None]]
-    mounts = J @ _in_datum(of_mounts, H[columns], np.moveaxis(F[:, columns], 1, 0), G) @ np.swapaxes(J, 1, 2)
+    columns, J = layout.rig_terms(optimum.state)
+    at = np.maximum(columns - first, 0)  # where a mount is fixed, J is 0
+    rigs = np.zeros((len(at), len(at)))
+    if cofactors.border.size and len(at):
+        shared = _in_datum(cofactors.border[np.ix_(at, at)][None], H[columns][None], F[:, columns][None], G)
+        rigs = J @ shared[0] @ J.T
     return Covariance(
         variance * points,
         variance * exterior,
         tuple(interior),
         variance * cofactors.limiting,
-        variance * mounts,
+        variance * rigs,
     )
 
 
@@ -169,8 +169,17 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
         without[rows] = without[:, rows] = np.nan
         without[rows, rows] = np.inf
         interior.append(without)
+    rigs = covariance.rigs.copy()
+    lost = np.flatnonzero(opened[layout.rig_terms(optimum.state)[0]] & rigs.any(axis=1))
+    rigs[lost] = rigs[:, lost] = np.nan
+    rigs[lost, lost] = np.inf
     return replace(
-        covariance, points=points, exterior=exterior, interior=tuple(interior), points_limiting=limiting
+        covariance,
+        points=points,
+        exterior=exterior,
+        interior=tuple(interior),
+        points_limiting=limiting,
+        rigs=rigs,
     )
 
 

@@ -155,13 +155,12 @@ class CorrelatedPart:
         columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
         T = exterior_jacobian(optimum.state.M) @ J
         exterior = D[columns[:, :, None], columns[:, None]]
-        columns, J = layout.mount_terms(optimum.state)
-        mounts = J @ D[columns[:, :, None], columns[:, None]] @ np.swapaxes(J, 1, 2)
+        columns, J = layout.rig_terms(optimum.state)
         return replace(
             covariance,
             points=covariance.points + variance * self.points,
             exterior=covariance.exterior + T @ exterior @ np.swapaxes(T, 1, 2),
-            mounts=covariance.mounts + mounts,
+            rigs=covariance.rigs + J @ D[np.ix_(columns, columns)] @ J.T,
             interior=tuple(
                 Q + D[np.ix_(own, own)]
                 for Q, own in zip(covariance.interior, layout.interior_column, strict=True)

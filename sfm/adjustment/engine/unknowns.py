@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sfm.adjustment.engine.collinearity import CAMERA_UNKNOWNS, Observations, State, behind_camera
 from sfm.adjustment.engine.ordering import by_point, whitening_of
@@ -112,21 +113,24 @@ class Unknowns:
         J[:, :, :6] *= self.pose_free[pose][:, None]
         return columns, J
 
-    def mount_terms(self, state: State) -> tuple[IntArray, FloatArray]:
-        """Return the unknowns of the mounts of rigs, and d (X, Y, Z, omega, phi, kappa) by them.
+    def rig_terms(self, state: State) -> tuple[IntArray, FloatArray]:
+        """Return the unknowns that photographs of rigs share, and d (what is stated of them) by them.
 
         Args:
             state: values of all unknowns.
 
         Returns:
-            Columns among the reduced unknowns, (a, 6), and derivatives, 0 where they are fixed, (a, 6, 6);
-            both empty without rigs.
+            Columns among the reduced unknowns, of the free interior parameters of all cameras and then of
+            all mounts, (s,), and the derivatives of these parameters and of X, Y, Z, omega, phi, kappa of
+            each mount, 0 where it is fixed, (s, s); both empty without rigs.
         """
         if not self.rigged:
-            return np.zeros((0, 6), dtype=np.int64), np.zeros((0, 6, 6))
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 0))
         free = self.mount_column >= 0
-        J = exterior_jacobian(state.camera_from_rig) * free[:, None]
-        return np.maximum(self.mount_column, 0), J
+        interior = np.concatenate(self.interior_column)
+        mounts = exterior_jacobian(state.camera_from_rig) * free[:, None]
+        columns = np.concatenate([interior, np.maximum(self.mount_column, 0).ravel()])
+        return columns.astype(np.int64), block_diag(np.eye(len(interior)), *mounts)
 
 
 def unknowns_of(

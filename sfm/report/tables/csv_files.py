@@ -18,6 +18,7 @@ from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
 from sfm.files.plain_text import BLOCK
 from sfm.files.ply import write_ply
+from sfm.files.rig_tables import write_rigs
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
@@ -53,6 +54,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
     ):
         rows, columns = np.triu_indices(covariance.shape[1])
         table.write(folder, names, covariance[:, rows, columns])
+    write_rigs(folder, result.solution)
     write_covariances(folder, result.solution, points=True)
     if BALANCED_MODEL in findings.interior.models:
         tables.CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))

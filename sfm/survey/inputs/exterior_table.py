@@ -98,7 +98,7 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
         columns,
         tuple(name for name in (*SIGMAS_OF_AXES, *ANGLES, *SIGMAS_OF_ANGLES) if name not in columns),
         aliases=aliases,
-        ignored=("camera", "points", "rms_px", "coverage"),
+        ignored=("camera", "rig", "points", "rms_px", "coverage"),
         blank=columns,
     )
     value, sigma = np.full((len(table.line), 6), np.nan), np.full((len(table.line), 6), np.nan)
