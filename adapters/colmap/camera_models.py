@@ -20,14 +20,14 @@ import numpy as np
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
+from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
 from sfm.conventions import BoolArray
-from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import MAX_NAME, is_name, shown
+from sfm.files.rig_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Mounts, Network
 
 
 def write_model(
@@ -124,8 +124,7 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
 
     Raises:
         SurveyFileError: no model in the folder, or one that cannot be read.
-        BackendError: pycolmap is missing, a camera model that Kolinear has no equal of, or photographs
-            in rigs of several cameras without an orientation of their own.
+        BackendError: pycolmap is missing, or a camera model that Kolinear has no equal of.
     """
     return named_network(folder, read_scene(folder, text=text))
 
@@ -156,26 +155,6 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
     return scene
 
 
-def rig_notes(folder: Path, *, text: bool) -> tuple[str, ...]:
-    """Return a line about the rigs of several cameras in a model, none where each photograph is alone.
-
-    `read_model` takes every photograph by itself, where the rig has it, and forgets what held them together.
-
-    Args:
-        folder: of the model.
-        text: whether its text files are read or the binary ones.
-    """
-    scene = read_scene(folder, text=text)
-    sizes = [rig.num_sensors() for rig in scene.rigs.values() if rig.num_sensors() > 1]
-    if not sizes:
-        return ()
-    images = sum(image.frame.rig.num_sensors() > 1 for image in scene.images.values())
-    return (
-        f"{counted(images, 'photograph')} of {counted(len(sizes), 'rig')} of up to {max(sizes)} cameras: "
-        "each is taken by itself where the rig has it, nothing holds them together",
-    )
-
-
 def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:
     """Return a scene as a network and its solution, with the names that lie beside it in its folder."""
     side = read_side_file(folder / SIDE_FILE)
@@ -197,7 +176,14 @@ def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:
         replace(camera, name=extra.name, pixel_mm=np.array(extra.pixel_mm), free=np.array(extra.free))
         for camera, extra in zip(estimate.cameras, side.cameras, strict=True)
     )
-    return network, replace(estimate, cameras=cameras)
+    mounts = estimate.mounts
+    if mounts is not None:
+        rig, free = list(mounts.rig), mounts.free.copy()
+        for a, extra in enumerate(side.cameras):
+            rig[a] = rig[a] and (extra.rig or rig[a])
+            free[a] &= free[a] if extra.mount_free is None else np.array(extra.mount_free)
+        mounts = replace(mounts, rig=tuple(rig), free=free)
+    return network, replace(estimate, cameras=cameras, mounts=mounts)
 
 
 def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Estimate]:
@@ -214,11 +200,13 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     Raises:
         BackendError: a camera model that Kolinear has no equal of.
         SurveyFileError: the name of a photograph has control or invisible characters or is that of another,
-            or an image point is of a point that is missing.
+            an image point is of a point that is missing, the pose of a camera in its rig is not known, or a
+            frame has two photographs of one camera.
     """
     side = side or Names()
     camera_ids = sorted(scene.cameras)
     cameras = tuple(as_opencv(camera_of(scene.camera(i))) for i in camera_ids)
+    mounts = _mounts_of(scene, camera_ids)
     image_ids = sorted(scene.images)
     images = [scene.image(i) for i in image_ids]
     point_ids = sorted(scene.point3D_ids())
@@ -266,4 +254,47 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
         ),
     )
     points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
-    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points)
+    if mounts is not None:
+        frames = [
+            (image.frame_id,) if mounts.rig[a] else ("", i)
+            for i, (image, a) in enumerate(zip(images, network.camera, strict=True))
+        ]
+        number = {frame: t for t, frame in enumerate(dict.fromkeys(frames))}
+        moment = np.array([number[frame] for frame in frames], dtype=np.int64)
+        refuse_moments("frames", [camera.name for camera in cameras], network, mounts, moment)
+        network = replace(network, moment=moment)
+    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points, mounts)
+
+
+def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
+    """Return the mounts of the cameras of a scene; None where each is alone.
+
+    The reference is that of COLMAP, or the first camera of a rig whose reference is none.
+
+    Raises:
+        SurveyFileError: the pose of a camera in its rig is not known.
+    """
+    pycolmap = load_pycolmap()
+    count, index = len(camera_ids), {number: a for a, number in enumerate(camera_ids)}
+    position, rotation = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+    free, names = np.zeros((count, 6), dtype=bool), [""] * count
+    for number, rig in sorted(scene.rigs.items()):
+        at_rig = rig.ref_sensor_id
+        poses = {at_rig.id: pycolmap.Rigid3d()} if at_rig.type == pycolmap.SensorType.CAMERA else {}
+        for sensor, pose in sorted(rig.non_ref_sensors.items(), key=lambda one: one[0].id):
+            if sensor.type == pycolmap.SensorType.CAMERA:
+                poses[sensor.id] = pose
+        if len(poses) < 2:
+            continue
+        for camera, pose in poses.items():
+            if camera not in index or names[index[camera]]:
+                raise SurveyFileError(f"rig {number}: camera {camera} is not in the model, or on another rig")
+            if pose is None:
+                raise SurveyFileError(f"rig {number}: the pose of camera {camera} in it is not known")
+            names[index[camera]] = f"rig {number}"
+        reference, *others = poses
+        for camera in others:
+            a = index[camera]
+            position[a], rotation[a] = mount_of(poses[camera] * poses[reference].inverse())
+            free[a] = True
+    return Mounts(position, rotation, free, tuple(names)) if any(names) else None

@@ -23,6 +23,8 @@ class NamedCamera(Content):
     pixel_mm: tuple[Pixel, Pixel]  # width and height of a pixel, mm
     free: tuple[bool, ...]  # to be adjusted, of each parameter
     size_px: tuple[Side, Side] | None = None  # width and height of its photographs, px
+    rig: Name | None = None  # what its rig is called
+    mount_free: tuple[bool, bool, bool, bool, bool, bool] | None = None  # which of X, Y, Z, rotations
 
 
 class Names(Content):
@@ -46,6 +48,7 @@ def read_side_file(path: Path) -> Names:
 
 def write_side_file(path: Path, network: Network, estimate: Estimate) -> None:
     """Write what COLMAP cannot hold."""
+    mounts = estimate.mounts
     side = {
         "cameras": [
             {
@@ -54,7 +57,12 @@ def write_side_file(path: Path, network: Network, estimate: Estimate) -> None:
                 "pixel_mm": [float(side) for side in camera.pixel_mm],
                 "free": camera.free.tolist(),
             }
-            for camera in estimate.cameras
+            | (
+                {"rig": mounts.rig[a], "mount_free": mounts.free[a].tolist()}
+                if mounts is not None and mounts.rig[a]
+                else {}
+            )
+            for a, camera in enumerate(estimate.cameras)
         ],
         "images": {str(i + 1): name for i, name in enumerate(network.images)},
         "points": {str(j + 1): name for j, name in enumerate(network.points)},

@@ -41,7 +41,7 @@ def reconstruction(
 ) -> Any:
     """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
     scene = pycolmap.Reconstruction()
-    rigged = _add_cameras(pycolmap, scene, estimate)
+    rigged = _add_cameras(pycolmap, scene, estimate, None if network.moment is None else estimate.mounts)
     frames: dict[int, Any] = {}
     seen = network.image_points
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
@@ -76,9 +76,10 @@ def reconstruction(
     return scene
 
 
-def _add_cameras(pycolmap: ModuleType, scene: Any, estimate: Estimate) -> dict[int, tuple[int, Any]]:
+def _add_cameras(
+    pycolmap: ModuleType, scene: Any, estimate: Estimate, mounts: Mounts | None
+) -> dict[int, tuple[int, Any]]:
     """Add cameras and rigs to a scene; the rig of each camera in one, and the camera from the rig."""
-    mounts = estimate.mounts
     names = ("",) * len(estimate.cameras) if mounts is None else mounts.rig
     found: dict[int, tuple[int, Any]] = {}
     for k, camera in enumerate(estimate.cameras):
@@ -205,11 +206,15 @@ def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
     position, rotation = start.position.copy(), start.rotation.copy()
     for rig in scene.rigs.values():
         for sensor, from_rig in rig.non_ref_sensors.items():
-            pose = from_rig.matrix()
-            R = AXES @ pose[:, :3] @ AXES
-            rotation[sensor.id - 1] = R.T
-            position[sensor.id - 1] = -R.T @ AXES @ pose[:, 3]
+            position[sensor.id - 1], rotation[sensor.id - 1] = mount_of(from_rig)
     return replace(start, position=position, rotation=rotation)
+
+
+def mount_of(camera_from_rig: Any) -> tuple[FloatArray, FloatArray]:
+    """Return position (3,) and rotation (3, 3) of a mount from COLMAP's pose of a camera in its rig."""
+    pose = camera_from_rig.matrix()
+    R = AXES @ pose[:, :3].T @ AXES
+    return -R @ AXES @ pose[:, 3], R
 
 
 def residuals_of(scene: Any, network: Network) -> FloatArray:

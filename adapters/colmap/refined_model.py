@@ -56,6 +56,7 @@ def open_model(folder: Path) -> OpenModel:
     """
     scene = read_scene(folder)
     network, estimate = named_network(folder, scene)
+    network, estimate = replace(network, moment=None), replace(estimate, mounts=None)  # see _adjust_rigs
     camera_ids, image_ids = sorted(scene.cameras), sorted(scene.images)
     same = [camera_of(scene.camera(i)) for i in camera_ids]
     cameras = tuple(

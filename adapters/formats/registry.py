@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap.camera_models import read_model, rig_notes, write_model
+from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.colmap.names import SIDE_FILE
 from adapters.colmap.reconstruction import COLMAP_NAMES
@@ -72,7 +72,6 @@ class FileFormat:
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
     read_all: Callable[..., Content] | None = None  # of a format that holds more than `read` returns
     write_all: Callable[[Path, Content], None] | None = None  # likewise of `write`
-    notes: Callable[[Path], tuple[str, ...]] | None = None  # on what `read` does not return
     control: bool = False  # whether `read_all` takes a file of control, as keyword
 
     def held(self, content: Content) -> frozenset[str]:
@@ -129,19 +128,17 @@ _BROWN_DISTORTION = MODELS["brown"].names[3:]
 NUMBERS = (False, False)
 _SOLVED = frozenset({"exterior orientations", "object points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
-_SIDE = _NAMED | {"free"}  # beside a model of COLMAP
+_SIDE = _NAMED | {"free", "rigs", "moments"}  # beside a model of COLMAP
 FORMATS = (
     FileFormat(
         *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False), _SIDE),
         folder=True,
         placed=True,
-        notes=partial(rig_notes, text=False),
     ),
     FileFormat(
         *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True), _SIDE),
         folder=True,
         placed=True,
-        notes=partial(rig_notes, text=True),
     ),
     FileFormat(
         "colmap-database",
@@ -294,14 +291,12 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         return form.read_all(path, control=control) if form.control else form.read_all(path)
     assert form.read is not None
     network, estimate = form.read(path)
-    notes = () if form.notes is None else form.notes(path)
     points_named = _names_points(form, path)
     if not points_named:
         uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
         network = replace(network, points=uncoded)
     return Content(
-        Solution(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1]),
-        notes=notes,
+        Solution(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1])
     )
 
 

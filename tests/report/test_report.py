@@ -545,6 +545,8 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
         "log.jsonl",
         "point_covariance_points.csv",
         "cameras_balanced.csv",
+        "mounts.csv",
+        "moments.csv",
     }
     assert len(list((out / "overlays").iterdir())) == 8
     assert [path.name for path in out.parent.iterdir()] == ["out"]
