@@ -37,6 +37,7 @@ from adapters.formats.photomodeler import read_export, write_export
 from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
+from adapters.formats.rig_files import write_rig_files
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
@@ -195,6 +196,11 @@ FORMATS = (
         folder=True,
         straight=_OPENCV_DISTORTION,
         names=NUMBERS,
+    ),
+    FileFormat(
+        *("rig", ("opencv",), None, None, frozenset({"rigs"})),
+        folder=True,
+        write_all=write_rig_files,
     ),
     FileFormat(
         "ply",
@@ -412,6 +418,9 @@ def written(name: str, network: Network, estimate: Estimate) -> str:
     form = format_named(name)
     if not form.models:
         return counted(int(estimate.determined.sum()), "point")
+    if name == "rig":
+        rigs = [rig for rig in (estimate.mounts.rig if estimate.mounts is not None else ()) if rig]
+        return f"{counted(len(rigs), 'camera')} of {counted(len(set(rigs)), 'rig')}"
     image_points = counted(len(network.image_points), "image point")
     if name == "colmap-database":
         return f"{counted(len(network.images), 'photograph')}, {image_points}, no coordinates of points"

@@ -23,9 +23,9 @@ from tests.synthetic import make_network, seed_of
 def solved() -> Solution:
     """Two cameras on a rig, free interior orientation, one photograph without partner."""
     network, truth = make_rig(seed_of("rig tables"), moments=6, points=25, free=("c", "K1"))
-    k = network.image_points
+    assert network.moment is not None
     moment = np.where(np.arange(12) == 5, 6, network.moment)
-    network = replace(network, image_points=k, moment=moment)
+    network = replace(network, moment=moment)
     assert truth.mounts is not None
     found: Solution = adjust(network, truth, reject="none").solution
     return found

@@ -129,7 +129,8 @@ def convert(
     """Convert a survey from one program's format to another's.
 
     A camera is converted where the format lacks its model. Formats: colmap, colmap-text, colmap-database,
-    tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp and ply.
+    tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig (calibration files of rigs
+    for OpenCV, COLMAP, Kalibr, ROS and mrcal) and ply.
     """
     with loading():
         from adapters.formats.content import with_cameras

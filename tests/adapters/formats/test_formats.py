@@ -29,7 +29,6 @@ from adapters.formats.registry import (
     format_of,
     read_any,
     read_comparable,
-    read_content,
     write_any,
     written,
 )
@@ -656,45 +655,3 @@ def test_matlab_files_have_the_names_of_the_thesis_or_are_named(tmp_path: Path) 
         for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt"):
             assert name in str(told.value)
         (tmp_path / "m" / "utara1_6.txt").unlink(missing_ok=True)
-
-
-def test_a_model_with_rigs_says_that_nothing_holds_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    network, truth = make_network(seed_of("rigs"), images=4, points=20, model="opencv", cameras=2)
-    write_any(tmp_path / "plain", "colmap", network, truth)
-    assert read_content(tmp_path / "plain").notes == ()
-    plain = pycolmap.Reconstruction(str(tmp_path / "plain"))
-    scene = pycolmap.Reconstruction()
-    for camera in plain.cameras.values():
-        scene.add_camera(camera)
-    poses = [plain.image(i + 1).cam_from_world() for i in range(4)]
-    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=k) for k in (1, 2)]
-    rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(sensors[0])
-    rig.add_sensor(sensors[1], poses[1] * poses[0].inverse())
-    scene.add_rig(rig)
-    for f in range(2):
-        frame = pycolmap.Frame(frame_id=f + 1, rig_id=1)
-        for sensor, i in zip(sensors, (2 * f, 2 * f + 1), strict=True):
-            frame.add_data_id(pycolmap.data_t(sensor_id=sensor, id=i + 1))
-        frame.rig_from_world = poses[2 * f]
-        scene.add_frame(frame)
-    for i in range(4):
-        image = plain.image(i + 1)
-        points = [(p.x(), p.y()) for p in image.points2D]
-        one = pycolmap.Image(
-            name=image.name, keypoints=np.array(points), camera_id=image.camera_id, image_id=i + 1
-        )
-        one.frame_id = i // 2 + 1
-        scene.add_image(one)
-    for number in (1, 2):
-        scene.register_frame(number)
-    (tmp_path / "rigs").mkdir()
-    scene.write(str(tmp_path / "rigs"))
-    content = read_content(tmp_path / "rigs")
-    (note,) = content.notes
-    assert [int(word) for word in note.split() if word.isdecimal()] == [4, 1, 2]
-    expected = -poses[1].rotation.matrix().T @ poses[1].translation
-    np.testing.assert_allclose(content.result.estimate.position[1], expected)

@@ -21,9 +21,11 @@ from adapters.formats.result_tables import read_result, write_tables
 from adapters.reading import text_lines as lines
 from adapters.reading.text_lines import Lines
 from adapters.reading.xml_lines import read_xml
+from sfm.comparison.camera_conversion import convert_cameras
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.solution import Solution
+from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
 HUGE_BYTES = 10_000_000_000
@@ -187,8 +189,11 @@ def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> N
         plain = plain.with_parameters(plain.parameters[[1, 1, 2, 3, 4, 5, 6, 7]])
     network = replace(network, images=tuple(f"p{i}.jpg" for i in range(6)))
     estimate = replace(truth, cameras=(plain,))
+    if name == "rig":
+        network, estimate = make_rig(seed_of("full"), moments=3, points=12)
+        estimate = convert_cameras(estimate, ("opencv",))[0]
     with (
-        full_disk(8192),
+        full_disk(256 if name == "rig" else 8192),
         pytest.raises(OutputError, match=r"out.*: .*cannot be written: File too large$"),
     ):
         write_any(tmp_path / "out", name, network, estimate)

@@ -1,0 +1,252 @@
+"""Calibrated rigs as other programs read them: a folder with files of each.
+
+    opencv-LEFT-RIGHT.yml        of each camera with the reference of its rig, for cv2.FileStorage: width,
+                                 height (px), K1, D1, K2, D2, R, T, E, F, rectification R1, R2, P1, P2, Q
+    rig_config.json              COLMAP's rig configuration, of all rigs
+    kalibr-RIG.yaml              camera chain of Kalibr
+    ros-CAMERA.yaml              camera_info of ROS; of a rig of two cameras with rectification
+    mrcal-CAMERA.cameramodel     of mrcal
+
+Camera axes are x right, y down, z forward, pixels count from the centre of the top-left one (COLMAP: from its
+corner). Lengths are in the unit of the result; in metres, where it is known, for Kalibr, ROS and mrcal.
+
+Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
+documentation, "Rigs and Frames"; Kalibr wiki, "YAML formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal
+2.5, "The .cameramodel file format".
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from adapters.colmap.reconstruction import AXES, COLMAP_NAMES, colmap_parameters
+from adapters.formats.content import Content
+from adapters.formats.stereo_rectification import rectify
+from sfm.camera import Camera
+from sfm.conventions import METRES, FloatArray, skew
+from sfm.errors import OutputError
+from sfm.network import Mounts, Network
+
+
+@dataclass(frozen=True)
+class _Mounted:
+    """A camera of a rig: x = R x_reference + T in axes x right, y down, z forward."""
+
+    camera: Camera
+    R: FloatArray  # (3, 3)
+    T: FloatArray  # (3,)
+
+    @property
+    def pose(self) -> FloatArray:
+        """The same as one matrix, (4, 4)."""
+        return np.block([[self.R, self.T[:, None]], [np.array([[0.0, 0.0, 0.0, 1.0]])]])
+
+    def scaled(self, factor: float) -> _Mounted:
+        """Return the same with lengths in another unit."""
+        return _Mounted(self.camera, self.R, factor * self.T)
+
+
+def write_rig_files(folder: Path, content: Content) -> None:
+    """Write the rigs of a result, with cameras in model opencv, into a folder.
+
+    Raises:
+        OutputError: there are none, or two of their names make one name of a file.
+    """
+    result = content.result
+    network, mounts = result.network, result.estimate.mounts
+    if mounts is None or not any(mounts.rig):
+        raise OutputError(f"{folder}: the result has no rigs, which format rig is of; see [[rig]]")
+    unit, metres = result.unit or "unknown units", METRES.get(result.unit)
+    in_metres = "m" if metres else unit
+    configs, files = [], {}
+
+    def add(name: str, text: str) -> None:
+        path = re.sub(r"[^\w.\-]+", "_", name)
+        if path in files:
+            raise OutputError(f"{folder}: two files would be {path}; rename cameras or rigs")
+        files[path] = text
+
+    for rig in dict.fromkeys(filter(None, mounts.rig)):
+        on = [a for a, one in enumerate(mounts.rig) if one == rig]
+        cameras = [_mounted(result.estimate.cameras[a], mounts, a) for a in on]
+        reference = next(
+            k for k, a in enumerate(on) if not (mounts.free[a].any() or mounts.position[a].any())
+        )
+        order = [reference, *(k for k in range(len(on)) if k != reference)]
+        on, cameras = [on[k] for k in order], [cameras[k] for k in order]
+        if len(on) < 2:
+            raise OutputError(f"{folder}: rig {rig} has one camera, needed 2 at least")
+        configs.append(_colmap(cameras, _prefixes(network, on, [one.camera.name for one in cameras])))
+        for one in cameras[1:]:
+            name = f"opencv-{cameras[0].camera.name}-{one.camera.name}.yml"
+            add(name, "\n".join(_opencv(cameras[0].camera, one, unit)) + "\n")
+        scaled = [one.scaled(metres or 1.0) for one in cameras]
+        add(f"kalibr-{rig}.yaml", "\n".join(_kalibr(scaled, in_metres)) + "\n")
+        for k, one in enumerate(scaled):
+            add(f"ros-{one.camera.name}.yaml", "\n".join(_ros(scaled, k, in_metres)) + "\n")
+            add(f"mrcal-{one.camera.name}.cameramodel", "\n".join(_mrcal(one, in_metres)) + "\n")
+    add("rig_config.json", json.dumps(configs, indent=1) + "\n")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8", newline="")
+    except OSError as error:
+        raise OutputError(f"{folder}: the files of the rig cannot be written: {error.strerror}") from error
+
+
+def _mounted(camera: Camera, mounts: Mounts, a: int) -> _Mounted:
+    R = AXES @ mounts.rotation[a].T @ AXES
+    return _Mounted(camera, R, -R @ AXES @ mounts.position[a])
+
+
+def _matrix(camera: Camera) -> FloatArray:
+    """Return K of a camera, (3, 3)."""
+    fx, fy, cx, cy = (camera.value(name) for name in ("fx", "fy", "cx", "cy"))
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _distortion(camera: Camera) -> list[float]:
+    return [camera.value(name) for name in ("k1", "k2", "p1", "p2")]
+
+
+def _numbers(values: FloatArray | Sequence[float]) -> str:
+    """Return numbers with all digits, and a point in each: 1e-5 is a word in YAML 1.1."""
+    texts = [repr(float(value)) for value in np.ravel(values)]
+    return ", ".join(text if "." in text else text.replace("e", ".0e") for text in texts)
+
+
+def _opencv(first: Camera, one: _Mounted, unit: str) -> Iterator[str]:
+    """Yield the lines of a pair of cameras."""
+    R, T, second = one.R, one.T, one.camera
+    K1, K2 = _matrix(first), _matrix(second)
+    E = skew(T) @ R
+    F = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
+    matrices = {"K1": K1, "D1": np.array([[*_distortion(first), 0.0]])}
+    matrices |= {"K2": K2, "D2": np.array([[*_distortion(second), 0.0]])}
+    matrices |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
+    rectified = rectify(first, second, R, T)
+    yield from ("%YAML:1.0", "---", f"# T is in {unit}: x2 = R x1 + T")
+    yield f"camera1: {json.dumps(first.name, ensure_ascii=False)}"
+    yield f"camera2: {json.dumps(second.name, ensure_ascii=False)}"
+    yield from (f"width: {first.size_px[0]}", f"height: {first.size_px[1]}")
+    if rectified is None:
+        yield "# no rectification: the cameras look in too different directions for a common image plane"
+    else:
+        matrices |= rectified._asdict()
+    for name, M in matrices.items():
+        yield f"{name}: !!opencv-matrix"
+        yield from (f"   rows: {M.shape[0]}", f"   cols: {M.shape[1]}", "   dt: d")
+        yield f"   data: [ {_numbers(M)} ]"
+
+
+def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """Return a rig as COLMAP's configuration has it."""
+    entries: list[dict[str, Any]] = []
+    for k, (one, prefix) in enumerate(zip(cameras, prefixes, strict=True)):
+        entry: dict[str, Any] = {"image_prefix": prefix}
+        if k == 0:
+            entry["ref_sensor"] = True
+        else:
+            quaternion = Rotation.from_matrix(one.R).as_quat(scalar_first=True)
+            entry |= {
+                "cam_from_rig_rotation": quaternion.tolist(),
+                "cam_from_rig_translation": one.T.tolist(),
+            }
+        entry["camera_model_name"] = COLMAP_NAMES[one.camera.model]
+        entry["camera_params"] = colmap_parameters(one.camera).tolist()
+        entries.append(entry)
+    return {"cameras": entries}
+
+
+def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
+    """Return how the names of the photographs of each camera begin, before what those of a moment share.
+
+    Where names do not begin so, the photographs are expected in folders named like the cameras.
+    """
+    folders = [f"{name}/" for name in names]
+    if network.moment is None:
+        return folders
+    moments: dict[int, dict[int, str]] = defaultdict(dict)
+    for name, t, a in zip(network.images, network.moment.tolist(), network.camera.tolist(), strict=True):
+        if a in on:
+            moments[t][a] = name
+    found: dict[int, set[str]] = {a: set() for a in on}
+    for together in moments.values():
+        if len(together) > 1:
+            same = zip(*(name[::-1] for name in together.values()), strict=False)
+            end = "".join(c[0] for c in takewhile(lambda c: len(set(c)) == 1, same))[::-1]
+            end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # after the word that it begins in
+            for a, name in together.items():
+                found[a].add(name.removesuffix(end))
+    if any(len(own) != 1 for own in found.values()):
+        return folders
+    prefixes = [next(iter(found[a])) for a in on]
+    mixed = any(
+        one.startswith(other) for k, one in enumerate(prefixes) for other in prefixes[:k] + prefixes[k + 1 :]
+    )
+    return folders if mixed else prefixes
+
+
+def _kalibr(cameras: list[_Mounted], unit: str) -> Iterator[str]:
+    """Yield the lines of a camera chain, each camera after the one before."""
+    yield f"# translations are in {unit}"
+    for k, one in enumerate(cameras):
+        camera, K = one.camera, _matrix(one.camera)
+        yield f"cam{k}:  # {json.dumps(camera.name)}"
+        if k:
+            yield "  T_cn_cnm1:"
+            pose = one.pose @ np.linalg.inv(cameras[k - 1].pose)
+            yield from (f"  - [{_numbers(row)}]" for row in pose)
+        yield f"  cam_overlaps: [{', '.join(str(o) for o in range(len(cameras)) if o != k)}]"
+        yield "  camera_model: pinhole"
+        yield f"  distortion_coeffs: [{_numbers(_distortion(camera))}]"
+        yield "  distortion_model: radtan"
+        yield f"  intrinsics: [{_numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])}]"
+        yield f"  resolution: [{camera.size_px[0]}, {camera.size_px[1]}]"
+        yield f"  rostopic: /cam{k}/image_raw"
+
+
+def _ros(cameras: list[_Mounted], k: int, unit: str) -> Iterator[str]:
+    """Yield the lines of the camera_info of a camera; rectified where the rig is a stereo pair."""
+    camera, K = cameras[k].camera, _matrix(cameras[k].camera)
+    R, P = np.eye(3), np.hstack([K, np.zeros((3, 1))])
+    pair = (
+        rectify(cameras[0].camera, cameras[1].camera, cameras[1].R, cameras[1].T)
+        if len(cameras) == 2
+        else None
+    )
+    if pair is not None:
+        R, P = (pair.R1, pair.P1) if k == 0 else (pair.R2, pair.P2)
+    yield f"# fourth column of projection_matrix: px times {unit}"
+    yield from (f"image_width: {camera.size_px[0]}", f"image_height: {camera.size_px[1]}")
+    yield f"camera_name: {json.dumps(camera.name)}"
+    yield "distortion_model: plumb_bob"
+    for name, M in (
+        ("camera_matrix", K),
+        ("distortion_coefficients", np.array([[*_distortion(camera), 0.0]])),
+        ("rectification_matrix", R),
+        ("projection_matrix", P),
+    ):
+        yield f"{name}:"
+        yield from (f"  rows: {M.shape[0]}", f"  cols: {M.shape[1]}", f"  data: [{_numbers(M)}]")
+
+
+def _mrcal(one: _Mounted, unit: str) -> Iterator[str]:
+    """Yield the lines of a camera model; the reference coordinates are those of the reference camera."""
+    K, pose = _matrix(one.camera), _numbers([*Rotation.from_matrix(one.R).as_rotvec(), *one.T])
+    intrinsics = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_distortion(one.camera)])
+    yield f"# {json.dumps(one.camera.name)}, translations are in {unit}"
+    yield from ("{", "    'lensmodel':  'LENSMODEL_OPENCV4',", f"    'intrinsics': [ {intrinsics} ],")
+    yield f"    'rt_cam_ref': [ {pose} ],"
+    yield f"    'extrinsics': [ {pose} ],  # the same for mrcal before 2.5"
+    yield from (f"    'imagersize': [ {one.camera.size_px[0]}, {one.camera.size_px[1]} ],", "}")
