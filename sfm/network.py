@@ -294,6 +294,19 @@ class Mounts:
     free: BoolArray  # which of X, Y, Z and small rotations about the image axes are adjusted, (a, 6)
     rig: tuple[str, ...]  # name of the rig of each camera; "" of those without, (a,)
 
+    @property
+    def at_reference(self) -> BoolArray:
+        """Which cameras are held fixed at 0, as the reference of a rig is and those without are, (a,)."""
+        return np.asarray(~self.free.any(axis=1) & ~self.position.any(axis=1))
+
+    def by_rig(self) -> dict[str, list[int]]:
+        """Return the cameras of each rig, its reference first."""
+        found: dict[str, list[int]] = {}
+        for a in np.argsort(~self.at_reference, kind="stable").tolist():
+            if self.rig[a]:
+                found.setdefault(self.rig[a], []).append(a)
+        return dict(sorted(found.items(), key=lambda one: self.rig.index(one[0])))
+
 
 @dataclass(frozen=True, repr=False)
 class Estimate:

@@ -89,15 +89,13 @@ def _add_cameras(
             scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
     if mounts is None:
         return found
-    for number, name in enumerate(dict.fromkeys(filter(None, names))):
+    for number, on in enumerate(mounts.by_rig().values()):
         rig = pycolmap.Rig(rig_id=len(names) + number + 1)
-        on = [k for k, one in enumerate(names) if one == name]
-        reference = next(k for k in on if not mounts.position[k].any() and not mounts.free[k].any())
-        for k in (reference, *(k for k in on if k != reference)):
+        for k in on:
             R = AXES @ mounts.rotation[k].T
             from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[k])
             sensor = sensor_of(pycolmap, k)
-            if k == reference:
+            if k == on[0]:
                 rig.add_ref_sensor(sensor)
             else:
                 rig.add_sensor(sensor, from_rig)

@@ -76,14 +76,8 @@ def write_rig_files(folder: Path, content: Content) -> None:
             raise OutputError(f"{folder}: two files would be {path}; rename cameras or rigs")
         files[path] = text
 
-    for rig in dict.fromkeys(filter(None, mounts.rig)):
-        on = [a for a, one in enumerate(mounts.rig) if one == rig]
+    for rig, on in mounts.by_rig().items():
         cameras = [_mounted(result.estimate.cameras[a], mounts, a) for a in on]
-        reference = next(
-            k for k, a in enumerate(on) if not (mounts.free[a].any() or mounts.position[a].any())
-        )
-        order = [reference, *(k for k in range(len(on)) if k != reference)]
-        on, cameras = [on[k] for k in order], [cameras[k] for k in order]
         if len(on) < 2:
             raise OutputError(f"{folder}: rig {rig} has one camera, needed 2 at least")
         configs.append(_colmap(cameras, _prefixes(network, on, [one.camera.name for one in cameras])))

@@ -1,6 +1,6 @@
 """The survey file of a converted network: its tables adjusted again as they are, with its control.
 
-    survey.toml     unit, cameras, image points, approximate values, scale bars, datum
+    survey.toml     unit, cameras, rigs, image points, approximate values, scale bars, datum
     control.csv     control and check points, see `known_points`
     exterior.csv    image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg
 
@@ -19,8 +19,9 @@ import numpy as np
 from adapters.formats.content import Content
 from adapters.formats.known_points import CONTROL, write_known_points
 from sfm.camera import Camera
-from sfm.conventions import METRES
+from sfm.conventions import METRES, angles_from_rotation
 from sfm.files.plain_text import csv_text
+from sfm.files.rig_tables import MOMENTS
 from sfm.network import Estimate, Network
 
 MIN_CONTROL = 3  # points that fix position, attitude and scale
@@ -45,6 +46,7 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
     lines = ["[survey]", f"name = {_text(title)}", unit, ""]
     for camera, images, own in _families(network, estimate):
         lines += [*_camera(camera, images, _weighted(network, estimate, camera), own), ""]
+    lines += _rigs(folder, network, estimate)
     lines += ["[observations]", 'file = "image_points.csv"', ""]
     lines += [
         "[approximate]",
@@ -69,6 +71,29 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
     kind = result.datum or ("control" if len(control.complete) >= MIN_CONTROL else "free")
     lines += ["[datum]", f'kind = "{kind}"']
     (folder / "survey.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _rigs(folder: Path, network: Network, estimate: Estimate) -> list[str]:
+    """Return the sections of rigs; writes the mounts that are held fixed. Moments are in moments.csv."""
+    mounts, lines = estimate.mounts, list[str]()
+    if mounts is None or network.moment is None:
+        return []
+    for number, (rig, cameras) in enumerate(mounts.by_rig().items(), 1):
+        on = [a for a in cameras if (network.camera == a).any()]
+        if len(on) < 2 or on[0] != cameras[0]:
+            continue  # photographs of one camera are single ones
+        names = [estimate.cameras[a].name for a in on]
+        lines += ["[[rig]]", f"name = {_text(rig)}", f"cameras = [{', '.join(map(_text, names))}]"]
+        lines.append(f'moment = "{MOMENTS}"')
+        held = [a for a in on[1:] if not mounts.free[a].any()]
+        if held:
+            angles = np.degrees(angles_from_rotation(mounts.rotation))
+            rows = [(estimate.cameras[a].name, *mounts.position[a], *angles[a], *[0.0] * 6) for a in held]
+            text = csv_text(("camera", *EXTERIOR[1:], *EXTERIOR_SIGMAS), rows)
+            (folder / f"held_mounts_{number}.csv").write_text(text, encoding="utf-8", newline="")
+            lines.append(f'mounts = "held_mounts_{number}.csv"')
+        lines.append("")
+    return lines
 
 
 def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, list[str], tuple[str, ...]]]:

@@ -11,7 +11,7 @@ Source: RFC 4180 for CSV.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -85,24 +85,31 @@ def read_rigs(
         a = cameras.index(name)
         position[a], rotation[a] = values[k, :3], rotation_from_angles(*np.radians(values[k, 3:]))
         free[a], rigs[a] = sigma[k] != 0, rig
-    references = {rigs[a] for a in np.flatnonzero(~free.any(axis=1) & ~position.any(axis=1))}
+    mounts = Mounts(position, rotation, free, tuple(rigs))
+    references = {rigs[a] for a in np.flatnonzero(mounts.at_reference)}
     for rig in dict.fromkeys(table.texts[1]):
         if not rig or rigs.count(rig) < 2:
             raise SurveyFileError(f"{path}: rig '{rig}' has one camera, needed a name and at least 2 cameras")
         if rig not in references:
             raise SurveyFileError(f"{path}: rig '{rig}' has no reference camera, all values and sigmas 0")
-    mounts = Mounts(position, rotation, free, tuple(rigs))
     return mounts, _read_moments(folder / MOMENTS, cameras, network, mounts)
+
+
+def read_moments(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield photographs and their moments from a table image,moment.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, or a photograph comes twice.
+    """
+    table = read_table(path, ("image", "moment"), (), ignored=None)
+    return zip(table.keys("image"), table.texts[1], strict=True)
 
 
 def _read_moments(path: Path, cameras: Sequence[str], network: Network, mounts: Mounts) -> IntArray:
     """Return the moment of each photograph, (m,)."""
-    table = read_table(path, ("image", "moment"), (), ignored=None)
-    known = set(network.images)
-    for k, name in enumerate(table.texts[0]):
-        if name not in known:
-            raise SurveyFileError(f"{table.place(k)}: image '{name}' is not in images.csv")
-    of = dict(zip(table.keys("image"), table.texts[1], strict=True))
+    of = dict(read_moments(path))
+    for name in of.keys() - set(network.images):
+        raise SurveyFileError(f"{path}: image '{name}' is not in images.csv")
     for name, a in zip(network.images, network.camera, strict=True):
         if mounts.rig[a] and name not in of:
             raise SurveyFileError(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -50,7 +50,7 @@ def with_survey_data(survey: Survey, network: Network) -> Network:
     for rig in survey.rigs:
         where = f"{survey.source}: rig {rig.name}"
         of_rig = [number[name] for name in rig.cameras]
-        moment = _moments(rig, network.images, network.camera, of_rig, where)
+        moment = _moments(rig, network.images, network.camera, of_rig, survey.moments, where)
         first: dict[tuple[object, int], str] = {}
         cameras = defaultdict(set)
         for i, when in moment.items():
@@ -113,10 +113,20 @@ def _given_mounts(survey: Survey) -> MountObservations:
 
 
 def _moments(
-    rig: RigSettings, images: Sequence[str], camera: IntArray, of_rig: list[int], where: str
+    rig: RigSettings,
+    images: Sequence[str],
+    camera: IntArray,
+    of_rig: list[int],
+    named: Mapping[str, str],
+    where: str,
 ) -> dict[int, object]:
     """Return the moment of each photograph of a rig, by its index."""
     own = [i for i in range(len(images)) if camera[i] in of_rig]
+    if rig.table is not None:
+        for i in own:
+            if images[i] not in named:
+                raise SurveyFileError(f"{where}: {rig.table} has no moment of photograph '{images[i]}'")
+        return {i: named[images[i]] for i in own}
     if rig.moment == "order":
         counts = {a: int((camera == a).sum()) for a in of_rig}
         if len(set(counts.values())) > 1:

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.formats.content import KINDS
+from adapters.formats.content import KINDS, Content
 from adapters.formats.registry import read_content, write_content
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.solve import adjust
 from sfm.errors import SurveyFileError
 from sfm.files.rig_tables import write_rigs
+from sfm.pipeline import run_survey
 from sfm.solution import Solution
+from sfm.survey.inputs.survey import read_survey
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
@@ -94,7 +96,7 @@ def test_single_photographs_have_no_rig_tables(tmp_path: Path) -> None:
             "",
             "photograph moment 2 camera 1 of camera camera 1 is missing",
         ),
-        ("moments.csv", "moment 2 camera 1", "x", "moments.csv, line 4: image 'x' is not in images.csv"),
+        ("moments.csv", "moment 2 camera 1", "x", "moments.csv: image 'x' is not in images.csv"),
     ],
 )
 def test_damaged_rig_tables_are_refused(
@@ -117,3 +119,25 @@ def test_covariance_of_other_rigs_is_refused(solved: Solution, tmp_path: Path) -
     np.savez(path, **(found | {"rigs": found["rigs"][1:, 1:]}))
     with pytest.raises(SurveyFileError, match="covariances of other photographs or cameras"):
         read_result(tmp_path / "t")
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_tables_with_rigs_are_a_survey_with_rigs(held: bool, tmp_path: Path) -> None:
+    """Adjusted as they are: the same redundancy, and mounts free or held as they were."""
+    network, truth = make_rig(seed_of("rig survey"), cameras=3, moments=6, points=20)
+    assert truth.mounts is not None
+    free = truth.mounts.free.copy()
+    free[2] = not held
+    truth = replace(truth, mounts=replace(truth.mounts, free=free))
+    write_content(tmp_path / "t", "tables", Content(Solution("t", network, truth, unit="m", datum="free")))
+    a = run_survey(read_survey(tmp_path / "t" / "survey.toml")).adjustment
+    b = adjust(network, truth, reject="none")
+    assert a.estimate.mounts is not None and truth.mounts is not None and a.redundancy == b.redundancy
+    assert a.unknown_counts == b.unknown_counts
+    assert (a.estimate.mounts.free == free).all()
+    if held:
+        np.testing.assert_allclose(a.estimate.mounts.position[2], truth.mounts.position[2], atol=1e-12)
+    text = (tmp_path / "t" / "moments.csv").read_text("utf-8")
+    (tmp_path / "t" / "moments.csv").write_text(text.replace("moment 3 camera 2,", "other,"), "utf-8")
+    with pytest.raises(SurveyFileError, match="has no moment of photograph 'moment 3 camera 2'"):
+        run_survey(read_survey(tmp_path / "t" / "survey.toml"))

@@ -50,13 +50,10 @@ def rigs_of(a: Adjustment) -> tuple[Rig, ...]:
     mounts, moment = a.estimate.mounts, a.network.moment
     if mounts is None or moment is None:
         return ()
-    names = np.array(mounts.rig)
     found = []
-    for rig in dict.fromkeys(filter(None, mounts.rig)):
-        on = np.flatnonzero(names == rig)
-        reference = int(on[~mounts.free[on].any(axis=1) & ~mounts.position[on].any(axis=1)][0])
-        of_rig = np.isin(a.network.camera, on)
-        others = tuple(_mount(a, int(k)) for k in on if k != reference)
+    for rig, (reference, *others_on) in mounts.by_rig().items():
+        of_rig = np.isin(a.network.camera, [reference, *others_on])
+        others = tuple(_mount(a, k) for k in others_on)
         shared = int((np.bincount(moment[of_rig]) > 1).sum())
         found.append(Rig(rig, a.estimate.cameras[reference].name, others, shared))
     return tuple(found)

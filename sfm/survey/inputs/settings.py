@@ -202,12 +202,17 @@ class RigSettings(Section):
 
     name: Name  # what people call the rig; unique in the survey
     cameras: Names  # names of its cameras; the first is the reference
-    # "order": the photographs of each camera in the order of their names; else a regular expression with one
-    # group, which is the moment, searched for in the names of photographs
+    # "order": the photographs of each camera in the order of their names; a table image,moment (.csv); else a
+    # regular expression with one group, which is the moment, searched for in the names of photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
     # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
     # the reference camera; sigma 0 = held fixed
     mounts: Name | None = None
+
+    @property
+    def table(self) -> str | None:
+        """The table that names the moments, if one does."""
+        return self.moment if self.moment.endswith(".csv") and "(" not in self.moment else None
 
 
 class ControlSettings(Section):

@@ -15,6 +15,7 @@ from sfm.arguments import checked_arguments
 from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
+from sfm.files.rig_tables import read_moments
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
@@ -109,6 +110,7 @@ class Survey:
     exif_sigma_m: tuple[float, float] | None = None  # in its place positions in EXIF data, see [exterior]
     rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
     mounts: tuple[ObservedExterior, ...] = ()  # of cameras of rigs, by their names, as far as they are given
+    moments: Mapping[str, str] = field(default_factory=dict)  # of photographs, where tables name them
     scale_bars: tuple[ScaleBar, ...] = ()
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     observations: Observations | None = None  # measured image points in place of photographs
@@ -262,6 +264,11 @@ def survey_of_file(file: SurveyFile) -> Survey:
             for rig in file.rigs
             if rig.mounts is not None
         ),
+        moments={
+            image: moment
+            for name in dict.fromkeys(rig.table for rig in file.rigs if rig.table is not None)
+            for image, moment in read_moments(file.beside(name))
+        },
         tables=tuple(
             read_observation_table(one.kind, file.beside(one.file), file.source)
             for one in file.observation_tables

@@ -133,7 +133,7 @@ class SurveyFile(Section):
             self.targets.codes if is_table(self.targets.codes) else None,
             self.targets.diameters,
         ]
-        names += [rig.mounts for rig in self.rigs]
+        names += [name for rig in self.rigs for name in (rig.mounts, rig.table)]
         names += [table.file for table in self.observation_tables]
         for camera in self.cameras:
             if camera.calibration is not None:

@@ -341,7 +341,7 @@ def _refuse_contradictions_of_rigs(
                     f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
                 )
             owner[name] = rig.name
-        if rig.moment != "order":
+        if rig.moment != "order" and rig.table is None:
             _refuse_pattern(rig.moment, here)
     for camera in cameras if rigs else ():
         if camera.per_photograph or camera.groups:
