@@ -40,9 +40,12 @@ class Similarity:
     def apply_estimate(self, estimate: Estimate) -> Estimate:
         """Return the estimate with points, positions, rotations and mounts in the target frame."""
         mounts = estimate.mounts
+        if mounts is not None:  # those held fixed keep the lengths they were given
+            scale = np.where(mounts.free[:, :3].any(axis=1, keepdims=True), self.scale, 1.0)
+            mounts = replace(mounts, position=scale * mounts.position)
         return replace(
             estimate,
-            mounts=None if mounts is None else replace(mounts, position=self.scale * mounts.position),
+            mounts=mounts,
             position=self.apply(estimate.position),
             rotation=self.rotation @ estimate.rotation,
             points=self.apply(estimate.points),

@@ -198,7 +198,8 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     rows = [
         ("observations", f"{counts.total}: {counted(counts.image, 'image coordinate')}, "
         f"{counts.control} of control, "
-         f"{counted(counts.scale_bars, 'scale bar')}; {counted(counts.constraints, 'constraint')}, "
+         f"{counted(counts.scale_bars, 'scale bar')}, {counts.further} further; "
+         f"{counted(counts.constraints, 'constraint')}, "
          f"{counted(a.unknowns, 'unknown')}"),
         *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
+SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of own parameters below which one is open
+
+
 class Fit(NamedTuple):
     """A group at some values of its points, its own parameters fitted."""
 
@@ -76,13 +79,13 @@ class Group(TableKind):
         Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
         HW = H.T * self.weights
         flat = Jx.reshape(d, -1)
-        Jx = (flat - H @ (np.linalg.pinv(HW @ H, hermitian=True) @ (HW @ flat))).reshape(Jx.shape)
+        Jx = (flat - H @ (_inverse(HW @ H) @ (HW @ flat))).reshape(Jx.shape)
         return Linear(fit.difference.reshape(1, d), tuple(Jx[None, :, k] for k in range(Jx.shape[1])))
 
     def own_cofactor(self, values: Values) -> FloatArray:
         """Return H (H'W H)^-1 H', what the own parameters take of the redundancy, (1, r c, r c)."""
         H = self.fit(values.points[self.point]).H.reshape(self.sigma.size, -1)
-        inverse = np.linalg.pinv(H.T @ (self.weights[:, None] * H), hermitian=True)
+        inverse = _inverse(H.T @ (self.weights[:, None] * H))
         return np.asarray(H @ inverse @ H.T)[None]
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
@@ -140,3 +143,12 @@ class Group(TableKind):
     def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
         """Groups are made one by one, see `of_group`."""
         raise NotImplementedError
+
+
+def _inverse(N: FloatArray) -> FloatArray:
+    """Return the inverse of the normal equations of own parameters over those that are determined, (h, h)."""
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(N), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(N * scale[:, None] * scale)
+    on = values > SINGULAR
+    half = scale[:, None] * vectors[:, on] / np.sqrt(values[on])
+    return np.asarray(half @ half.T)

@@ -10,6 +10,8 @@ from sfm.conventions import FloatArray
 from sfm.observations.groups import Fit, Group
 from sfm.observations.kind import Values
 
+ROUNDS = 20  # of the plane, which offsets shift and turn; each leaves a fraction of the last
+
 
 class Planes(Group):
     """Distances of points from a plane of their own."""
@@ -29,17 +31,24 @@ class Planes(Group):
 
     def fit(self, X: FloatArray) -> Fit:
         """Return n (X - c) - offset of the best plane; H by its height and two tilts."""
-        w = self.weights
-        normal = _normal(X, w)
-        for _ in range(2):  # offsets shift the plane of least squares a little
-            c = ((X - self.value * normal) * w[:, None]).sum(axis=0) / w.sum()
-            normal = _normal(X - self.value * normal, w, near=normal)
+        w, start = self.weights, _normal(X, self.weights)
+        sides = [self._side(X, start), self._side(X, -start)]  # which one offsets are counted to is not known
+        misfit = [float(w @ ((X - c) @ normal - self.value[:, 0]) ** 2) for normal, c in sides]
+        normal, c = sides[int(np.argmin(misfit))]
         away = X - c
         u = np.linalg.svd(normal[None])[2][1:]
         H = np.stack([-np.ones(len(X)), *(away @ axis for axis in u)], axis=1)[:, None]
         Jx = np.zeros((len(X), 1, len(X), 3))
         Jx[np.arange(len(X)), 0, np.arange(len(X))] = normal
         return Fit((away @ normal)[:, None] - self.value, Jx, H)
+
+    def _side(self, X: FloatArray, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the normal of the best plane on a side, and a point on it."""
+        w = self.weights
+        for _ in range(ROUNDS):
+            shifted = X - self.value * normal
+            normal = _normal(shifted, w, near=normal)
+        return normal, ((X - self.value * normal) * w[:, None]).sum(axis=0) / w.sum()
 
 
 def _normal(X: FloatArray, w: FloatArray, near: FloatArray | None = None) -> FloatArray:

@@ -24,23 +24,27 @@ class RigidFrames(Group):
         R, t = _motion(self.value, X, W.mean(axis=1))
         for _ in range(5):  # to the weights of single coordinates
             local = (X - t) @ R
-            H = self._by_motion(local)
+            H = self._by_motion()
             root = np.sqrt(W)
             rows, l = root.reshape(-1, 1) * H.reshape(-1, 6), (root * (local - self.value)).ravel()
             step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-12)[0], dtype=float)
-            t = t + R @ step[:3]
-            R = R @ rotation_from_vector(step[3:])
+            centre = self.value.mean(axis=0)
+            turned = R @ rotation_from_vector(step[3:])
+            t = t + R @ step[:3] + (R - turned) @ centre
+            R = turned
         local = (X - t) @ R
         Jx = np.zeros((len(X), 3, len(X), 3))
         Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
-        return Fit(local - self.value, Jx, self._by_motion(local))
+        return Fit(local - self.value, Jx, self._by_motion())
 
-    @staticmethod
-    def _by_motion(local: FloatArray) -> FloatArray:
-        """Return the derivatives of R'(X - t) by a shift and a turn in the system of the frame, (p, 3, 6)."""
-        H = np.zeros((len(local), 3, 6))
+    def _by_motion(self) -> FloatArray:
+        """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).
+
+        They are those of the coordinates given: of points on a line a turn about it changes nothing.
+        """
+        H = np.zeros((len(self.value), 3, 6))
         H[:, :, :3] = -np.eye(3)
-        H[:, :, 3:] = skew(local)
+        H[:, :, 3:] = skew(self.value - self.value.mean(axis=0))
         return H
 
 

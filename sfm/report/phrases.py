@@ -181,6 +181,7 @@ def words_left_out(findings: Findings) -> str:
                 (counts.exterior, "observed exterior orientation parameter"),
                 (counts.interior, "observed interior orientation parameter"),
                 (counts.scale_bars, "scale bar"),
+                (counts.further, "further observation"),
             )
             if number
         ),

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sfm.adjustment.result import Adjustment, ObservedResiduals
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
+from sfm.distributions import normal_ppf
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, read_table
-from sfm.network import Network
+from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
-from sfm.observations.kind import TableKind
+from sfm.observations.kind import Kind, TableKind
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.inputs.given import ScaleBar
 
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
+
+
+DISTANCE = "distance"
+ALARM = 0.001  # probability with which right observations of tables lose one
+MIN_REDUNDANCY = 0.01  # of an observation that is tested: others hardly check one below
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,9 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
-    if len(of.texts) > 1:
+    if issubclass(of, Group):  # a point counts once in a group; a station has one set of directions
+        table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), of.texts)
+    elif len(of.texts) > 1:
         for row, names in enumerate(zip(*table.texts, strict=True)):
             if len(set(names)) < len(names):
                 raise SurveyFileError(
@@ -72,6 +82,18 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     value = table.values[:, :-d].copy()
     value[:, len(of.numbers) :] *= unit
     return ObservationTable(kind, value, unit * sigma, table)
+
+
+def bars_of(table: ObservationTable) -> list[ScaleBar]:
+    """Return the distances of a table as scale bars, which they are; none of other kinds."""
+    if table.kind != DISTANCE:
+        return []
+    return [
+        ScaleBar(start, end, float(length), float(sigma))
+        for (start, end), (length,), (sigma,) in zip(
+            zip(*table.table.texts, strict=True), table.value, table.sigma, strict=True
+        )
+    ]
 
 
 def with_tables(survey: Survey, network: Network) -> Network:
@@ -114,6 +136,12 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
         for one in survey.tables
         for row in np.flatnonzero(~np.logical_and.reduce(_known(one, network)))
     ]
+    for one in survey.tables:
+        if issubclass(one.of, Group):
+            there = {kind.group for kind in network.observations if isinstance(kind, one.of) and len(kind)}
+            unused += [
+                f"{one.kind} {name}" for name in dict.fromkeys(one.table.texts[0]) if name not in there
+            ]
     return (remark("observations_unused", observations=unused),) if unused else ()
 
 
@@ -127,3 +155,54 @@ def _known(one: ObservationTable, network: Network) -> list[BoolArray]:
     names = set(_names(one, network))
     columns = one.table.texts[1:] if one.of.texts[0] == "group" else one.table.texts
     return [np.array([name in names for name in column], dtype=bool) for column in columns]
+
+
+def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> tuple[str, ...]:
+    """Return the observations of tables that contradict all others, as `name_of_observation` names them.
+
+    Image points are not tested here: one wrong observation would have right ones rejected, which are weaker.
+    The observation with the largest w leaves first, as long as more of its kind stay.
+
+    Args:
+        network: image points that are accepted, and observations.
+        adjust_with: adjusts a network without rejecting anything.
+    """
+    out: list[str] = []
+    while network.observations:
+        a = adjust_with(network)
+        first = len(network.kinds) - len(network.observations)
+        tests = [(w, one, row) for one in a.observed if one.index >= first for w, row in _largest(one)]
+        w, one, row = max(tests, key=lambda test: test[0], default=(0.0, None, 0))
+        count = sum(one.count for one in a.observed if one.index >= first)
+        if one is None or not w > -normal_ppf(ALARM / (2 * count)):
+            break
+        kind = network.kinds[one.index]
+        same = sum(len(other) for other in network.observations if type(other) is type(kind))
+        if same < 3:
+            break  # of two nothing shows which one is wrong; the remark on residuals names the larger one
+        at = int(one.rows[row])
+        out.append(name_of_observation(kind, at, network, a.estimate))
+        others = list(network.observations)
+        others[one.index - first] = kind.select(np.delete(np.arange(len(kind)), at))
+        network = replace(network, observations=tuple(other for other in others if len(other)))
+    return tuple(out)
+
+
+def _largest(one: ObservedResiduals) -> list[tuple[float, int]]:
+    """Return the largest |w| of each observation that is checked, and its row."""
+    w = np.where(one.redundancy_numbers > MIN_REDUNDANCY, np.abs(one.standardised), np.nan)
+    return [(float(np.nanmax(own)), row) for row, own in enumerate(w) if np.isfinite(own).any()]
+
+
+def name_of_observation(kind: Kind, row: int, network: Network, estimate: Estimate) -> str:
+    """Return "height difference 12 - 15"."""
+    return f"{kind.single} {kind.names(network, estimate)[row]}"
+
+
+def without_observations(network: Network, estimate: Estimate, names: tuple[str, ...]) -> Network:
+    """Return the network without some observations, by their names."""
+    kept = []
+    for kind in network.observations:
+        on = [name_of_observation(kind, row, network, estimate) not in names for row in range(len(kind))]
+        kept.append(kind.select(np.array(on, dtype=bool)))
+    return replace(network, observations=tuple(kind for kind in kept if len(kind)))

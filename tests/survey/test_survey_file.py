@@ -407,7 +407,7 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
     missing = [
         (one.kind, *one.names("points"), *one.names("bars"))
-        for one in datum_remarks(read_survey(path), network, "control")
+        for one in datum_remarks(read_survey(path), network, has_scale=True)
     ]
     assert missing == [("control_missing", "elsewhere"), ("scale_bars_missing", "a - lost")]
     assert estimate.oriented.tolist() == [False, True]

@@ -152,11 +152,12 @@ def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
     Z, known = a.estimate.points[:, 2], truth.points[order, 2]
     assert Z - Z.mean() == pytest.approx(known - known.mean(), abs=1e-3)
     found = findings_of(result)
-    (said,) = [one for one in found.verdict.remarks if one.kind == "observations_unused"]
-    assert said.names("observations") == ("distance 1 - elsewhere",)
+    (said,) = [one for one in found.verdict.remarks if one.kind == "scale_bars_missing"]
+    assert said.names("bars") == ("1 - elsewhere",)
+    assert len(a.network.scale_bars) == 12
     write_result(found, tmp_path / "out")
     stored = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["further_observations"]
-    assert {name: len(values) for name, values in stored.items()} == {"height difference": 12, "distance": 12}
+    assert {name: len(values) for name, values in stored.items()} == {"height difference": 12}
 
 
 def test_start_values_in_any_attitude_come_to_the_observations() -> None:
@@ -183,3 +184,52 @@ def test_wrong_tables_are_refused(text: str, said: str, tmp_path: Path) -> None:
     lines = '[[survey_observations]]\nkind = "distance"\nfile = "tape.csv"\n'
     with pytest.raises(SurveyFileError, match=said):
         read_survey(written(tmp_path, network, truth, lines))
+
+
+def test_a_wrong_antenna_position_leaves_and_its_photograph_stays(tmp_path: Path) -> None:
+    """1 m off, of eight; and a group of too few points is named."""
+    network, truth = network_of("gross", ("antenna position",))
+    (one,) = network.observations
+    value, sigma = one.position.copy(), one.sigma  # type: ignore[attr-defined]
+    value[3, 0] += 1.0
+    cells = [
+        ",".join(map(repr, [network.images[i], *lever, *X, *s])).replace("'", "")
+        for i, lever, X, s in zip(one.image, one.lever.tolist(), value.tolist(), sigma.tolist(), strict=True)  # type: ignore[attr-defined]
+    ]
+    of = TABLES["antenna position"]
+    (tmp_path / "gnss.csv").write_text("\n".join([",".join((*of.texts, *of.columns())), *cells]), "utf-8")
+    (tmp_path / "plane.csv").write_text("group,point,offset,soffset\nwall,1,0,1e-4\nwall,2,0,1e-4\n", "utf-8")
+    lines = "".join(
+        f'[[survey_observations]]\nkind = "{kind}"\nfile = "{file}"\n\n'
+        for kind, file in (("antenna position", "gnss.csv"), ("plane", "plane.csv"))
+    )
+    result = run_survey(read_survey(written(tmp_path, network, truth, lines + '[adjust]\nreject = "tau"\n')))
+    assert len(result.adjustment.network.images) == 8
+    remarks = {said.kind: said for said in findings_of(result).verdict.remarks}
+    assert remarks["observations_wrong"].names("observations") == (f"antenna position {network.images[3]}",)
+    assert remarks["observations_unused"].names("observations") == ("plane wall",)
+
+
+def test_planes_are_met_on_either_side_of_large_offsets() -> None:
+    rng = seed_of("sides")
+    for size in (1e-3, 2e-2, 0.4):
+        for _ in range(20):
+            X = np.hstack([rng.uniform(-1, 1, (9, 2)), np.zeros((9, 1))])
+            offset = rng.uniform(-size, size, (9, 1))
+            X[:, 2:] = offset
+            R = np.linalg.qr(rng.normal(0, 1, (3, 3)))[0]
+            plane = TABLES["plane"]("p", np.arange(9), offset, np.full((9, 1), 1e-4))  # type: ignore[call-arg]
+            assert plane.fit(X @ R.T).difference == pytest.approx(0.0, abs=1e-9)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("line", "own"), [(False, 6), (True, 5)])
+def test_frames_have_as_many_parameters_wherever_they_are(line: bool, own: int) -> None:
+    """A bar has five, and coordinates of its system may be large."""
+    rng = seed_of("frame")
+    for away in (0.0, 1e4, 5e6):
+        local = rng.uniform(-0.5, 0.5, (5, 3)) * ([1, 0, 0] if line else [1, 1, 1])
+        X = local @ np.linalg.qr(rng.normal(0, 1, (3, 3)))[0].T + 1e-4 * rng.standard_normal((5, 3))
+        frame = RigidFrames("bar", np.arange(5), local + away, np.full((5, 3), 1e-4))
+        H = frame.fit(X).H.reshape(15, 6)
+        assert np.linalg.matrix_rank(H, tol=1e-6) == own
+        assert np.abs(frame.fit(X).difference).max() < 1e-3

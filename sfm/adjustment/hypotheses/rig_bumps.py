@@ -98,9 +98,12 @@ def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
     found = find_bumps(a)
     if not found:
         return ()
+    cameras = {one.camera for one in found}
+    theirs = [k for k, camera in enumerate(a.estimate.cameras) if camera.name in cameras]
+    most = 2 * len(found) >= int(np.isin(a.network.camera, theirs).sum())
     return (
         remark(
-            "rig_bumped",
+            "rig_contradicted" if most else "rig_bumped",
             photographs=[one.photograph for one in found],
             cameras=list(dict.fromkeys(one.camera for one in found)),
             distance=(max(one.shift for one in found), unit),

@@ -16,10 +16,18 @@ PULLED = (
 
 ROWS = (
     Kind(
+        "observations_wrong",
+        "warning",
+        "{observations:survey observation} contradicted all others and took no part: {observations}.",
+        "a misread or mistyped value, another point, or a standard deviation that is too small",
+        "Correct {observations:this value|these values}, or state a larger standard deviation.",
+    ),
+    Kind(
         "observations_unused",
         "warning",
         "{observations:survey observation} took no part: {observations}.",
-        "their points or photographs are not in the result",
+        "their points or photographs are not in the result, or too few of a group are: a plane needs 4 "
+        "points, a line 3, a station 2 targets",
         "Correct the names, or look among the points that were left out.",
     ),
     Kind(

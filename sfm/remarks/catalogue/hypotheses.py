@@ -116,6 +116,17 @@ ROWS = (
         short="a camera that moved on its rig",
     ),
     Kind(
+        "rig_contradicted",
+        "error",
+        "Most photographs of {cameras} contradict the rig, by up to {distance} and {angle}, {shift} standard "
+        "deviations: {photographs}.",
+        "a wrong mount was given, the camera moved to another place during the survey, or the cameras were "
+        "not triggered together",
+        "Check the mounts that were given; give the photographs from each place of the camera a camera and "
+        "a rig of their own.",
+        short="a camera that is not where its rig has it",
+    ),
+    Kind(
         "points_moved",
         SHIFT,  # a few points leave the RMS of all small
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."

@@ -30,6 +30,7 @@ class ObservationCounts:
     exterior: int  # observed parameters of exterior orientation
     interior: int  # observed parameters of interior orientation
     scale_bars: int
+    further: int  # of other kinds, less parameters of their own
     constraints: int  # of the datum
     total: int  # without the constraints
 
@@ -147,13 +148,16 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     exterior = int(is_observed(_variances(network.exterior.covariance)).sum())
     sigma = network.interior.sigma
     interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
-    bars = adjustment.observations - image - control - exterior - interior
+    first = len(network.kinds) - len(network.observations)
+    further = sum(one.count for one in adjustment.observed if one.index >= first)
+    bars = adjustment.observations - image - control - exterior - interior - further
     return ObservationCounts(
         image,
         control,
         exterior,
         interior,
         bars,
+        further,
         adjustment.redundancy - adjustment.observations + adjustment.unknowns,
         adjustment.observations,
     )

@@ -9,7 +9,7 @@ Source: Baarda (1968), A testing procedure for use in geodetic networks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class GivenValue:
     sigma: float  # given standard deviation; 0 where fixed
     r: float  # redundancy number; NaN where fixed
     w: float  # NaN where not checked
+
+    def named(self, coordinates: tuple[str, ...]) -> GivenValue:
+        """Return it with its coordinate in its name, where there are several."""
+        return self if len(coordinates) == 1 else replace(self, name=f"{self.name} {self.coordinate}")
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,11 @@ class Given:
         tables = (ObjectPoints.single, CENTRE, ROTATION)
         shown = [kind for kind in self.kinds if kind.kind not in tables]
         short = {InteriorObservations.single: "interior"}
-        return tuple((short.get(kind.kind, kind.kind), one) for kind in shown for one in kind.values)
+        return tuple(
+            (short.get(kind.kind, kind.kind), one.named(kind.coordinates))
+            for kind in shown
+            for one in kind.values
+        )
 
     @property
     def exterior(self) -> tuple[GivenResiduals, ...]:

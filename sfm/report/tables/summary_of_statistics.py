@@ -38,7 +38,7 @@ def summary_of_statistics(findings: Findings) -> dict[str, Any]:
         "tau_test": _coordinate_test(found.tau, found.largest_tau),
         "observations": {
             "image_coordinates": counts.image,
-            **values_of(counts, "control exterior interior scale_bars constraints total"),
+            **values_of(counts, "control exterior interior scale_bars further constraints total"),
         },
         "redundancy_number": {
             "sum": or_none(found.redundancy_sum),

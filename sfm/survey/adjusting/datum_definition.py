@@ -34,7 +34,7 @@ def object_scale(network: Network, estimate: Estimate) -> float:
 
 def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
     """Bring a network that control does not hold to the length of its scale bars, else of its control."""
-    if datum.kind == "control":
+    if datum.kind == "control" or has_held_mounts(estimate):
         return estimate
     scale = object_scale(network, estimate)
     if not scale > 0:
@@ -45,9 +45,15 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
 
 def is_scaled(network: Network, estimate: Estimate) -> bool:
     """Return whether scale bars, other observations or mounts held fixed give a network its scale."""
+    return bool(len(network.scale_bars) or len(network.observations) or has_held_mounts(estimate))
+
+
+def has_held_mounts(estimate: Estimate) -> bool:
+    """Return whether the mount of a camera is held fixed, beside those of reference cameras."""
     mounts = estimate.mounts
-    held = mounts is not None and bool((mounts.position.any(axis=1) & ~mounts.free[:, :3].any(axis=1)).any())
-    return bool(len(network.scale_bars) or len(network.observations) or held)
+    if mounts is None:
+        return False
+    return bool((mounts.position.any(axis=1) & ~mounts.free[:, :3].any(axis=1)).any())
 
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
@@ -92,7 +98,7 @@ def place_on_frame(
         return estimate
 
 
-def datum_remarks(survey: Survey, network: Network, datum: str) -> tuple[Remark, ...]:
+def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
 
     Points of a plate may be out of view: nobody expects all of them in the result.
@@ -107,6 +113,6 @@ def datum_remarks(survey: Survey, network: Network, datum: str) -> tuple[Remark,
     bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
         remarks.append(remark("scale_bars_missing", bars=bars))
-    if datum != "control" and not len(network.scale_bars) and len(network.control) < 2:
+    if not has_scale:
         remarks.append(remark("scale_undefined", unit=survey.unit))
     return tuple(remarks)

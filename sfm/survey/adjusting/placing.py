@@ -17,6 +17,7 @@ from sfm.conventions import FloatArray, rotation_from_vector, skew
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, inverse_of_observed
 from sfm.similarity import Similarity
+from sfm.survey.adjusting.datum_definition import has_held_mounts
 
 ROUNDS = 20  # of Gauss-Newton from each attitude
 LARGEST_STEP = 0.5  # turn of one step, rad, and change of the scale
@@ -34,7 +35,9 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
         return estimate
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
-    tried = [_fitted(kinds, Similarity(1.0, R, np.zeros(3)).apply_estimate(start)) for R in _attitudes()]
+    scaled = not has_held_mounts(estimate)
+    turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in _attitudes()]
+    tried = [_fitted(kinds, one, scaled=scaled) for one in turned]
     return min(tried, key=lambda one: one[1])[0]
 
 
@@ -49,10 +52,11 @@ def _usable(kind: Kind, estimate: Estimate) -> Kind:
     return kind.select(on)
 
 
-def _fitted(kinds: list[Kind], estimate: Estimate) -> tuple[Estimate, float]:
-    """Return the estimate moved to least v'Pv of observations, and it."""
+def _fitted(kinds: list[Kind], estimate: Estimate, *, scaled: bool) -> tuple[Estimate, float]:
+    """Return the estimate moved, and scaled, to least v'Pv of observations, and it."""
     for _ in range(ROUNDS):
         rows, l = _rows(kinds, estimate)
+        rows[:, 6] *= scaled
         step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
         size = max(float(np.abs(step[3:]).max()), LARGEST_STEP) / LARGEST_STEP
         step /= size

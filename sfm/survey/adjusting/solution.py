@@ -69,7 +69,7 @@ from sfm.survey.inputs.settings import CameraSettings, DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
-from sfm.survey.observation_tables import unused_observations
+from sfm.survey.observation_tables import find_gross, unused_observations, without_observations
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
@@ -394,6 +394,7 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
         free = None  # what they give alone is no start either, nor are the cameras that it gave photographs
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate, ready, accepted = start.estimate, None, None
+    gross: tuple[Remark, ...] = ()
     iterations, treated = 0, None
     if free is not None:
         settled, iterations, treated = free.settled, free.iterations, free.treated
@@ -404,6 +405,8 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
         if task.datum.kind != "control" and not beside:
             ready = _with_given(settled, task.network)
     estimate = scale_to_bars(task.network, estimate, task.datum)
+    if task.network.observations and accepted is not None:
+        task, gross = _without_gross(task, settled, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
     if ready is None:
@@ -447,9 +450,24 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
         others,
         treated,
         given,
-        (*own, *given.remarks, *better, *held),
+        (*own, *given.remarks, *gross, *better, *held),
         c_held,
     )
+
+
+def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Task, tuple[Remark, ...]]:
+    """Return the task without observations of tables that contradict all others, by the settled network."""
+
+    def adjusted(part: Network) -> Adjustment:
+        datum = on_points(task.survey, part, start, task.datum)
+        return adjust(part, start, datum=datum, reject="none", image_sigma_factor=task.factor)
+
+    part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
+    gross = find_gross(part, adjusted)
+    if not gross:
+        return task, ()
+    network = without_observations(task.network, estimate, gross)
+    return replace(task, network=network), (remark("observations_wrong", observations=list(gross)),)
 
 
 def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
@@ -592,6 +610,6 @@ def _remarks(
         *([remark("datum_points_missing", points=absent)] if absent else []),
         *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
-        *datum_remarks(survey, adjustment.network, adjustment.datum),
+        *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
     )

@@ -56,7 +56,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
-from sfm.survey.observation_tables import ObservationTable, read_observation_table
+from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table
 from sfm.targets.codes.families import TargetFamily, code_family, is_table
 from sfm.targets.codes.rings import CodeFamily
 
@@ -142,7 +142,8 @@ class Survey:
             "unit": head.unit,
             "source": where,
             "cameras": cameras,
-            "scale_bars": tuple(self.scale_bars),
+            "scale_bars": (*self.scale_bars, *(bar for table in self.tables for bar in bars_of(table))),
+            "tables": tuple(table for table in self.tables if table.kind != DISTANCE),
             "folder": Path(self.folder),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
             "targets": _section(TargetSettings, self.targets, f"{where}: targets"),
