@@ -34,7 +34,7 @@ def write_rigs(folder: Path, solution: Solution) -> None:
     network, mounts = solution.network, solution.estimate.mounts
     if mounts is None or network.moment is None:
         return
-    values = IN_FILES * np.hstack([mounts.position, angles_from_rotation(mounts.rotation)])
+    values = IN_FILES * np.hstack([mounts.position, angles_from_rotation(mounts.rotation)]) + 0.0  # no -0
     Q = solution.mount_covariance
     sigma = (
         np.full_like(values, np.nan) if Q is None else IN_FILES * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
