@@ -2,6 +2,7 @@
 
     opencv-LEFT-RIGHT.yml        of each camera with the reference of its rig, for cv2.FileStorage: width,
                                  height (px), K1, D1, K2, D2, R, T, E, F, rectification R1, R2, P1, P2, Q
+    dice-LEFT-RIGHT.xml          the same pairs, camera system of DICe
     rig_config.json              COLMAP's rig configuration, of all rigs
     kalibr-RIG.yaml              camera chain of Kalibr
     ros-CAMERA.yaml              camera_info of ROS; of a rig of two cameras with rectification
@@ -11,8 +12,8 @@ Camera axes are x right, y down, z forward, pixels count from the centre of the 
 corner). Lengths are in the unit of the result; in metres, where it is known, for Kalibr, ROS and mrcal.
 
 Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
-documentation, "Rigs and Frames"; Kalibr wiki, "YAML formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal
-2.5, "The .cameramodel file format".
+documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; Kalibr wiki, "YAML
+formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal 2.5, "The .cameramodel file format".
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -82,8 +84,9 @@ def write_rig_files(folder: Path, content: Content) -> None:
             raise OutputError(f"{folder}: rig {rig} has one camera, needed 2 at least")
         configs.append(_colmap(cameras, _prefixes(network, on, [one.camera.name for one in cameras])))
         for one in cameras[1:]:
-            name = f"opencv-{cameras[0].camera.name}-{one.camera.name}.yml"
-            add(name, "\n".join(_opencv(cameras[0].camera, one, unit)) + "\n")
+            pair = f"{cameras[0].camera.name}-{one.camera.name}"
+            add(f"opencv-{pair}.yml", "\n".join(_opencv(cameras[0].camera, one, unit)) + "\n")
+            add(f"dice-{pair}.xml", "\n".join(_dice([cameras[0], one], unit)) + "\n")
         scaled = [one.scaled(metres or 1.0) for one in cameras]
         add(f"kalibr-{rig}.yaml", "\n".join(_kalibr(scaled, in_metres)) + "\n")
         for k, one in enumerate(scaled):
@@ -141,6 +144,33 @@ def _opencv(first: Camera, one: _Mounted, unit: str) -> Iterator[str]:
         yield f"{name}: !!opencv-matrix"
         yield from (f"   rows: {M.shape[0]}", f"   cols: {M.shape[1]}", "   dt: d")
         yield f"   data: [ {_numbers(M)} ]"
+
+
+def _dice(pair: list[_Mounted], unit: str) -> Iterator[str]:
+    """Yield the lines of a system of two cameras, the second after the first."""
+
+    def entry(name: str, kind: str, value: object) -> str:
+        return f'<Parameter name="{name}" type="{kind}" value={quoteattr(str(value))} />'
+
+    yield from ("<ParameterList>", f"  <!-- TX, TY, TZ are in {unit} -->")
+    yield "  " + entry("xml_file_format", "string", "DICe_xml_camera_system_file")
+    yield "  " + entry("system_type_3D", "string", "OPENCV")
+    yield "  " + entry("extrinsics_relative_camera_to_camera", "bool", "true")
+    for k, one in enumerate(pair):
+        K, size = _matrix(one.camera), one.camera.size_px
+        values = dict(zip(("CX", "CY", "FX", "FY"), (K[0, 2], K[1, 2], K[0, 0], K[1, 1]), strict=True))
+        values |= zip(("K1", "K2", "P1", "P2"), _distortion(one.camera), strict=True)
+        values |= zip(("TX", "TY", "TZ"), one.T.tolist(), strict=True)
+        yield f'  <ParameterList name="CAMERA {k}">'
+        yield "    " + entry("CAMERA_ID", "string", one.camera.name)
+        yield from ("    " + entry(name, "double", repr(float(value))) for name, value in values.items())
+        yield "    " + entry("LENS_DISTORTION_MODEL", "string", "OPENCV_LENS_DISTORTION")
+        yield "    " + entry("IMAGE_HEIGHT_WIDTH", "string", f"{{ {size[1]}, {size[0]} }}")
+        yield '    <ParameterList name="rotation_3x3_matrix">'
+        for r, row in enumerate(one.R):
+            yield "      " + entry(f"ROW {r}", "string", f"{{ {_numbers(row)} }}")
+        yield from ("    </ParameterList>", "  </ParameterList>")
+    yield "</ParameterList>"
 
 
 def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict[str, Any]]]:

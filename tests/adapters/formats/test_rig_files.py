@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -212,6 +213,33 @@ def test_ros_has_the_rectification_of_a_pair_in_metres(tmp_path: Path) -> None:
     assert yaml.safe_load(text)["rectification_matrix"]["data"] == np.eye(3).ravel().tolist()
 
 
+def test_dice_has_the_second_camera_after_the_first(tmp_path: Path) -> None:
+    network, truth = made()
+    cameras = (replace(truth.cameras[0], name='<"a&b">'), truth.cameras[1])
+    folder = written(tmp_path / "r", network, replace(truth, cameras=cameras))
+    root = ElementTree.fromstring((folder / "dice-_a_b_-camera_2.xml").read_text())
+    flags = {one.attrib["name"]: one.attrib["value"] for one in root.findall("Parameter")}
+    assert flags == {
+        "xml_file_format": "DICe_xml_camera_system_file",
+        "system_type_3D": "OPENCV",
+        "extrinsics_relative_camera_to_camera": "true",
+    }
+    pair = opencv(folder / "opencv-_a_b_-camera_2.yml")
+    for k, R, T in ((0, np.eye(3), np.zeros(3)), (1, pair["R"], pair["T"][:, 0])):
+        (camera,) = root.findall(f"ParameterList[@name='CAMERA {k}']")
+        value = {one.attrib["name"]: one.attrib["value"] for one in camera.findall("Parameter")}
+        assert value["CAMERA_ID"] == cameras[k].name and value["IMAGE_HEIGHT_WIDTH"] == "{ 1500, 2000 }"
+        own = [float(value[name]) for name in ("FX", "FY", "CX", "CY", "K1", "K2", "P1", "P2")]
+        np.testing.assert_array_equal(own, cameras[k].parameters)
+        np.testing.assert_array_equal([float(value[name]) for name in ("TX", "TY", "TZ")], T)
+        rows = [
+            one.attrib["value"].strip("{} ").split(", ")
+            for one in camera.iter()
+            if "ROW" in one.attrib["name"]
+        ]
+        np.testing.assert_array_equal(np.array(rows, dtype=float), R)
+
+
 def test_mrcal_models_are_of_the_reference_camera(tmp_path: Path) -> None:
     """A Python literal, as mrcal evaluates it."""
     network, truth = made()
@@ -231,7 +259,7 @@ def test_convert_writes_a_rig_of_a_result(tmp_path: Path, capsys: pytest.Capture
     convert(tmp_path / "t", tmp_path / "r", to_format="rig")
     told = capsys.readouterr().out
     assert "2 cameras of 1 rig as rig" in told and "to opencv, misfit" in told
-    assert len(list((tmp_path / "r").iterdir())) == 7
+    assert len(list((tmp_path / "r").iterdir())) == 8
     single = make_network(seed_of("convert single"), images=3, points=8)
     Solution("x", *single).write(tmp_path / "single")
     with pytest.raises(OutputError, match="the result has no rigs") as refused:
