@@ -119,3 +119,24 @@ def test_a_camera_without_pose_in_its_rig_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match=r"in: .*camera 2 in it is not known") as refused:
         read_model(tmp_path / "in")
     assert "\n" not in str(refused.value)
+
+
+def test_two_photographs_of_one_camera_in_a_frame_are_refused(tmp_path: Path) -> None:
+    """The second image of the first frame is said to be of camera 1, as the first one is."""
+    scene = synthesized()
+    (tmp_path / "in").mkdir()
+    scene.write_text(str(tmp_path / "in"))
+    path = tmp_path / "in" / "frames.txt"
+    *head, line = path.read_text().splitlines()
+    words = line.split()
+    assert words[9] == "2" and words[10:12] == ["CAMERA", "1"] and words[13:15] == ["CAMERA", "2"]
+    path.write_text("\n".join([*head, " ".join([*words[:14], "1", words[15]])]) + "\n")
+    images = (tmp_path / "in" / "images.txt").read_text().splitlines()
+    for k, row in enumerate(images):
+        cells = row.split()
+        if len(cells) == 10 and cells[0] == words[15] and cells[8] == "2":
+            images[k] = " ".join([*cells[:8], "1", cells[9]])
+    (tmp_path / "in" / "images.txt").write_text("\n".join(images) + "\n")
+    with pytest.raises(SurveyFileError, match="are of one moment; needed different") as refused:
+        read_model(tmp_path / "in")
+    assert "\n" not in str(refused.value)
