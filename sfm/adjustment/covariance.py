@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
 from sfm.adjustment.engine.cofactors import ZERO, Cofactors, cofactors, marginal_covariance, without_held
@@ -119,14 +120,18 @@ class Marginal:
             ]
         )
         half = H @ F
-        cofactor = cofactor - half - half.T + H @ Q.G @ H.T
+        cofactor -= half
+        cofactor -= half.T
+        del half  # of all coordinates by all, as is each term
+        cofactor += H @ Q.G @ H.T
         if self.correlated is not None:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
         fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= ZERO * limiting)  # by the datum
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
-        return np.asarray(self.adjustment.sigma0**2 * cofactor)
+        cofactor *= self.adjustment.sigma0**2
+        return np.asarray(cofactor)
 
 
 class JointOnDemand:
@@ -149,15 +154,16 @@ class JointOnDemand:
         with own_threads():
             m, p = self._marginal, 3 * len(points)
             some = np.asarray(images, dtype=np.int64)
-            columns, J = m.layout.photograph_terms(m.optimum.state, some)
+            columns, by = m.layout.photograph_terms(m.optimum.state, some)
             found = m.joint(columns.ravel(), np.asarray(points))
-        u, wide = columns.size, columns.shape[1]
-        T = np.zeros((p + 6 * len(some), u + p))
-        T[np.arange(p), u + np.arange(p)] = 1.0
-        turned = exterior_jacobian(m.optimum.state.M[some]) @ J
-        for k, own in enumerate(turned):
-            T[p + 6 * k : p + 6 * k + 6, wide * k : wide * k + wide] = own
-        return np.asarray(T @ found @ T.T)
+        u = columns.size
+        J = block_diag(np.zeros((0, 0)), *(exterior_jacobian(m.optimum.state.M[some]) @ by))
+        ordered = np.empty((p + len(J), p + len(J)))
+        ordered[:p, :p] = found[u:, u:]
+        ordered[p:, :p] = J @ found[:u, u:]
+        ordered[:p, p:] = ordered[p:, :p].T
+        ordered[p:, p:] = J @ found[:u, :u] @ J.T
+        return ordered
 
 
 @checked_arguments()

@@ -135,16 +135,18 @@ class CorrelatedPart:
         o, own = influence.linear.layout.observations, influence.linear.own
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
+        of_all = np.zeros((3 * p, C.shape[1]))
         for one in _photographs(o.image, o.xy, self.relative, self.correlation):
             rows = one.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
             columns, S = influence.scores_of(rows)
             O, at = own[rows[chosen]], place[o.point[rows[chosen]]]
-            half = (O.transpose(0, 2, 1) @ one.times(S, chosen) @ C[columns]).reshape(-1, C.shape[1])
-            lines = (u + 3 * at[:, None] + np.arange(3)).ravel()
-            added[lines] += half
-            added[:, lines] += half.T
-            added[np.ix_(lines, lines)] += one.between(O, chosen)
+            lines = (3 * at[:, None] + np.arange(3)).ravel()
+            KS = one.times(S, chosen)
+            of_all[lines] += (O.transpose(0, 2, 1) @ KS).reshape(len(lines), -1) @ C[columns]
+            added[np.ix_(u + lines, u + lines)] += one.between(O, chosen)
+        added[u:] += of_all
+        added[:, u:] += of_all.T
         return np.asarray(added)
 
     def added_to(self, covariance: Covariance, variance: float, optimum: Optimum) -> Covariance:
