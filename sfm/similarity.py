@@ -98,17 +98,46 @@ def fit_similarity(
         raise GeometryError(
             "similarity: weights that are negative, not finite or all 0, expected positive ones"
         )
-    w = w / w.sum()
-    centre_s, centre_t = w @ source, w @ target
-    s, t = source - centre_s, target - centre_t
-    spread = np.linalg.svd(s * np.sqrt(w)[:, None], compute_uv=False)
-    if spread[1] <= COLLINEAR * spread[0]:
+    (found,) = _fitted(source[None], target[None], w / w.sum(), scale)
+    if found is None:
         raise GeometryError("similarity: the common points lie on a line or coincide")
-    U, d, Vt = np.linalg.svd((t * w[:, None]).T @ s)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = (U * sign) @ Vt
-    fitted = float((d * sign).sum() / (w @ (s**2).sum(axis=1))) if scale is None else scale
-    return Similarity(fitted, R, centre_t - fitted * R @ centre_s)
+    return found
+
+
+def fit_similarities(source: FloatArray, target: FloatArray) -> list[Similarity | None]:
+    """Return the similarities of many sets of points at once, as `fit_similarity` does of one.
+
+    Args:
+        source: sets of n points each, 3 at least, shape (s, n, 3).
+        target: the same points in the target frame of each.
+
+    Returns:
+        None for a set whose points lie on a line, or are not finite.
+    """
+    known = np.isfinite(source + target).all(axis=(1, 2)).reshape(-1, 1, 1)
+    n = source.shape[1]
+    return _fitted(np.where(known, source, 0.0), np.where(known, target, 0.0), np.full(n, 1 / n), None)
+
+
+def _fitted(
+    source: FloatArray, target: FloatArray, w: FloatArray, scale: float | None
+) -> list[Similarity | None]:
+    """Return the similarities of sets of finite points, (s, n, 3), with weights whose sum is 1, (n,)."""
+    centre_s, centre_t = w @ source, w @ target
+    s, t = source - centre_s[:, None], target - centre_t[:, None]
+    spread = np.linalg.svd(s * np.sqrt(w)[:, None], compute_uv=False)
+    U, d, Vt = np.linalg.svd(np.swapaxes(t * w[:, None], 1, 2) @ s)
+    sign = np.ones_like(d)
+    sign[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    R = (U * sign[:, None]) @ Vt
+    found: list[Similarity | None] = []
+    for k, on_line in enumerate(spread[:, 1] <= COLLINEAR * spread[:, 0]):
+        if on_line:
+            found.append(None)
+            continue
+        factor = float((d[k] * sign[k]).sum() / (w @ (s[k] ** 2).sum(axis=1))) if scale is None else scale
+        found.append(Similarity(factor, R[k], centre_t[k] - factor * R[k] @ centre_s[k]))
+    return found
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

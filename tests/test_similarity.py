@@ -8,7 +8,7 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, fit_similarity
+from sfm.similarity import Similarity, fit_similarities, fit_similarity
 from tests.synthetic import make_network, seed_of
 
 TRUE = Similarity(2.5, rotation_from_angles(0.3, -1.1, 2.9), np.array([10.0, -4.0, 7.0]))
@@ -68,3 +68,16 @@ def test_a_transformed_network_takes_the_same_photographs() -> None:
 def test_too_little_is_refused(points: np.ndarray, message: str) -> None:
     with pytest.raises(GeometryError, match=message):
         fit_similarity(points, points)
+
+
+def test_many_sets_of_points_have_the_similarities_of_each() -> None:
+    rng = np.random.default_rng(8)
+    source, target = rng.standard_normal((2, 6, 4, 3))
+    source[2] = np.outer(np.arange(4.0), np.ones(3))  # on a line
+    target[4, 1, 0] = np.nan
+    found = fit_similarities(source, target)
+    assert [k for k, one in enumerate(found) if one is None] == [2, 4]
+    for k in (0, 1, 3, 5):
+        one, alone = found[k], fit_similarity(source[k], target[k])
+        assert one is not None
+        np.testing.assert_allclose(one.apply(source[k]), alone.apply(source[k]), atol=1e-12)

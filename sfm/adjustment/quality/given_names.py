@@ -13,8 +13,7 @@ from math import lgamma
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.similarity import Similarity, fit_similarity
+from sfm.similarity import Similarity, fit_similarities
 
 MIN_POINTS = 4  # three have a similar triangle by chance too easily: two degrees of freedom
 MAX_POINTS = 40  # 59,280 triangles with their orders; of more points those that disagree are assigned only
@@ -38,6 +37,7 @@ def assignments(
             three may agree by chance, so that it is not the only one that is tried.
     """
     from scipy.optimize import linear_sum_assignment  # takes half a second, which right surveys never need
+    from scipy.spatial.distance import cdist
 
     at = np.flatnonzero(np.isfinite(given).all(axis=1))
     if len(at) < MIN_POINTS:
@@ -47,16 +47,20 @@ def assignments(
     placings = [] if agreed is None else [agreed]
     if len(at) <= MAX_POINTS:
         placings += _placings(X, Y)
+    if not placings:
+        return
+    placed = np.concatenate([one.apply(X) for one in placings])
+    distance2 = cdist(placed, Y, "sqeuclidean").reshape(len(placings), len(X), len(Y))
+    scale2 = np.array([one.scale**2 for one in placings])[:, None, None]
+    expected = np.maximum(3 * (scale2 * of_x[:, None] + of_y), np.finfo(float).tiny)
+    misfit = 3 * np.log(np.maximum(distance2 / expected, 1.0))
     found: dict[tuple[int, ...], float] = {}
-    for one in placings:
-        distance2 = ((one.apply(X)[:, None] - Y[None]) ** 2).sum(axis=2)
-        expected = 3 * (one.scale**2 * of_x[:, None] + of_y)
-        misfit = 3 * np.log(np.maximum(distance2 / np.maximum(expected, np.finfo(float).tiny), 1.0))
-        other = linear_sum_assignment(misfit)[1]
+    for one in misfit:
+        other = linear_sum_assignment(one)[1]
         order = np.arange(len(free))
         order[at] = at[other]
         key = tuple(order.tolist())
-        cost = float(misfit[np.arange(len(at)), other].sum()) + cost_of_choice(key)
+        cost = float(one[np.arange(len(at)), other].sum()) + cost_of_choice(key)
         found[key] = min(cost, found.get(key, np.inf))
     found.pop(tuple(range(len(free))), None)
     yield from sorted(found, key=lambda one: found[one])[:MAX_ASSIGNMENTS]
@@ -85,11 +89,9 @@ def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
     for _ in range(TRIANGLES):
         some = rng.choice(n, 3, replace=False)
         apart = np.abs(shape - _shape(X[some])).sum(axis=1)
-        for k in np.argpartition(apart, min(MAX_SIMILAR, len(apart)) - 1)[:MAX_SIMILAR]:
-            try:
-                found.append(fit_similarity(X[some], Y[of_y[k]]))
-            except GeometryError:
-                continue
+        nearest = np.argpartition(apart, min(MAX_SIMILAR, len(apart)) - 1)[:MAX_SIMILAR]
+        fitted = fit_similarities(np.broadcast_to(X[some], (len(nearest), 3, 3)), Y[of_y[nearest]])
+        found += [one for one in fitted if one is not None]
     return found
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 from math import comb, log
 
@@ -27,7 +28,7 @@ from sfm.adjustment.quality.given_values import (
 )
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, extended_axes, fit_similarity, similarity_motions
+from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity, similarity_motions
 
 MAX_TRIPLES = (
     300  # similarities by three points that are tried: with half of them right, 37 are by three such
@@ -454,10 +455,9 @@ def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarit
     yield every
     best, least, h = None, np.inf, len(at) // 2 + 1
     if len(at) > 3:
-        for some in _triples(len(at)):
-            try:
-                one = fit_similarity(X[some], given[some])
-            except GeometryError:
+        triples = _triples(len(at), MAX_TRIPLES)
+        for one in fit_similarities(X[triples], given[triples]):
+            if one is None:
                 continue
             distance = float(np.partition(np.linalg.norm(one.apply(X) - given, axis=1), h - 1)[h - 1])
             if distance < least:
@@ -466,14 +466,13 @@ def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarit
         yield best
 
 
-def _triples(n: int) -> Iterator[list[int]]:
-    """Yield all threes of n points, or MAX_TRIPLES random ones where these are too many."""
-    if comb(n, 3) <= MAX_TRIPLES:
-        yield from map(list, combinations(range(n), 3))
-        return
+@lru_cache(maxsize=64)
+def _triples(n: int, most: int) -> IntArray:
+    """Return all threes of n points, or `most` random ones where these are more, (t, 3)."""
+    if comb(n, 3) <= most:
+        return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(n)
-    for _ in range(MAX_TRIPLES):
-        yield rng.choice(n, 3, replace=False).tolist()
+    return np.array([rng.choice(n, 3, replace=False) for _ in range(most)])
 
 
 @dataclass(frozen=True)
