@@ -67,7 +67,7 @@ class Kept:
         """
         rows = np.flatnonzero(self.model.item == one)
         s = self.model.size[rows]
-        d, U = np.linalg.eigh(self.precision[np.ix_(rows, rows)] * s[:, None] * s)
+        d, U = np.linalg.eigh(self.precision[rows[:, None], rows] * s[:, None] * s)
         on = d > MIN_REDUNDANCY
         half = s[:, None] * U[:, on] / np.sqrt(d[on])
         G, w = self.precision[:, rows] @ half, half.T @ self.u[rows]
@@ -293,9 +293,10 @@ class GivenModel:
         tried = FACTORS
         if fixed:
             tried = np.sqrt(max(float(z2.mean()), float(start.min()))) * np.geomspace(1e-3, 10.0, 241)
-        cost = [float((np.log((d + f * f) / start) + z2 / (d + f * f)).sum()) for f in tried]
+        variance = d + tried[:, None] ** 2
+        cost = (np.log(variance / start) + z2 / variance).sum(axis=1)
         best = int(np.argmin(cost))
-        return float(tried[best]), float((z2 / start).sum()) - cost[best]
+        return float(tried[best]), float((z2 / start).sum() - cost[best])
 
 
 @dataclass(frozen=True)
