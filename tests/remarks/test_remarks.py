@@ -131,6 +131,7 @@ LIMITS: dict[
     str, tuple[str, float, float | None]
 ] = {  # by kind: the number, and from where it is a warning and an error
     "sigma0_high": ("ratio", 2.0, 5.0),
+    "scale_weak": ("sigma", 1.0, 5.0),
     "residual_kept": ("over_sigma", 10.0, 30.0),
     "image_points_rejected": ("share", 0.05, None),
     "other_solution": ("moved", 0.0, 5.0),

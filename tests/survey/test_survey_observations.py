@@ -233,3 +233,17 @@ def test_frames_have_as_many_parameters_wherever_they_are(line: bool, own: int) 
         H = frame.fit(X).H.reshape(15, 6)
         assert np.linalg.matrix_rank(H, tol=1e-6) == own
         assert np.abs(frame.fit(X).difference).max() < 1e-3
+
+
+def test_heights_near_nothing_give_no_scale(tmp_path: Path) -> None:
+    """Twelve differences of 0.1 mm, known to 0.1 mm."""
+    network, truth = network_of("no scale", ())
+    pairs = np.array([seed_of(f"pair {k}").choice(np.arange(14, 34), 2, replace=False) for k in range(12)])
+    dZ = 1e-4 * seed_of("flat").standard_normal(12)
+    rows = [f"{i + 1},{j + 1},{float(v)!r},1e-4" for (i, j), v in zip(pairs.tolist(), dZ, strict=True)]
+    (tmp_path / "heights.csv").write_text("\n".join(["from,to,dZ,sdZ", *rows]), "utf-8")
+    lines = '[[survey_observations]]\nkind = "height difference"\nfile = "heights.csv"\n\n'
+    flat = replace(truth, points=truth.points * [1, 1, 0])
+    network, flat = make_network(seed_of("no scale"), images=8, points=34, free=(), figure=flat.points)
+    verdict = findings_of(run_survey(read_survey(written(tmp_path, network, flat, lines)))).verdict
+    assert verdict.level == "bad" and verdict.remarks[0].kind == "scale_weak"

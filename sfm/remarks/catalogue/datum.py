@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Kind
+from sfm.remarks.kind import Grade, Kind
 
 ROWS = (
+    Kind(
+        "scale_weak",
+        Grade("sigma", warning=1.0, error=5.0),
+        "The scale rests on {observations} alone and is known to {sigma} (1 sigma).",
+        "differences near 0, or few observations",
+        "Add a scale bar or a distance.",
+    ),
     Kind(
         "scale_undefined",
         "note",

@@ -41,6 +41,21 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     return min(tried, key=lambda one: one[1])[0]
 
 
+def scale_sigma(network: Network, estimate: Estimate) -> float:
+    """Return the relative standard deviation of the scale that observations of points and photographs give.
+
+    It is that of a network in which nothing else gives one; infinite where they do not either.
+    """
+    kinds = [one for one in (_usable(kind, estimate) for kind in network.observations) if len(one)]
+    if not kinds:
+        return float("inf")
+    centre = np.nanmean(estimate.points, axis=0)
+    rows, _ = _rows(kinds, Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate))
+    N, others = rows.T @ rows, rows[:, :6]
+    left = N[6, 6] - N[6, :6] @ np.linalg.pinv(others.T @ others, hermitian=True) @ N[:6, 6]
+    return float(1 / np.sqrt(left)) if left > 0 else float("inf")
+
+
 def _usable(kind: Kind, estimate: Estimate) -> Kind:
     """Return the observations of a kind whose points and photographs have start values."""
     on = np.ones(len(kind), dtype=bool)

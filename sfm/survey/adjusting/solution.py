@@ -23,6 +23,7 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
+from sfm.observations.mounts import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -37,12 +38,14 @@ from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
     datum_remarks,
+    has_held_mounts,
     place_on_control,
     place_on_frame,
     scale_to_bars,
 )
 from sfm.survey.adjusting.exterior import add_exterior, hold_fixed
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
+from sfm.survey.adjusting.placing import scale_sigma
 from sfm.survey.adjusting.settling import (
     MIN_IMAGE_POINTS,
     Settled,
@@ -77,6 +80,7 @@ OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # difference is reported. Free in each photograph it costs more than it cures where one of them determines it
 # badly: halves of a video whose c differs by 2 % then differ by 4 % of the distance, before by 0.04 %.
 MAX_FOCUS_CHANGE = 1.03
+WEAK_SCALE = 0.01  # relative standard deviation of a scale from which it is reported
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation decides which of the four solutions is meant
@@ -599,6 +603,19 @@ def _handedness(survey: Survey, given: JudgedGiven) -> tuple[Remark, ...]:
     return (remark("handedness_unchecked"),)
 
 
+def _weak_scale(a: Adjustment) -> tuple[Remark, ...]:
+    """Return the remark on a scale that only survey observations give, and badly."""
+    network = a.network
+    given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
+    observed = any(isinstance(one, MountObservations) for one in network.observations)
+    mounts = observed or has_held_mounts(a.estimate)
+    if given or mounts or not network.observations or not a.has_scale:
+        return ()
+    sigma = scale_sigma(network, a.estimate)
+    names = list(dict.fromkeys(one.name for one in network.observations))
+    return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
+
+
 def _remarks(
     survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
@@ -612,4 +629,5 @@ def _remarks(
         *_pixels_unlike_squares(survey, adjustment.estimate),
         *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
+        *_weak_scale(adjustment),
     )
