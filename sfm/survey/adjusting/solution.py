@@ -372,6 +372,9 @@ def _judged(
         rescale=task.survey.adjust.weights == "components",
         plates=plates if is_plate_control(task.survey.control, plate) else (),
     )
+    if _mounts_scale(network, start.estimate):
+        checked = tuple(one for one in given.remarks if one.kind != "scale_unchecked")
+        given = replace(given, remarks=checked)
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
@@ -603,13 +606,17 @@ def _handedness(survey: Survey, given: JudgedGiven) -> tuple[Remark, ...]:
     return (remark("handedness_unchecked"),)
 
 
+def _mounts_scale(network: Network, estimate: Estimate) -> bool:
+    """Return whether mounts that were given have a say on the scale of a network."""
+    observed = any(isinstance(one, MountObservations) for one in network.observations)
+    return observed or has_held_mounts(estimate)
+
+
 def _weak_scale(a: Adjustment) -> tuple[Remark, ...]:
     """Return the remark on a scale that only survey observations give, and badly."""
     network = a.network
     given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
-    observed = any(isinstance(one, MountObservations) for one in network.observations)
-    mounts = observed or has_held_mounts(a.estimate)
-    if given or mounts or not network.observations or not a.has_scale:
+    if given or _mounts_scale(network, a.estimate) or not network.observations or not a.has_scale:
         return ()
     sigma = scale_sigma(network, a.estimate)
     names = list(dict.fromkeys(one.name for one in network.observations))
