@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 
 DISTANCE = "distance"
+MAX_WRONG = 1 / 3  # share of the observations of a kind that are wrong, beyond which none is believed
 ALARM = 0.001  # probability with which right observations of tables lose one
 MIN_REDUNDANCY = 0.01  # of an observation that is tested: others hardly check one below
 
@@ -157,8 +159,16 @@ def _known(one: ObservationTable, network: Network) -> list[BoolArray]:
     return [np.array([name in names for name in column], dtype=bool) for column in columns]
 
 
-def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> tuple[str, ...]:
-    """Return the observations of tables that contradict all others, as `name_of_observation` names them.
+@dataclass(frozen=True)
+class Gross:
+    """Observations of tables that contradict others."""
+
+    names: tuple[str, ...] = ()  # as `name_of_observation` names them
+    kinds: tuple[str, ...] = ()  # of which more than MAX_WRONG contradict: nothing shows which ones are right
+
+
+def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> Gross:
+    """Return the observations of tables that contradict all others.
 
     Image points are not tested here: one wrong observation would have right ones rejected, which are weaker.
     The observation with the largest w leaves first, as long as more of its kind stay.
@@ -167,7 +177,11 @@ def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -
         network: image points that are accepted, and observations.
         adjust_with: adjusts a network without rejecting anything.
     """
-    out: list[str] = []
+    out: dict[str, list[str]] = {}
+    whole: list[str] = []
+    total = Counter[str]()
+    for kind in network.observations:
+        total[kind.name] += len(kind)
     while network.observations:
         a = adjust_with(network)
         first = len(network.kinds) - len(network.observations)
@@ -181,11 +195,16 @@ def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -
         if same < 3:
             break  # of two nothing shows which one is wrong; the remark on residuals names the larger one
         at = int(one.rows[row])
-        out.append(name_of_observation(kind, at, network, a.estimate))
+        names = out.setdefault(kind.name, [])
+        names.append(name_of_observation(kind, at, network, a.estimate))
         others = list(network.observations)
         others[one.index - first] = kind.select(np.delete(np.arange(len(kind)), at))
+        if len(names) > MAX_WRONG * total[kind.name]:
+            whole.append(kind.name)
+            others = [other for other in others if other.name != kind.name]
+            del out[kind.name]
         network = replace(network, observations=tuple(other for other in others if len(other)))
-    return tuple(out)
+    return Gross(tuple(name for names in out.values() for name in names), tuple(whole))
 
 
 def _largest(one: ObservedResiduals) -> list[tuple[float, int]]:
@@ -199,10 +218,11 @@ def name_of_observation(kind: Kind, row: int, network: Network, estimate: Estima
     return f"{kind.single} {kind.names(network, estimate)[row]}"
 
 
-def without_observations(network: Network, estimate: Estimate, names: tuple[str, ...]) -> Network:
-    """Return the network without some observations, by their names."""
+def without_observations(network: Network, estimate: Estimate, gross: Gross) -> Network:
+    """Return the network without some observations and kinds of them."""
     kept = []
     for kind in network.observations:
-        on = [name_of_observation(kind, row, network, estimate) not in names for row in range(len(kind))]
+        names = [name_of_observation(kind, row, network, estimate) for row in range(len(kind))]
+        on = [kind.name not in gross.kinds and name not in gross.names for name in names]
         kept.append(kind.select(np.array(on, dtype=bool)))
     return replace(network, observations=tuple(kind for kind in kept if len(kind)))

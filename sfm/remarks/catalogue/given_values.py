@@ -16,6 +16,13 @@ PULLED = (
 
 ROWS = (
     Kind(
+        "kind_wrong",
+        "error",
+        "The image points contradict most {of}, and none of them took part.",
+        "another unit, order of columns, sense of an axis or angle, or names exchanged",
+        "Check the table: signs, units, which point or photograph each row is of.",
+    ),
+    Kind(
         "observations_wrong",
         "warning",
         "{observations:survey observation} contradicted all others and took no part: {observations}.",

@@ -471,10 +471,11 @@ def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Ta
 
     part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
     gross = find_gross(part, adjusted)
-    if not gross:
-        return task, ()
     network = without_observations(task.network, estimate, gross)
-    return replace(task, network=network), (remark("observations_wrong", observations=list(gross)),)
+    remarks = [remark("kind_wrong", of=name) for name in gross.kinds]
+    if gross.names:
+        remarks.append(remark("observations_wrong", observations=list(gross.names)))
+    return replace(task, network=network), tuple(remarks)
 
 
 def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
