@@ -87,7 +87,7 @@ def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Mea
         pytest.param(FISHEYE, 230.0, 0.02, -0.005, marks=pytest.mark.slow),
         pytest.param(FISHEYE, 360.0, 0.02, -0.005, marks=pytest.mark.slow),  # 62 degrees
         ("opencv", 240.0, -0.05, 0.01),  # a central perspective of 59 degrees
-        ("opencv", 336.0, -0.1, 0.03),
+        pytest.param("opencv", 336.0, -0.1, 0.03, marks=pytest.mark.slow),
     ],
 )
 def test_the_image_points_tell_a_fisheye_from_a_wide_lens(

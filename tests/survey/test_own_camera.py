@@ -41,7 +41,7 @@ def with_zoom(name: str, factors: dict[int, float], *, images: int = 10) -> tupl
     return replace(network, image_points=replace(seen, xy=xy)), truth
 
 
-@pytest.mark.parametrize("factor", [0.95, 0.98, 1.1])
+@pytest.mark.parametrize("factor", [pytest.param(0.95, marks=pytest.mark.slow), 0.98, 1.1])
 def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     network, truth = with_zoom(f"zoomed {factor}", {7: factor})
     result = run_survey(survey_of(network, truth, adjust=TAU))
@@ -88,7 +88,13 @@ def test_a_photograph_with_the_names_of_other_points_is_left_out(number: int) ->
     assert not of_kind(result.remarks, "camera_per_photograph")
 
 
-@pytest.mark.parametrize(("kind", "cause"), [("held b1", "held_parameter"), ("autofocus", "camera_varies")])
+@pytest.mark.parametrize(
+    ("kind", "cause"),
+    [
+        pytest.param("held b1", "held_parameter", marks=pytest.mark.slow),
+        ("autofocus", "camera_varies"),
+    ],
+)
 def test_what_all_photographs_share_is_no_camera_of_one(kind: str, cause: str) -> None:
     """A photograph lost points, and another c explained them; what explains all photographs is likelier."""
     one = planted(kind, {"held b1": 7002, "autofocus": 7013}[kind])

@@ -45,7 +45,9 @@ def test_bars_are_no_targets() -> None:
     assert dict(count_flags(found.rejected_flag))["lobed"] > count / 3
 
 
-@pytest.mark.parametrize("codes", ["arcs", "ring12", "ring14", "ring20"])
+@pytest.mark.parametrize(
+    "codes", ["arcs", "ring12", "ring14", pytest.param("ring20", marks=pytest.mark.slow)]
+)
 def test_no_code_is_read_from_print(codes: str) -> None:
     rng = np.random.default_rng(2)
     ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
