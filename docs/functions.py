@@ -105,6 +105,8 @@ class FunctionReference(SphinxDirective):
         section = nodes.section(ids=[label])
         section += nodes.title(title, title)
         section += nodes.literal_block("", text.strip(), language="text")
+        if name in PUBLIC:  # its own page is where links lead
+            return section
         if kind == "module":
             domain.note_module(name, label, "", "", False)
         domain.note_object(name, kind, label, location=section)
