@@ -30,7 +30,7 @@ from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
-from sfm.observations.exterior import exterior_jacobian
+from sfm.observations.pose import exterior_jacobian
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray, skew
-from sfm.observations.kind import PHOTOGRAPH, Block, Linear, TableKind, Values
+from sfm.observations.kind import PHOTOGRAPH, Block, Linear, RowKind, Values
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
 @dataclass(frozen=True)
-class AntennaPositions(TableKind):
+class AntennaPositions(RowKind):
     """Positions of an antenna that is mounted on the camera."""
 
     name: ClassVar[str] = "antenna positions"
@@ -31,10 +31,6 @@ class AntennaPositions(TableKind):
 
     def __len__(self) -> int:
         return len(self.image)
-
-    def covariances(self) -> FloatArray:
-        """Return the covariance of each, (n, 3, 3)."""
-        return np.eye(3) * self.sigma[:, None] ** 2
 
     @property
     def values(self) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import POINT, Block, Kind, Linear, Values
+from sfm.observations.kind import POINT, Block, Kind, Linear, Values, no_index
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
@@ -22,7 +22,7 @@ class ObjectPoints(Kind):
     single: ClassVar[str] = "control point"
     components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
 
-    point: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # index of the point, (n,)
+    point: IntArray = field(default_factory=no_index)  # index of the point, (n,)
     xyz: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # object unit, (n, 3)
     covariance: FloatArray = field(
         default_factory=lambda: np.zeros((0, 3, 3))

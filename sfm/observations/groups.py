@@ -139,11 +139,6 @@ class Group(TableKind):
         """
         return cls(group, point, value, sigma)
 
-    @classmethod
-    def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
-        """Groups are made one by one, see `of_group`."""
-        raise NotImplementedError
-
 
 def _inverse(N: FloatArray) -> FloatArray:
     """Return the inverse of the normal equations of own parameters over those that are determined, (h, h)."""

@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import PARAMETER, Block, Kind, Linear, Values
+from sfm.observations.kind import PARAMETER, Block, Kind, Linear, Values, no_index, no_value
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
-
-
-def _no_index() -> IntArray:
-    return np.zeros(0, dtype=np.int64)
-
-
-def _none() -> FloatArray:
-    return np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -30,10 +22,10 @@ class InteriorObservations(Kind):
     single: ClassVar[str] = "interior orientation"
     components: ClassVar[tuple[str, ...]] = ("value",)
 
-    camera: IntArray = field(default_factory=_no_index)  # index of the camera, (p,)
-    parameter: IntArray = field(default_factory=_no_index)  # index among the camera's names, (p,)
-    value: FloatArray = field(default_factory=_none)  # in the parameter's unit, (p,)
-    sigma: FloatArray = field(default_factory=_none)  # in the parameter's unit, (p,)
+    camera: IntArray = field(default_factory=no_index)  # index of the camera, (p,)
+    parameter: IntArray = field(default_factory=no_index)  # index among the camera's names, (p,)
+    value: FloatArray = field(default_factory=no_value)  # in the parameter's unit, (p,)
+    sigma: FloatArray = field(default_factory=no_value)  # in the parameter's unit, (p,)
     correlation: FloatArray | None = None  # of all of them together; independent where not given, (p, p)
 
     def __len__(self) -> int:

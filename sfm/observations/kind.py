@@ -21,6 +21,16 @@ if TYPE_CHECKING:
 POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # sorts of unknowns
 
 
+def no_index() -> IntArray:
+    """Return indices of nothing, (0,)."""
+    return np.zeros(0, dtype=np.int64)
+
+
+def no_value() -> FloatArray:
+    """Return values of nothing, (0,)."""
+    return np.zeros(0)
+
+
 class Values(Protocol):
     """Values of all unknowns."""
 
@@ -159,6 +169,20 @@ class TableKind(Kind):
         values = tuple(f"{name}{unit}" for name in cls.components)
         return (*cls.numbers, *values, *(f"s{name}" for name in values))
 
+    def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
+        """Return the unit of lengths, or rad."""
+        return (("rad" if self.in_degrees else length_unit,) * len(self.components),) * len(self)
+
+
+class RowKind(TableKind):
+    """A kind of table of which each row is an observation."""
+
+    sigma: FloatArray  # of each component, object unit or rad, (n, d)
+
+    def covariances(self) -> FloatArray:
+        """Return the covariance of each, (n, d, d)."""
+        return np.eye(self.sigma.shape[1]) * self.sigma[:, None] ** 2
+
     @classmethod
     @abstractmethod
     def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
@@ -169,10 +193,6 @@ class TableKind(Kind):
             value: `numbers` and values, object unit or rad, (n, q + d).
             sigma: standard deviations of the values, (n, d).
         """
-
-    def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
-        """Return the unit of lengths, or rad."""
-        return (("rad" if self.in_degrees else length_unit,) * len(self.components),) * len(self)
 
 
 def is_observed(variance: FloatArray) -> BoolArray:

@@ -6,17 +6,15 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self
 
-import numpy as np
-
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import POINT, Block, Linear, TableKind, Values
+from sfm.observations.kind import POINT, Block, Linear, RowKind, Values
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
 @dataclass(frozen=True)
-class PointPairs(TableKind):
+class PointPairs(RowKind):
     """Observations of d components between two object points."""
 
     texts: ClassVar[tuple[str, ...]] = ("from", "to")
@@ -33,10 +31,6 @@ class PointPairs(TableKind):
 
     def __len__(self) -> int:
         return len(self.start)
-
-    def covariances(self) -> FloatArray:
-        """Return the covariance of each, (n, d, d)."""
-        return np.eye(self.value.shape[1]) * self.sigma[:, None] ** 2
 
     @property
     def values(self) -> FloatArray:

@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import POINT, Block, Kind, Linear, Values
+from sfm.observations.kind import POINT, Block, Kind, Linear, Values, no_index, no_value
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
-
-
-def _no_index() -> IntArray:
-    return np.zeros(0, dtype=np.int64)
-
-
-def _none() -> FloatArray:
-    return np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -30,10 +22,10 @@ class ScaleBars(Kind):
     single: ClassVar[str] = "scale bar"
     components: ClassVar[tuple[str, ...]] = ("length",)
 
-    start: IntArray = field(default_factory=_no_index)  # index of the first point, (b,)
-    end: IntArray = field(default_factory=_no_index)  # index of the second point, (b,)
-    length: FloatArray = field(default_factory=_none)  # object unit, (b,)
-    sigma: FloatArray = field(default_factory=_none)  # object unit, (b,)
+    start: IntArray = field(default_factory=no_index)  # index of the first point, (b,)
+    end: IntArray = field(default_factory=no_index)  # index of the second point, (b,)
+    length: FloatArray = field(default_factory=no_value)  # object unit, (b,)
+    sigma: FloatArray = field(default_factory=no_value)  # object unit, (b,)
 
     def __len__(self) -> int:
         return len(self.start)

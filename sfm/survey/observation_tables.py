@@ -19,7 +19,7 @@ from sfm.files.csv_tables import CsvTable, read_table
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
-from sfm.observations.kind import Kind, TableKind
+from sfm.observations.kind import Kind, RowKind, TableKind
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.given import ScaleBar
 
@@ -113,6 +113,7 @@ def with_tables(survey: Survey, network: Network) -> Network:
         indices = tuple(
             np.array([number[column[row]] for row in rows], dtype=np.int64) for column in one.table.texts
         )
+        assert issubclass(one.of, RowKind)
         added.append(one.of.of_table(indices, one.value[rows], one.sigma[rows]))
     return replace(network, observations=(*network.observations, *added)) if added else network
 

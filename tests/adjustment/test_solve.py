@@ -25,7 +25,7 @@ from sfm.network import (
     ObjectPoints,
     ScaleBars,
 )
-from sfm.observations.exterior import angle_jacobian
+from sfm.observations.pose import angle_jacobian
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, perturb, seed_of
 

@@ -19,7 +19,7 @@ from sfm.network import Estimate, Network, values_of
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
 from sfm.observations.horizontal_directions import HorizontalDirections
-from sfm.observations.kind import PHOTOGRAPH, TableKind
+from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
 from sfm.observations.lines import Lines
 from sfm.observations.plumb_lines import PlumbLines
 from sfm.observations.rigid_frames import RigidFrames
@@ -39,6 +39,7 @@ def observed(kind: str, truth: Estimate, rng: np.random.Generator, count: int = 
     of, n = TABLES[kind], len(truth.points)
     if issubclass(of, Group):
         return group_of(of, truth, rng, SIGMA.get(kind, 1e-4))
+    assert issubclass(of, RowKind)
     d, sigma = len(of.components), SIGMA.get(kind, 1e-4)
     pairs = np.array([14 + rng.choice(n - 14, 2, replace=False) for _ in range(count)])
     indices: tuple[IntArray, ...] = (pairs[:, 0], pairs[:, 1])

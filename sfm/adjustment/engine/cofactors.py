@@ -23,7 +23,7 @@ from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.options import kernel
-from sfm.observations.exterior import exterior_jacobian
+from sfm.observations.pose import exterior_jacobian
 
 ZERO = 1e-9  # variance over its limiting value below which a coordinate is one that the datum fixes
 

@@ -25,7 +25,7 @@ from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance, ErrorCorrelation
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import rows_of
-from sfm.observations.exterior import exterior_jacobian
+from sfm.observations.pose import exterior_jacobian
 
 POINTS_AT_ONCE = 2000
 BYTES_AT_ONCE = 16_000_000  # of the correlations of some image points with all others of a photograph

@@ -26,8 +26,8 @@ from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.kernels.small_algebra import turn
 from sfm.network import Estimate, Mounts, Network
-from sfm.observations.exterior import exterior_jacobian
 from sfm.observations.kind import POINT
+from sfm.observations.pose import exterior_jacobian
 
 MIN_RAYS = 2  # per object point that is not known otherwise
 MIN_POINTS = 3  # per pose that is not known otherwise

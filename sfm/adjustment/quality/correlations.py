@@ -20,7 +20,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.kernels.threads import own_threads
-from sfm.observations.exterior import exterior_jacobian
+from sfm.observations.pose import exterior_jacobian
 
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
