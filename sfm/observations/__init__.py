@@ -14,17 +14,21 @@ from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import TableKind
 from sfm.observations.level_groups import LevelGroups
 from sfm.observations.lines import Lines
+from sfm.observations.offset_distances import OffsetDistances
 from sfm.observations.planes import Planes
 from sfm.observations.plumb_lines import PlumbLines
+from sfm.observations.relative_orientations import RelativeOrientations
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.zenith_angles import ZenithAngles
 
 TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
     "distance": Distances,
+    "distance with additive constant": OffsetDistances,
     "height difference": HeightDifferences,
     "coordinate difference": CoordinateDifferences,
     "zenith angle": ZenithAngles,
     "antenna position": AntennaPositions,
+    "relative orientation": RelativeOrientations,
     "horizontal direction": HorizontalDirections,
     "plane": Planes,
     "line": Lines,

@@ -22,6 +22,7 @@ class AntennaPositions(RowKind):
     single: ClassVar[str] = "antenna position"
     components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
     texts: ClassVar[tuple[str, ...]] = ("image",)
+    texts_of: ClassVar[str] = PHOTOGRAPH
     numbers: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
 
     image: IntArray  # index of the photograph, (n,)

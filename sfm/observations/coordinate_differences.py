@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -21,3 +23,7 @@ class CoordinateDifferences(PointPairs):
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return d, and the unit matrix."""
         return d, np.broadcast_to(np.eye(3), (len(d), 3, 3))
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the differences between exchanged points."""
+        return {"exchanged": replace(self, value=-self.value)}

@@ -40,6 +40,7 @@ class Group(TableKind):
     """Observations of one group: r of them, of c components each, by p points."""
 
     texts: ClassVar[tuple[str, ...]] = ("group", "point")
+    labelled: ClassVar[bool] = True  # whether the first of these names the group alone, and no point
     least: ClassVar[int]  # points that a group needs to say anything
 
     group: str
@@ -94,17 +95,19 @@ class Group(TableKind):
 
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
         """Return the unit of each component."""
-        unit = "rad" if self.in_degrees else length_unit
-        return ((unit,) * self.sigma.size,)[: len(self)]
+        of_row = tuple("rad" if name in self.angles else length_unit for name in self.components)
+        return (of_row * len(self.sigma),)[: len(self)]
 
     def labels(self, network: Network) -> tuple[str, ...]:
         """Return what each component of the group is called, (r c,)."""
         several = len(self.components) > 1
         return tuple(
-            f"{network.points[j]}{f' {part}' if several else ''}"
-            for j in self.point[-len(self.value) :]
-            for part in self.components
+            f"{row} {part}" if several else row for row in self.rows(network) for part in self.components
         )
+
+    def rows(self, network: Network) -> tuple[str, ...]:
+        """Return what the observations of the group are called, (r,)."""
+        return tuple(network.points[j] for j in self.point[len(self.point) - len(self.value) :])
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return the group, or nothing of it."""
@@ -112,13 +115,25 @@ class Group(TableKind):
             return self
         return replace(self, point=self.point[:0], value=self.value[:0], sigma=self.sigma[:0])
 
+    def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of the rows: "plane wall: 7", (r,)."""
+        return tuple(f"{self.single} {self.group}: {row}" for row in self.rows(network))
+
+    def part_of(self, row: int, component: int) -> int:
+        """Return the row of a component."""
+        return component // len(self.components)
+
+    def select_parts(self, on: BoolArray) -> Self:
+        """Return some of the rows, (r,)."""
+        stations = len(self.point) - len(self.value)
+        point = np.concatenate([self.point[:stations], self.point[stations:][on]])
+        return replace(self, point=point, value=self.value[on], sigma=self.sigma[on])
+
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
         """Return the group with some points alone; nothing where too few are left."""
         on = points[self.point]
-        rows = on[-len(self.value) :] if len(self.value) else on
-        if not on[: len(on) - len(rows)].all():  # a station
-            rows = np.zeros(len(rows), dtype=bool)
-        return replace(self, point=self.point[on], value=self.value[rows], sigma=self.sigma[rows])
+        stations = len(on) - len(self.value)
+        return self.select_parts(on[stations:] & on[:stations].all())
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
         """Return the group with its points at other places."""
@@ -126,18 +141,18 @@ class Group(TableKind):
 
     @classmethod
     def of_group(
-        cls, group: str, point: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
+        cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
         """Return the observations of one group of a table, its rows in order.
 
         Args:
             group: its name.
-            point: index of the point of each row, (r,).
+            points: indices of the points of each row, (r, columns of points).
             value: object unit or rad, (r, c).
             sigma: standard deviations, (r, c).
             number: of each point of the network, by name.
         """
-        return cls(group, point, value, sigma)
+        return cls(group, points[:, 0], value, sigma)
 
 
 def _inverse(N: FloatArray) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -21,3 +23,7 @@ class HeightDifferences(PointPairs):
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return dZ, and the direction of Z."""
         return d[:, 2:], np.broadcast_to(np.array([0.0, 0.0, 1.0]), (len(d), 1, 3))
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the differences between exchanged points."""
+        return {"exchanged": replace(self, value=-self.value)}

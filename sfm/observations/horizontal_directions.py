@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -18,7 +19,8 @@ class HorizontalDirections(Group):
     single: ClassVar[str] = "horizontal direction"
     components: ClassVar[tuple[str, ...]] = ("direction",)
     texts: ClassVar[tuple[str, ...]] = ("station", "point")
-    in_degrees: ClassVar[bool] = True
+    angles: ClassVar[tuple[str, ...]] = ("direction",)
+    labelled: ClassVar[bool] = False
     least: ClassVar[int] = 3  # the station and two targets
 
     def fit(self, X: FloatArray) -> Fit:
@@ -36,9 +38,13 @@ class HorizontalDirections(Group):
         Jx[:, 0, 0, :2] = -by
         return Fit(l[:, None], Jx, -np.ones((len(d), 1, 1)))
 
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the directions counted the other way round."""
+        return {"counter-clockwise": replace(self, value=-self.value)}
+
     @classmethod
     def of_group(
-        cls, group: str, point: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
+        cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
         """Return the directions from a station, whose point stands before those of its targets."""
-        return cls(group, np.concatenate([[number[group]], point]), value, sigma)
+        return cls(group, np.concatenate([[number[group]], points[:, 0]]), value, sigma)

@@ -9,6 +9,7 @@ Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -129,6 +130,22 @@ class Kind(ABC):
         """Return what the components are called in tables, (d,)."""
         return self.components
 
+    def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of what can leave alone, as a wrong observation does, (q,)."""
+        return tuple(f"{self.single} {name}" for name in self.names(network, estimate))
+
+    def part_of(self, row: int, component: int) -> int:
+        """Return the part that a component of an observation belongs to."""
+        return row
+
+    def select_parts(self, on: BoolArray) -> Self:
+        """Return the observations of some parts, (q,)."""
+        return self.select(on)
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the observations as they would be without a common mistake, by what the mistake is."""
+        return {}
+
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
         """Return the observations of some points (n,) and photographs (m,) alone."""
         on = np.ones(len(self), dtype=bool)
@@ -158,20 +175,25 @@ class Kind(ABC):
 class TableKind(Kind):
     """A kind that a survey gives as a table: names, then values, then their standard deviations."""
 
-    texts: ClassVar[tuple[str, ...]]  # columns of names: of photographs if "image", else of points
+    texts: ClassVar[tuple[str, ...]]  # columns of names
+    texts_of: ClassVar[str] = POINT  # what they name: POINT or PHOTOGRAPH
     numbers: ClassVar[tuple[str, ...]] = ()  # columns of numbers without a standard deviation
-    in_degrees: ClassVar[bool] = False  # whether values are degrees in tables
+    angles: ClassVar[tuple[str, ...]] = ()  # components that are angles: rad, and degrees in tables
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
         """Return the columns of numbers: those without standard deviation, values, standard deviations."""
-        unit = "_deg" if cls.in_degrees else ""
-        values = tuple(f"{name}{unit}" for name in cls.components)
+        values = tuple(f"{name}_deg" if name in cls.angles else name for name in cls.components)
         return (*cls.numbers, *values, *(f"s{name}" for name in values))
 
+    @classmethod
+    def in_tables(cls) -> FloatArray:
+        """Return the factor of each component from rad to degrees, 1 for lengths, (d,)."""
+        return np.array([np.degrees(1.0) if name in cls.angles else 1.0 for name in cls.components])
+
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
-        """Return the unit of lengths, or rad."""
-        return (("rad" if self.in_degrees else length_unit,) * len(self.components),) * len(self)
+        """Return the unit of each component: that of lengths, or rad."""
+        return (tuple("rad" if name in self.angles else length_unit for name in self.components),) * len(self)
 
 
 class RowKind(TableKind):

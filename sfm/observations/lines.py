@@ -58,7 +58,7 @@ class Lines(Group):
 
     @classmethod
     def of_group(
-        cls, group: str, point: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
+        cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
         """Return the points of a line, of one standard deviation each."""
-        return cls(group, point, np.zeros((len(point), 2)), np.repeat(sigma, 2, axis=1))
+        return cls(group, points[:, 0], np.zeros((len(points), 2)), np.repeat(sigma, 2, axis=1))

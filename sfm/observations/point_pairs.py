@@ -1,4 +1,4 @@
-"""Observations between two object points each: distances, differences of heights and coordinates, zeniths."""
+"""Observations between two object points, or two photographs, each."""
 
 from __future__ import annotations
 
@@ -7,27 +7,22 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import POINT, Block, Linear, RowKind, Values
+from sfm.observations.kind import PHOTOGRAPH, POINT, Block, Linear, RowKind, Values
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
 @dataclass(frozen=True)
-class PointPairs(RowKind):
-    """Observations of d components between two object points."""
+class Pairs(RowKind):
+    """Observations of d components between two object points or photographs."""
 
     texts: ClassVar[tuple[str, ...]] = ("from", "to")
 
-    start: IntArray  # index of the first point, (n,)
-    end: IntArray  # index of the second point, (n,)
+    start: IntArray  # index of the first one, (n,)
+    end: IntArray  # index of the second one, (n,)
     value: FloatArray  # object unit or rad, (n, d)
     sigma: FloatArray  # (n, d)
-
-    @classmethod
-    @abstractmethod
-    def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return values (n, d) and derivatives (n, d, 3) by the differences of the points X2 - X1, (n, 3)."""
 
     def __len__(self) -> int:
         return len(self.start)
@@ -38,18 +33,13 @@ class PointPairs(RowKind):
         return self.value
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return both points."""
-        return Block(POINT, self.start), Block(POINT, self.end)
-
-    def linearise(self, values: Values) -> Linear:
-        """Return computed minus observed, and the derivatives by both points."""
-        computed, J = self.computed(values.points[self.end] - values.points[self.start])
-        return Linear(computed - self.value, (-J, J))
+        """Return both ends."""
+        return Block(self.texts_of, self.start), Block(self.texts_of, self.end)
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return the names of both points."""
-        ends = zip(self.start, self.end, strict=True)
-        return tuple(f"{network.points[i]} - {network.points[j]}" for i, j in ends)
+        """Return the names of both ends."""
+        of = network.images if self.texts_of == PHOTOGRAPH else network.points
+        return tuple(f"{of[i]} - {of[j]}" for i, j in zip(self.start, self.end, strict=True))
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the observations."""
@@ -62,11 +52,26 @@ class PointPairs(RowKind):
         )
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the points at other places."""
-        return replace(self, start=points[self.start], end=points[self.end])
+        """Return them with their ends at other places."""
+        place = points if self.texts_of == POINT else images
+        return self if place is None else replace(self, start=place[self.start], end=place[self.end])
 
     @classmethod
     def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
         """Return the observations of a table."""
         start, end = indices
         return cls(start, end, value, sigma)
+
+
+class PointPairs(Pairs):
+    """Observations that depend on the difference of the coordinates of two object points."""
+
+    @classmethod
+    @abstractmethod
+    def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return values (n, d) and derivatives (n, d, 3) by the differences of the points X2 - X1, (n, 3)."""
+
+    def linearise(self, values: Values) -> Linear:
+        """Return computed minus observed, and the derivatives by both points."""
+        computed, J = self.computed(values.points[self.end] - values.points[self.start])
+        return Linear(computed - self.value, (-J, J))

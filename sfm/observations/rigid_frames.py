@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -36,6 +38,10 @@ class RigidFrames(Group):
         Jx = np.zeros((len(X), 3, len(X), 3))
         Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
         return Fit(local - self.value, Jx, self._by_motion())
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the coordinates of a mirrored system."""
+        return {"mirrored": replace(self, value=self.value * [1.0, 1.0, -1.0])}
 
     def _by_motion(self) -> FloatArray:
         """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).

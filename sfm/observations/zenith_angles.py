@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -16,7 +18,7 @@ class ZenithAngles(PointPairs):
     name: ClassVar[str] = "zenith angles"
     single: ClassVar[str] = "zenith angle"
     components: ClassVar[tuple[str, ...]] = ("zenith",)
-    in_degrees: ClassVar[bool] = True
+    angles: ClassVar[tuple[str, ...]] = ("zenith",)
 
     @classmethod
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -27,3 +29,10 @@ class ZenithAngles(PointPairs):
         along = d[:, 2] / (square * h)
         J = np.stack([along * d[:, 0], along * d[:, 1], -h / square], axis=1)
         return np.arctan2(h, d[:, 2])[:, None], J[:, None]
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the angles counted from the horizon, and between exchanged points."""
+        return {
+            "elevation": replace(self, value=np.pi / 2 - self.value),
+            "exchanged": replace(self, value=np.pi - self.value),
+        }

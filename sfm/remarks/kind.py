@@ -40,6 +40,11 @@ NOUNS = {  # what a remark may be of, by the names in its data
     "coordinates": "Coordinates",
     "coordinates without control": "Coordinates of the network without the control points",
     "lengths": "the given lengths",
+    # mistakes in tables of survey observations
+    "counter-clockwise": "directions are counted counter-clockwise",
+    "elevation": "angles are counted from the horizon",
+    "exchanged": "both ends are exchanged",
+    "mirrored": "coordinates are those of a mirrored system",
 }
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)

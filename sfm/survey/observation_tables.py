@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfm.adjustment.result import Adjustment, ObservedResiduals
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.display import listed
 from sfm.distributions import normal_ppf
 from sfm.errors import SurveyFileError
@@ -19,7 +19,7 @@ from sfm.files.csv_tables import CsvTable, read_table
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
-from sfm.observations.kind import Kind, RowKind, TableKind
+from sfm.observations.kind import PHOTOGRAPH, Kind, RowKind, TableKind
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.given import ScaleBar
 
@@ -47,6 +47,11 @@ class ObservationTable:
         """The kind of observation."""
         return TABLES[self.kind]
 
+    @property
+    def named(self) -> tuple[tuple[str, ...], ...]:
+        """The columns of names of points or photographs, without that of labels."""
+        return self.table.texts[issubclass(self.of, Group) and self.of.labelled :]
+
     def name(self, row: int) -> str:
         """Return what an observation is called: "distance 12 - 15"."""
         return f"{self.kind} {' - '.join(column[row] for column in self.table.texts)}"
@@ -72,18 +77,16 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
-    if issubclass(of, Group):  # a point counts once in a group; a station has one set of directions
+    if issubclass(of, Group) and len(of.texts) == 2:  # a second set of directions is another table
         table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), of.texts)
-    elif len(of.texts) > 1:
-        for row, names in enumerate(zip(*table.texts, strict=True)):
-            if len(set(names)) < len(names):
-                raise SurveyFileError(
-                    f"{table.place(row)}: {kind} from {names[0]} to itself, needed two points"
-                )
-    unit = np.pi / 180 if of.in_degrees else 1.0
+    ends = [column for name, column in zip(of.texts, table.texts, strict=True) if name in ("from", "to")]
+    for row, names in enumerate(zip(*ends, strict=True) if ends else ()):
+        if len(set(names)) < len(names):
+            raise SurveyFileError(f"{table.place(row)}: {kind} from {names[0]} to itself, needed two")
+    to_rad = 1 / of.in_tables()
     value = table.values[:, :-d].copy()
-    value[:, len(of.numbers) :] *= unit
-    return ObservationTable(kind, value, unit * sigma, table)
+    value[:, len(of.numbers) :] *= to_rad
+    return ObservationTable(kind, value, to_rad[:d] * sigma, table)
 
 
 def bars_of(table: ObservationTable) -> list[ScaleBar]:
@@ -100,130 +103,198 @@ def bars_of(table: ObservationTable) -> list[ScaleBar]:
 
 def with_tables(survey: Survey, network: Network) -> Network:
     """Return the network with the observations of a survey's tables whose points or photographs it has."""
-    added = []
-    for one in survey.tables:
-        known = np.logical_and.reduce(_known(one, network))
-        if not known.any():
-            continue
-        rows = np.flatnonzero(known)
+    added: list[TableKind] = []
+    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+        rows = np.flatnonzero(_known(one, network))
         number = {name: k for k, name in enumerate(_names(one, network))}
+        named = one.named
+        indices = [np.array([number[column[row]] for row in rows], dtype=np.int64) for column in named]
         if issubclass(one.of, Group):
-            added += _groups(one, rows, number)
-            continue
-        indices = tuple(
-            np.array([number[column[row]] for row in rows], dtype=np.int64) for column in one.table.texts
-        )
-        assert issubclass(one.of, RowKind)
-        added.append(one.of.of_table(indices, one.value[rows], one.sigma[rows]))
+            for group, label in labels.items():
+                own = np.array([one.table.texts[0][row] == group for row in rows], dtype=bool)
+                if own.any():
+                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[own]
+                    value, sigma = one.value[rows][own], one.sigma[rows][own]
+                    made = one.of.of_group(group, points, value, sigma, number)
+                    added.append(replace(made, group=label))
+        elif len(rows):
+            assert issubclass(one.of, RowKind)
+            added.append(one.of.of_table(tuple(indices), one.value[rows], one.sigma[rows]))
+    added = [kind for kind in added if len(kind)]
     return replace(network, observations=(*network.observations, *added)) if added else network
 
 
-def _groups(one: ObservationTable, rows: IntArray, number: Mapping[str, int]) -> list[TableKind]:
-    """Return the groups of a table that have enough points in a network, of rows with a point in it."""
-    names, points = one.table.texts
-    found: list[TableKind] = []
-    for name in dict.fromkeys(names[row] for row in rows):
-        own = np.array([row for row in rows if names[row] == name], dtype=np.int64)
-        point = np.array([number[points[row]] for row in own], dtype=np.int64)
-        assert issubclass(one.of, Group)
-        group = one.of.of_group(name, point, one.value[own], one.sigma[own], number)
-        if len(group):
-            found.append(group)
+def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
+    """Return what the groups of each table are called: "S1", and "S1 (2)" where two tables have one."""
+    count, found = Counter[tuple[str, str]](), []
+    for one in tables:
+        labels = {}
+        for name in dict.fromkeys(one.table.texts[0]) if issubclass(one.of, Group) else ():
+            count[one.kind, name] += 1
+            before = count[one.kind, name] > 1
+            labels[name] = f"{name} ({count[one.kind, name]})" if before else name
+        found.append(labels)
     return found
 
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
     """Return the remark on observations whose points or photographs are not in a network."""
-    unused = [
-        one.name(int(row))
-        for one in survey.tables
-        for row in np.flatnonzero(~np.logical_and.reduce(_known(one, network)))
-    ]
-    for one in survey.tables:
-        if issubclass(one.of, Group):
-            there = {kind.group for kind in network.observations if isinstance(kind, one.of) and len(kind)}
-            unused += [
-                f"{one.kind} {name}" for name in dict.fromkeys(one.table.texts[0]) if name not in there
-            ]
+    unused = [one.name(int(row)) for one in survey.tables for row in np.flatnonzero(~_known(one, network))]
+    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+        there = {
+            kind.group for kind in network.observations if isinstance(kind, Group) and type(kind) is one.of
+        }
+        unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
     return (remark("observations_unused", observations=unused),) if unused else ()
 
 
 def _names(one: ObservationTable, network: Network) -> tuple[str, ...]:
     """Return the names that the columns of a table are of."""
-    return network.images if one.of.texts == ("image",) else network.points
+    return network.images if one.of.texts_of == PHOTOGRAPH else network.points
 
 
-def _known(one: ObservationTable, network: Network) -> list[BoolArray]:
-    """Return which names of each column are in a network, (n,) each."""
+def _known(one: ObservationTable, network: Network) -> BoolArray:
+    """Return which observations of a table have all their points or photographs in a network, (n,)."""
     names = set(_names(one, network))
-    columns = one.table.texts[1:] if one.of.texts[0] == "group" else one.table.texts
-    return [np.array([name in names for name in column], dtype=bool) for column in columns]
+    known: BoolArray = np.array([[name in names for name in column] for column in one.named], dtype=bool)
+    return np.asarray(known.all(axis=0))
 
 
 @dataclass(frozen=True)
 class Gross:
-    """Observations of tables that contradict others."""
+    """Observations of one kind from tables that contradict others."""
 
-    names: tuple[str, ...] = ()  # as `name_of_observation` names them
-    kinds: tuple[str, ...] = ()  # of which more than MAX_WRONG contradict: nothing shows which ones are right
+    kind: str  # name of the kind
+    names: tuple[str, ...]  # as `Kind.parts` names them
+    whole: bool  # whether more than MAX_WRONG contradict: nothing shows which ones are right, and all leave
+    mistake: str | None = None  # without which they agree, see `Kind.mistakes`
 
 
-def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> Gross:
-    """Return the observations of tables that contradict all others.
+def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> tuple[Gross, ...]:
+    """Return the observations of tables that contradict all others, by kind.
 
     Image points are not tested here: one wrong observation would have right ones rejected, which are weaker.
-    The observation with the largest w leaves first, as long as more of its kind stay.
+    Kinds that a common mistake explains with all that contradicts leave whole. Else the observation with the
+    largest w leaves first, as long as more of its kind stay.
 
     Args:
         network: image points that are accepted, and observations.
         adjust_with: adjusts a network without rejecting anything.
     """
-    out: dict[str, list[str]] = {}
-    whole: list[str] = []
-    total = Counter[str]()
-    for kind in network.observations:
-        total[kind.name] += len(kind)
+    given, wrong, whole = network.observations, dict[str, list[str]](), set[str]()
+    total, estimate, mistakes = Counter[str](), None, dict[str, str | None]()
     while network.observations:
         a = adjust_with(network)
         first = len(network.kinds) - len(network.observations)
-        tests = [(w, one, row) for one in a.observed if one.index >= first for w, row in _largest(one)]
-        w, one, row = max(tests, key=lambda test: test[0], default=(0.0, None, 0))
-        count = sum(one.count for one in a.observed if one.index >= first)
-        if one is None or not w > -normal_ppf(ALARM / (2 * count)):
+        tests = [(*test, one) for one in a.observed if one.index >= first for test in _largest(one)]
+        w, row, component, one = max(tests, key=lambda test: test[0], default=(0.0, 0, 0, None))
+        if one is None or not w > _critical(a, first):
             break
         kind = network.kinds[one.index]
-        same = sum(len(other) for other in network.observations if type(other) is type(kind))
-        if same < 3:
-            break  # of two nothing shows which one is wrong; the remark on residuals names the larger one
-        at = int(one.rows[row])
-        names = out.setdefault(kind.name, [])
-        names.append(name_of_observation(kind, at, network, a.estimate))
-        others = list(network.observations)
-        others[one.index - first] = kind.select(np.delete(np.arange(len(kind)), at))
-        if len(names) > MAX_WRONG * total[kind.name]:
-            whole.append(kind.name)
-            others = [other for other in others if other.name != kind.name]
-            del out[kind.name]
-        network = replace(network, observations=tuple(other for other in others if len(other)))
-    return Gross(tuple(name for names in out.values() for name in names), tuple(whole))
+        if estimate is None:
+            estimate = a.estimate
+            for other in given:
+                total[other.name] += len(other.parts(network, estimate))
+            for gross in _explained(network, estimate, kind, adjust_with):
+                wrong[gross.kind], mistakes[gross.kind] = list(gross.names), gross.mistake
+                whole |= {gross.kind} if gross.whole else set()
+        if not wrong or estimate is not a.estimate:
+            if total[kind.name] < 3:
+                break  # of two nothing shows which is wrong; the remark on residuals names the larger one
+            part = kind.parts(network, estimate)[kind.part_of(int(one.rows[row]), component)]
+            wrong.setdefault(kind.name, []).append(part)
+            if len(wrong[kind.name]) > MAX_WRONG * total[kind.name]:
+                whole.add(kind.name)
+        network = without_observations(network, estimate, wrong, whole)
+    for name in wrong.keys() - mistakes.keys():
+        assert estimate is not None
+        of_kind = [kind for kind in given if kind.name == name]
+        mistakes[name] = _mistake(of_kind, wrong[name], network, estimate, adjust_with, whole=name in whole)
+    return tuple(Gross(name, tuple(names), name in whole, mistakes[name]) for name, names in wrong.items())
 
 
-def _largest(one: ObservedResiduals) -> list[tuple[float, int]]:
-    """Return the largest |w| of each observation that is checked, and its row."""
-    w = np.where(one.redundancy_numbers > MIN_REDUNDANCY, np.abs(one.standardised), np.nan)
-    return [(float(np.nanmax(own)), row) for row, own in enumerate(w) if np.isfinite(own).any()]
+def _explained(
+    network: Network, estimate: Estimate, worst: Kind, adjust_with: Callable[[Network], Adjustment]
+) -> list[Gross]:
+    """Return what one common mistake each explains with all that contradicts; several leave it open which."""
+    found: list[Gross] = []
+    kinds = dict.fromkeys(kind.name for kind in network.observations)
+    for name, single in [(name, False) for name in kinds] + [(worst.name, True)]:
+        of = [kind for kind in network.observations if (kind is worst if single else kind.name == name)]
+        others = tuple(kind for kind in network.observations if not any(kind is one for one in of))
+        for mistake in of[0].mistakes():
+            mended = tuple(kind.mistakes()[mistake] for kind in of)
+            a = adjust_with(replace(network, observations=(*others, *mended)))
+            first = len(network.kinds) - len(network.observations)
+            tests = [w for one in a.observed if one.index >= first for w, _, _ in _largest(one)]
+            if tests and max(tests) <= _critical(a, first) and name not in {one.kind for one in found}:
+                names = [part for kind in of for part in kind.parts(network, estimate)]
+                whole = not any(kind.name == name for kind in others)
+                found.append(Gross(name, tuple(names), whole, mistake))
+    return found
 
 
-def name_of_observation(kind: Kind, row: int, network: Network, estimate: Estimate) -> str:
-    """Return "height difference 12 - 15"."""
-    return f"{kind.single} {kind.names(network, estimate)[row]}"
+def _mistake(
+    kinds: Sequence[Kind],
+    names: Sequence[str],
+    network: Network,
+    estimate: Estimate,
+    adjust_with: Callable[[Network], Adjustment],
+    *,
+    whole: bool,
+) -> str | None:
+    """Return the mistake without which observations agree with a network that has them not; None if none."""
+    for mistake in dict.fromkeys(mistake for kind in kinds for mistake in kind.mistakes()):
+        mended: list[Kind] = []
+        for kind in kinds:
+            on = np.array([whole or name in names for name in kind.parts(network, estimate)], dtype=bool)
+            if on.any():
+                one = kind.mistakes()[mistake]
+                mended.append(one if isinstance(kind, Group) else one.select_parts(on))
+        others = [kind for kind in network.observations if not _same_group(kind, mended)]
+        a = adjust_with(replace(network, observations=(*others, *mended)))
+        first = len(network.kinds) - len(network.observations) + len(others)
+        tests = [w for one in a.observed if one.index >= first for w, _, _ in _largest(one)]
+        if tests and max(tests) <= _critical(a, first):
+            return mistake
+    return None
 
 
-def without_observations(network: Network, estimate: Estimate, gross: Gross) -> Network:
-    """Return the network without some observations and kinds of them."""
+def _same_group(kind: Kind, others: Sequence[Kind]) -> bool:
+    """Return whether observations are of a group that is among others."""
+    return isinstance(kind, Group) and any(
+        type(kind) is type(other) and kind.group == other.group
+        for other in others
+        if isinstance(other, Group)
+    )
+
+
+def _critical(a: Adjustment, first: int) -> float:
+    """Return the |w| that right observations of the kinds from an index on exceed at probability ALARM."""
+    count = sum(one.count for one in a.observed if one.index >= first)
+    return -float(normal_ppf(ALARM / (2 * max(count, 1))))
+
+
+def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:
+    """Return the largest |w| of each observation that is checked, its row and its component."""
+    w = np.where(one.redundancy_numbers > MIN_REDUNDANCY, np.abs(one.standardised), -np.inf)
+    w = np.where(np.isnan(w), -np.inf, w)
+    at = w.argmax(axis=1)
+    return [
+        (float(own[k]), row, int(k)) for row, (own, k) in enumerate(zip(w, at, strict=True)) if own[k] >= 0
+    ]
+
+
+def without_observations(
+    network: Network, estimate: Estimate, wrong: Mapping[str, Collection[str]], whole: Collection[str]
+) -> Network:
+    """Return the network without some observations, by kind, and without whole kinds of them."""
     kept = []
     for kind in network.observations:
-        names = [name_of_observation(kind, row, network, estimate) for row in range(len(kind))]
-        on = [kind.name not in gross.kinds and name not in gross.names for name in names]
-        kept.append(kind.select(np.array(on, dtype=bool)))
+        if kind.name in whole:
+            continue
+        if kind.name in wrong:
+            parts = kind.parts(network, estimate)
+            kind = kind.select_parts(np.array([name not in wrong[kind.name] for name in parts], dtype=bool))
+        kept.append(kind)
     return replace(network, observations=tuple(kind for kind in kept if len(kind)))

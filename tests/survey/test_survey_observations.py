@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network, values_of
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
+from sfm.observations.height_differences import HeightDifferences
 from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
 from sfm.observations.lines import Lines
+from sfm.observations.offset_distances import OffsetDistances
 from sfm.observations.plumb_lines import PlumbLines
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
@@ -44,10 +47,10 @@ def observed(kind: str, truth: Estimate, rng: np.random.Generator, count: int = 
     pairs = np.array([14 + rng.choice(n - 14, 2, replace=False) for _ in range(count)])
     indices: tuple[IntArray, ...] = (pairs[:, 0], pairs[:, 1])
     lever = np.zeros((count, 0))
-    if of.texts == ("image",):
-        indices = (np.arange(len(truth.position))[:count],)
-        count = len(indices[0])
-        lever = rng.uniform(-0.2, 0.2, (count, 3))
+    if of.texts_of == PHOTOGRAPH:
+        m = len(truth.position)
+        indices, count = (np.arange(m), (np.arange(m) + 3) % m)[: len(of.texts)], m
+        lever = rng.uniform(-0.2, 0.2, (count, len(of.numbers)))
     empty = of.of_table(indices, np.hstack([lever, np.zeros((count, d))]), np.full((count, d), sigma))
     exact = empty.linearise(values_of(truth)).difference
     noise = sigma * rng.standard_normal(exact.shape)
@@ -58,10 +61,15 @@ def group_of(of: type[Group], truth: Estimate, rng: np.random.Generator, sigma: 
     """Return observations of seven points, or of a station and six, with noise."""
     point = 14 + rng.choice(len(truth.points) - 14, 7, replace=False)
     rows, c = 7 - (of is HorizontalDirections), len(of.components)
-    empty = of("group", point, np.zeros((rows, c)), np.full((rows, c), sigma))
     if issubclass(of, Lines):
         point = np.arange(7) + 7 * (of is PlumbLines)
-        return of.of_group("group", point, np.zeros((7, 0)), np.full((7, 1), sigma), {})
+        return of.of_group("group", point[:, None], np.zeros((7, 0)), np.full((7, 1), sigma), {})
+    if of is OffsetDistances:
+        ends = rng.permutation(np.stack([point, np.roll(point, 2)], axis=1))
+        value = np.linalg.norm(truth.points[ends[:, 0]] - truth.points[ends[:, 1]], axis=1)[:, None] + 0.123
+        value = value + sigma * rng.standard_normal((rows, 1))
+        return of.of_group("tape", ends, value, np.full((rows, 1), sigma), {})
+    empty = of("group", point, np.zeros((rows, c)), np.full((rows, c), sigma))
     if of is RigidFrames:
         R = rotation_from_vector(rng.normal(0, 1, 3))
         value = (truth.points[point] - rng.normal(0, 1, 3)) @ R
@@ -104,7 +112,7 @@ def test_derivatives_are_those_of_differences(kind: str) -> None:
             for step in (h, -h):
                 points, position, rotation = truth.points.copy(), truth.position.copy(), truth.rotation.copy()
                 if of == PHOTOGRAPH and axis >= 3:
-                    rotation[at] = rotation[at] @ rotation_from_vector(step * np.eye(3)[axis - 3])
+                    rotation[at[0]] = rotation[at[0]] @ rotation_from_vector(step * np.eye(3)[axis - 3])
                 else:
                     (position if of == PHOTOGRAPH else points)[at[0], axis] += step
                 change.append(seen(replace(truth, points=points, position=position, rotation=rotation))[0])
@@ -248,3 +256,116 @@ def test_heights_near_nothing_give_no_scale(tmp_path: Path) -> None:
     network, flat = make_network(seed_of("no scale"), images=8, points=34, free=(), figure=flat.points)
     verdict = findings_of(run_survey(read_survey(written(tmp_path, network, flat, lines)))).verdict
     assert verdict.level == "bad" and verdict.remarks[0].kind == "scale_weak"
+
+
+def table_of(folder: Path, network: Network, kinds: dict[str, list[TableKind]]) -> str:
+    """Write tables of observations into a folder, and return what a survey file says of them."""
+    lines = ""
+    for word, ones in kinds.items():
+        of = TABLES[word]
+        for n, one in enumerate(ones):
+            names = network.images if of.texts_of == PHOTOGRAPH else network.points
+            factor, texts = one.in_tables(), list[tuple[str, ...]]()
+            if isinstance(one, OffsetDistances):
+                texts = [(one.group, *(names[one.point[k]] for k in ends)) for ends in one.ends]
+            elif isinstance(one, HorizontalDirections):
+                texts = [(names[one.point[0]], names[j]) for j in one.point[1:]]
+            elif isinstance(one, Group):
+                texts = [(one.group, names[j]) for j in one.point]
+            else:
+                pairs = zip(one.start, one.end, strict=True)  # type: ignore[attr-defined]
+                texts = [(names[i], names[j]) for i, j in pairs]
+            value, sigma = factor * one.value, factor * one.sigma  # type: ignore[attr-defined]
+            rows = [
+                ",".join([*text, *map(repr, [*v, *s])])
+                for text, v, s in zip(texts, value.tolist(), sigma.tolist(), strict=True)
+            ]
+            path = folder / f"{word.replace(' ', '_')}_{n}.csv"
+            path.write_text("\n".join([",".join((*of.texts, *of.columns())), *rows]), "utf-8")
+            lines += f'[[survey_observations]]\nkind = "{word}"\nfile = "{path.name}"\n\n'
+    return lines
+
+
+def run_with(folder: Path, network: Network, truth: Estimate, kinds: dict[str, list[TableKind]]) -> Any:
+    """Return the result of a survey with tables of observations."""
+    return run_survey(read_survey(written(folder, network, truth, table_of(folder, network, kinds))))
+
+
+@pytest.mark.parametrize(
+    ("kind", "mistake", "open_with_heights"),  # seen from below, heights and these are both the other way
+    [
+        ("zenith angle", "elevation", False),
+        ("zenith angle", "exchanged", True),
+        ("coordinate difference", "exchanged", False),
+        ("relative orientation", "exchanged", False),
+        ("horizontal direction", "counter-clockwise", True),
+        ("rigid frame", "mirrored", False),
+    ],
+)
+def test_a_mistake_in_a_whole_table_is_named(
+    kind: str, mistake: str, open_with_heights: bool, tmp_path: Path
+) -> None:
+    network, truth = network_of(f"mistake {kind}", (kind, "height difference", "distance"))
+    right, heights, tape = network.observations
+    given = {kind: [right.mistakes()[mistake]], "height difference": [heights], "distance": [tape]}
+    remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
+    said = [one for one in remarks if one.kind in ("kind_wrong", "observations_wrong")]
+    found = {(one.kind, one.names("of"), one.names("mistake")) for one in said}
+    both = {("kind_wrong", ("height differences",), ("exchanged",))} if open_with_heights else set()
+    assert found == {("kind_wrong", (TABLES[kind].name,), (mistake,))} | both
+    assert all("agree if" in one.text for one in said)
+
+
+def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
+    """One direction to another target, one height between exchanged points, a set of a second set-up."""
+    network, truth = network_of("single", ("horizontal direction", "height difference", "distance"))
+    first, heights, tape = network.observations
+    assert isinstance(first, HorizontalDirections) and isinstance(heights, HeightDifferences)
+    value, dZ = first.value.copy(), heights.value.copy()
+    value[2] += 0.01
+    dZ[4] *= -1
+    second = replace(first, value=first.value + 0.4)
+    given = {
+        "horizontal direction": [replace(first, value=value), second],
+        "height difference": [replace(heights, value=dZ)],
+        "distance": [tape],
+    }
+    result = run_with(tmp_path, network, truth, given)  # type: ignore[arg-type]
+    target, ends = network.points[first.point[3]], heights.names(network, truth)[4]
+    wrong = {
+        one.names("observations"): one.names("mistake")
+        for one in result.remarks
+        if one.kind == "observations_wrong"
+    }
+    assert wrong == {
+        (f"horizontal direction {network.points[first.point[0]]}: {target}",): (),
+        (f"height difference {ends}",): ("exchanged",),
+    }
+    sets = [kind for kind in result.network.observations if isinstance(kind, HorizontalDirections)]
+    assert [len(one.value) for one in sets] == [5, 6]
+    assert sets[1].group == f"{sets[0].group} (2)"
+
+
+def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path) -> None:
+    """A constant of 0.1 m; one distance that is misread leaves."""
+    network, truth = network_of("constant", ("distance with additive constant",))
+    (one,) = network.observations
+    assert isinstance(one, OffsetDistances)
+    value = one.value + 0.1
+    value[3] += 0.05
+    given = {"distance with additive constant": [replace(one, value=value)]}
+    result = run_with(tmp_path, network, truth, given)  # type: ignore[arg-type]
+    assert result.adjustment.has_scale
+    (kept,) = result.network.observations
+    assert len(kept.value) == 6
+    order = [network.points.index(name) for name in result.network.points]
+    sizes = [np.linalg.norm(X - X.mean(axis=0)) for X in (result.estimate.points, truth.points[order])]
+    assert sizes[0] / sizes[1] == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", list(TABLES))
+def test_the_how_to_lists_the_columns_of_every_kind(kind: str) -> None:
+    of = TABLES[kind]
+    text = (Path(__file__).parents[2] / "docs" / "how-to" / "scale-and-control.md").read_text("utf-8")
+    (row,) = [line for line in text.splitlines() if line.startswith("|") and f"`{kind}`" in line]
+    assert f"| {','.join((*of.texts, *of.columns()))} |" in row

@@ -18,14 +18,16 @@ ROWS = (
     Kind(
         "kind_wrong",
         "error",
-        "The image points contradict most {of}, and none of them took part.",
+        "The other observations contradict most {of}; none of them took part."
+        "[[ They agree if {mistake:@}.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
         "Check the table: signs, units, which point or photograph each row is of.",
     ),
     Kind(
         "observations_wrong",
         "warning",
-        "{observations:survey observation} contradicted all others and took no part: {observations}.",
+        "{observations:survey observation} contradicted all others and took no part: {observations}."
+        "[[ {observations:It agrees|They agree} if {mistake:@}.]]",
         "a misread or mistyped value, another point, or a standard deviation that is too small",
         "Correct {observations:this value|these values}, or state a larger standard deviation.",
     ),

@@ -45,7 +45,7 @@ from sfm.survey.adjusting.datum_definition import (
 )
 from sfm.survey.adjusting.exterior import add_exterior, hold_fixed
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
-from sfm.survey.adjusting.placing import scale_sigma
+from sfm.survey.adjusting.placing import place_on_observations, scale_sigma
 from sfm.survey.adjusting.settling import (
     MIN_IMAGE_POINTS,
     Settled,
@@ -414,6 +414,8 @@ def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
     estimate = scale_to_bars(task.network, estimate, task.datum)
     if task.network.observations and accepted is not None:
         task, gross = _without_gross(task, settled, estimate)
+        if gross and task.datum.kind != "control":
+            estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
     if ready is None:
@@ -466,16 +468,21 @@ def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Ta
     """Return the task without observations of tables that contradict all others, by the settled network."""
 
     def adjusted(part: Network) -> Adjustment:
-        datum = on_points(task.survey, part, start, task.datum)
-        return adjust(part, start, datum=datum, reject="none", image_sigma_factor=task.factor)
+        free = task.datum.kind != "control"
+        placed = place_on_observations(part, start) if free else start  # wrong observations turn it
+        datum = on_points(task.survey, part, placed, task.datum)
+        return adjust(part, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
 
     part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
     gross = find_gross(part, adjusted)
-    network = without_observations(task.network, estimate, gross)
-    remarks = [remark("kind_wrong", of=name) for name in gross.kinds]
-    if gross.names:
-        remarks.append(remark("observations_wrong", observations=list(gross.names)))
-    return replace(task, network=network), tuple(remarks)
+    wrong, whole = {one.kind: one.names for one in gross}, {one.kind for one in gross if one.whole}
+    remarks = tuple(
+        remark("kind_wrong", of=one.kind, mistake=one.mistake)
+        if one.whole
+        else remark("observations_wrong", observations=one.names, mistake=one.mistake)
+        for one in gross
+    )
+    return replace(task, network=without_observations(task.network, estimate, wrong, whole)), remarks
 
 
 def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:

@@ -248,11 +248,7 @@ class ObservationSettings(Section):
 class ObservationTableSettings(Section):
     """[[survey_observations]]: a table of observations beside photographs, as of tape, level or GNSS."""
 
-    # distance: from,to,length,slength | height difference: from,to,dZ,sdZ | coordinate difference:
-    # from,to,dX,dY,dZ,sdX,sdY,sdZ | zenith angle: from,to,zenith_deg,szenith_deg | horizontal direction:
-    # station,point,direction_deg,sdirection_deg | plane: group,point,offset,soffset | line, plumb line:
-    # group,point,sigma | level: group,point,height,sheight | rigid frame: group,point,X,Y,Z,sX,sY,sZ |
-    # antenna position: image,lever_x,lever_y,lever_z,X,Y,Z,sX,sY,sZ
+    # distance, height difference, plane, ...: docs/how-to/scale-and-control.md lists them with their columns
     kind: Literal[tuple(TABLES)]  # type: ignore[valid-type]
     file: Name  # a table with the columns of its kind
 
