@@ -25,7 +25,7 @@ from sfm.survey.camera_models import orient_with_models
 from sfm.survey.correspondences import find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
-from sfm.survey.inputs.exif_exterior import exterior_from_exif
+from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
@@ -92,6 +92,7 @@ def _measure(
     if survey.observations is not None:
         return survey, measurements_from_observations(survey)
     files = find_photographs(survey, images_dir=images_dir)
+    survey, clocks = moments_from_exif(survey, files)
     survey, positions = exterior_from_exif(survey, files)
     refuse_unknown_photographs(survey, files.names)
     sizes = separate_sizes(survey, files)
@@ -108,7 +109,7 @@ def _measure(
         measured,
         images=files.names,
         failed=sizes.left_out + measured.failed,
-        remarks=positions + sizes.remarks + measured.remarks,
+        remarks=clocks + positions + sizes.remarks + measured.remarks,
     )
 
 

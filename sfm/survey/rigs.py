@@ -122,10 +122,12 @@ def _moments(
 ) -> dict[int, object]:
     """Return the moment of each photograph of a rig, by its index."""
     own = [i for i in range(len(images)) if camera[i] in of_rig]
-    if rig.table is not None:
+    if rig.named:
         for i in own:
             if images[i] not in named:
-                raise SurveyFileError(f"{where}: {rig.table} has no moment of photograph '{images[i]}'")
+                raise SurveyFileError(
+                    f"{where}: {rig.table or 'EXIF data'} has no moment of photograph '{images[i]}'"
+                )
         return {i: named[images[i]] for i in own}
     if rig.moment == "order":
         counts = {a: int((camera == a).sum()) for a in of_rig}

@@ -15,7 +15,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.result import SurveyResult
-from sfm.survey.inputs.exif_exterior import observed_positions, plausible_positions
+from sfm.survey.inputs.from_exif import observed_positions, plausible_positions
 from sfm.survey.inputs.survey import read_survey
 from tests.satellite import at, state_position
 from tests.survey.test_exterior import written

@@ -18,8 +18,7 @@ ROWS = (
     Kind(
         "kind_wrong",
         "error",
-        "The other observations contradict most {of}; none of them took part."
-        "[[ They agree if {mistake:@}.]]",
+        "The other observations contradict most {of}; none of them took part.[[ They agree if {mistake:@}.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
         "Check the table: signs, units, which point or photograph each row is of.",
     ),

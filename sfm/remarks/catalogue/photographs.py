@@ -39,6 +39,15 @@ ROWS = (
         "Nothing needs to be done. If photographs that overlap are not connected, take one between them.",
     ),
     Kind(
+        "clock_differs",
+        "note",
+        "By the times in EXIF data the clock of camera {camera} is {ahead} ahead of that of camera "
+        "{reference}; "
+        "times are compared without this difference.",
+        "clocks that were not set to the same time",
+        "Check in the report that the photographs of a moment show the same scene.",
+    ),
+    Kind(
         "photographs_uneven",
         "warning",
         "The photographs differ in precision (Bartlett's test, {p:<}): sigma0 of {photograph} is {ratio} "

@@ -202,12 +202,19 @@ class RigSettings(Section):
 
     name: Name  # what people call the rig; unique in the survey
     cameras: Names  # names of its cameras; the first is the reference
-    # "order": the photographs of each camera in the order of their names; a table image,moment (.csv); else a
-    # regular expression with one group, which is the moment, searched for in the names of photographs
+    # "order": the photographs of each camera in the order of their names; "exif": by the times in their EXIF
+    # data; a table image,moment (.csv); else a regular expression with one group, which is the moment,
+    # searched for in the names of photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
+    tolerance_s: Annotated[float, Field(ge=0, le=86_400)] = 1.0  # between times of one moment, s
     # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
     # the reference camera; sigma 0 = held fixed
     mounts: Name | None = None
+
+    @property
+    def named(self) -> bool:
+        """Whether photographs are listed with their moments, by a table or EXIF data."""
+        return self.moment == "exif" or self.table is not None
 
     @property
     def table(self) -> str | None:

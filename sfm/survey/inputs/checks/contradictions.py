@@ -146,6 +146,12 @@ def refuse_contradictions(survey: SurveySettings) -> None:
                 f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
             )
     _refuse_contradictions_of_rigs(survey.rigs, survey.cameras, where)
+    for rig in survey.rigs:
+        if rig.moment == "exif" and survey.observations is not None:
+            raise SurveyFileError(
+                f"{where}: rig {rig.name}: moment = 'exif' beside [observations], which have no photographs; "
+                "name the moments by an expression, 'order' or a table"
+            )
     globs = sum(len(camera.images or ()) for camera in survey.cameras)
     if globs > MAX_GLOBS:
         raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are looked for")
@@ -341,7 +347,7 @@ def _refuse_contradictions_of_rigs(
                     f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
                 )
             owner[name] = rig.name
-        if rig.moment != "order" and rig.table is None:
+        if rig.moment != "order" and not rig.named:
             _refuse_pattern(rig.moment, here)
     for camera in cameras if rigs else ():
         if camera.per_photograph or camera.groups:

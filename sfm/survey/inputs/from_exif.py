@@ -1,9 +1,11 @@
-"""Observed projection centres of a survey from the positions in the EXIF data of its photographs."""
+"""What a survey takes from the EXIF data of its photographs: projection centres, and moments of rigs."""
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import datetime, timedelta
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import AXES
 from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
 MAX_DISTANCE_M = (
@@ -69,6 +72,82 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
     limit = (MAX_DISTANCE_M / METRES[survey.unit], survey.unit)
     remarks = (found, remark("exif_positions_far", far=far, limit=limit)) if far else (found,)
     return replace(survey, exterior=exterior, exif_sigma_m=None), remarks
+
+
+def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tuple[Remark, ...]]:
+    """Return the survey with the moments of rigs by the times in EXIF data, where rigs ask for it.
+
+    A moment begins with the first photograph that is later than the start of the one before by more than
+    the tolerance of the rig; it is named by its time. A clock that differs from that of the reference camera
+    is corrected by the offset at which most photographs have a partner.
+
+    Args:
+        survey: with rigs.
+        files: its photographs.
+
+    Returns:
+        The survey, and a remark on each clock that differs.
+
+    Raises:
+        SurveyFileError: a photograph of such a rig states no time.
+    """
+    moments, remarks = dict(survey.moments), []
+    for rig in survey.rigs:
+        if rig.moment != "exif":
+            continue
+        cameras = {one.name: one for one in survey.cameras}
+        of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
+        corrected = dict(of_rig[0])
+        for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
+            ahead = _clock_offset(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
+            corrected |= {name: taken - timedelta(seconds=ahead) for name, taken in times.items()}
+            if ahead:
+                found = remark("clock_differs", camera=camera, reference=rig.cameras[0], ahead=(ahead, "s"))
+                remarks.append(found)
+        start = datetime.min
+        for name, taken in sorted(corrected.items(), key=lambda one: one[1]):
+            if taken - start > timedelta(seconds=rig.tolerance_s):
+                start = taken
+            moments[name] = start.isoformat(sep=" ")
+    return (replace(survey, moments=moments) if moments else survey), tuple(remarks)
+
+
+def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[str, datetime]:
+    """Return when the photographs of a camera were taken, by its clock."""
+    times: dict[str, datetime] = {}
+    for name, path in zip(files.names, files.paths, strict=True):
+        if not any(fnmatch.fnmatchcase(name, glob) for glob in camera.images or ()):
+            continue
+        try:
+            taken = read_metadata(path).taken
+        except PhotographError:
+            continue  # whoever measures in it names it
+        if taken is None:
+            raise SurveyFileError(
+                f"{where}: moment = 'exif', and photograph '{name}' states no time in its EXIF data; "
+                "needed a table or an expression that names the moments, or 'order'"
+            )
+        times[name] = taken
+    return times
+
+
+def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> float:
+    """Return by how much a clock is ahead of that of the reference camera, s; 0 where it need not be.
+
+    Most pairs of photographs agree at the right offset, and of equal ones the smallest is taken.
+    """
+    if not reference or not times:
+        return 0.0
+    start = reference[0]
+    a, b = (np.array([(one - start).total_seconds() for one in some]) for some in (reference, times))
+    ahead = np.sort((b[:, None] - a).ravel())
+    last = np.searchsorted(ahead, ahead + tolerance_s, side="right")
+    count = last - np.arange(len(ahead))
+    if count.max() <= (np.abs(ahead) <= tolerance_s).sum():
+        return 0.0
+    best = np.flatnonzero(count == count.max())
+    middle = [float(np.median(ahead[k : last[k]])) for k in best]
+    return min(middle, key=abs)
 
 
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:
