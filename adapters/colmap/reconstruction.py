@@ -92,8 +92,7 @@ def _add_cameras(
     for number, on in enumerate(mounts.by_rig().values()):
         rig = pycolmap.Rig(rig_id=len(names) + number + 1)
         for k in on:
-            R = AXES @ mounts.rotation[k].T
-            from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[k])
+            from_rig = camera_from_rig(pycolmap, mounts, k)
             sensor = sensor_of(pycolmap, k)
             if k == on[0]:
                 rig.add_ref_sensor(sensor)
@@ -109,12 +108,12 @@ def _add_frame(
 ) -> None:
     """Add the photographs of one moment to a scene: image, its pose and its camera."""
     _, pose, camera = images[0]
-    rig, camera_from_rig = rigged[camera]
+    rig, from_rig = rigged[camera]
     frame = pycolmap.Frame(frame_id=images[0][0].image_id, rig_id=rig)
     for image, _, k in images:
         frame.add_data_id(pycolmap.data_t(sensor_of(pycolmap, k), image.image_id))
         image.frame_id = frame.frame_id
-    frame.rig_from_world = camera_from_rig.inverse() * pose
+    frame.rig_from_world = from_rig.inverse() * pose
     scene.add_frame(frame)
     for image, _, _ in images:
         scene.add_image(image)
@@ -208,9 +207,15 @@ def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
     return replace(start, position=position, rotation=rotation)
 
 
-def mount_of(camera_from_rig: Any) -> tuple[FloatArray, FloatArray]:
+def camera_from_rig(pycolmap: ModuleType, mounts: Mounts, camera: int) -> Any:
+    """Return COLMAP's pose of a camera in its rig, for one with COLMAP's axes of the reference camera."""
+    R = AXES @ mounts.rotation[camera].T
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[camera])
+
+
+def mount_of(from_rig: Any) -> tuple[FloatArray, FloatArray]:
     """Return position (3,) and rotation (3, 3) of a mount from COLMAP's pose of a camera in its rig."""
-    pose = camera_from_rig.matrix()
+    pose = from_rig.matrix()
     R = AXES @ pose[:, :3].T @ AXES
     return -R @ AXES @ pose[:, 3], R
 

@@ -16,12 +16,16 @@ import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_of, colmap_parameters
+from adapters.colmap.reconstruction import (
+    AXES,
+    HALF_PIXEL,
+    camera_from_rig,
+    camera_of,
+    colmap_parameters,
+)
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, Network, rows_of
-from sfm.similarity import Similarity, fit_similarity
-
-STEPS = 200  # of COLMAP's adjuster, that holds the cameras of a rig together
+from sfm.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,6 @@ def open_model(folder: Path) -> OpenModel:
     """
     scene = read_scene(folder)
     network, estimate = named_network(folder, scene)
-    network, estimate = replace(network, moment=None), replace(estimate, mounts=None)  # see _adjust_rigs
     camera_ids, image_ids = sorted(scene.cameras), sorted(scene.images)
     same = [camera_of(scene.camera(i)) for i in camera_ids]
     cameras = tuple(
@@ -93,10 +96,8 @@ def update_model(
     measured: BoolArray,
     images: BoolArray,
     points: BoolArray,
-) -> int:
-    """Put a solution into a model.
-
-    Where a photograph belongs to a rig of several cameras, COLMAP's adjuster then holds them together.
+) -> None:
+    """Put a solution into a model: cameras, mounts, poses, points and image points.
 
     Args:
         model: is changed.
@@ -105,9 +106,6 @@ def update_model(
         measured: image points measured anew; the others of adjusted points claim none any more, (k,).
         images: photographs that were adjusted, (m,).
         points: points that were adjusted, (n,).
-
-    Returns:
-        How many photographs are in rigs of several cameras.
     """
     pycolmap = load_pycolmap()
     scene, seen = model.scene, model.network.image_points
@@ -115,6 +113,11 @@ def update_model(
         for k, i in enumerate(model.camera_ids):
             if images[model.network.camera == k].any():
                 scene.camera(i).params = colmap_parameters(estimate.cameras[k])
+        for rig in scene.rigs.values():
+            for sensor in rig.non_ref_sensors:
+                k = model.camera_ids.index(sensor.id)
+                if estimate.mounts is not None and estimate.mounts.rig[k]:
+                    rig.set_sensor_from_rig(sensor, camera_from_rig(pycolmap, estimate.mounts, k))
         for i, rows in enumerate(rows_of(seen.image, len(images))):
             image = scene.image(model.image_ids[i])
             key_points = image.points2D
@@ -123,19 +126,13 @@ def update_model(
             lost = rows[~measured[rows] & points[seen.point[rows]]]
             for row in lost.tolist():
                 scene.delete_observation(model.image_ids[i], int(model.slot[row]))
-            if images[i] and image.frame.rig.num_sensors() == 1:
+            if images[i]:
                 R = AXES @ estimate.rotation[i].T
                 pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
                 image.frame.set_cam_from_world(image.camera_id, pose)
         for j, xyz in enumerate(estimate.points):
             if np.isfinite(xyz).all() and scene.exists_point3D(model.point_ids[j]):
                 scene.point3D(model.point_ids[j]).xyz = xyz
-        in_rigs = sum(
-            scene.image(model.image_ids[i]).frame.rig.num_sensors() > 1 for i in np.flatnonzero(images)
-        )
-        if in_rigs:
-            _adjust_rigs(pycolmap, scene, {model.point_ids[j] for j in np.flatnonzero(points)})
-    return int(in_rigs)
 
 
 def key_points_of(model: OpenModel) -> tuple[int, float]:
@@ -175,39 +172,6 @@ def interior_rows(
             (number, model.models[k], *one) for one in zip(camera.names, *values, sigma.tolist(), strict=True)
         ]
     return tuple(rows)
-
-
-def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:
-    """Adjust the refined points with the cameras of each rig held together, and take over what that gives.
-
-    Interior orientation is held: COLMAP frees it by groups of parameters, of all cameras alike, and would
-    free what the adjustment before held. Its gauge is free, so that the whole is brought back to where the
-    points were.
-    """
-    part = pycolmap.Reconstruction(scene)
-    for j in set(part.point3D_ids()) - points:
-        part.delete_point3D(j)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.max_num_iterations = STEPS
-    config = pycolmap.BundleAdjustmentConfig()
-    for i in part.reg_image_ids():
-        config.add_image(i)
-    for i in part.cameras:
-        config.set_constant_cam_intrinsics(i)
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, part).solve()  # as a whole, it logs
-    common = sorted(points & set(part.point3D_ids()))
-    found, wanted = (np.array([one.point3D(j).xyz for j in common]) for one in (part, scene))
-    part.transform(_sim3d(pycolmap, fit_similarity(found, wanted)))
-    for number, rig in scene.rigs.items():
-        for sensor in rig.non_ref_sensors:
-            if part.rig(number).has_sensor_from_rig(sensor):
-                rig.set_sensor_from_rig(sensor, part.rig(number).sensor_from_rig(sensor))
-    for number in scene.frames:
-        if part.frame(number).has_pose:
-            scene.frame(number).rig_from_world = part.frame(number).rig_from_world
-    for j in common:
-        scene.point3D(j).xyz = part.point3D(j).xyz
 
 
 def _sim3d(pycolmap: Any, similarity: Similarity) -> Any:

@@ -10,7 +10,6 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted
-from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
 from sfm.report.findings.given_residuals import given_of
 from sfm.report.given import given_parts
@@ -28,7 +27,6 @@ class Numbers:
     image_ids: tuple[int, ...]  # of each photograph
     point_ids: tuple[int, ...]  # of each point
     interior: tuple[tuple[object, ...], ...]  # camera, model, parameter, before, after, sigma; NaN: held
-    in_rigs: int = 0  # photographs that belong to rigs of several cameras
     written: int = 0  # key points with a point in the files
     written_px: float = 0.0  # their RMS per coordinate by COLMAP
 
@@ -50,7 +48,6 @@ def page(found: Refinement, *, numbers: Numbers, title: str) -> Page:
         numbers: as its file counts.
         title: of the page, such as the folder of the model.
     """
-    rigs = (remark("rigs_held_together", photographs=numbers.in_rigs),) if numbers.in_rigs else ()
     px = significant(found.before_px), significant(found.after_px)
     figures = f"RMS of the key points {px[0]} px before, {px[1]} px after"
     bad = f"Not dependable: {figures}"
@@ -59,7 +56,7 @@ def page(found: Refinement, *, numbers: Numbers, title: str) -> Page:
         "refinement",
         "Refinement of a COLMAP model",
         title,
-        judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad}),
+        judge(found.remarks, {"good": figures, "fair": figures, "bad": bad}),
         (
             Section("Before and after", *_changes(found, numbers, unit)),
             Section("Key points that took no part", *_reasons(found)),

@@ -101,7 +101,7 @@ def refine(
         )
     a = found.adjustment
     interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
-    in_rigs = update_model(
+    update_model(
         opened,
         found.estimate,
         xy=found.xy,
@@ -109,7 +109,7 @@ def refine(
         images=found.images,
         points=found.points_anew,
     )
-    numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs, *key_points_of(opened))
+    numbers = Numbers(opened.image_ids, opened.point_ids, interior, *key_points_of(opened))
     print(refinement_text(found), end="")
     page = page_of(found, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:

@@ -27,12 +27,4 @@ ROWS = (
         "photographs of another size or state than those of the model, or little texture",
         "Give the photographs of the model; see the reasons beside the key points.",
     ),
-    Kind(
-        "rigs_held_together",
-        "note",
-        "{photographs:photograph} {photographs:is|are} in rigs, whose cameras COLMAP's adjuster held "
-        "together afterwards.",
-        "the model has rigs of several cameras",
-        "Take the standard deviations for those without that condition.",
-    ),
 )

@@ -176,7 +176,8 @@ def whole_model(
     position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
     position[images], rotation[images] = part.position, part.rotation
     xyz[points] = part.points[: int(points.sum())]
-    oriented, seen = Estimate(part.cameras, position, rotation, xyz), network.image_points
+    oriented = Estimate(part.cameras, position, rotation, xyz, part.mounts)
+    seen = network.image_points
     other = ~points[seen.point] & images[seen.image]
     rows = np.flatnonzero(other & np.isfinite(windows.xy).all(axis=1))
     anew = ImagePoints(seen.image[rows], seen.point[rows], windows.xy[rows], windows.covariance[rows])
