@@ -3,6 +3,7 @@
     opencv-LEFT-RIGHT.yml        of each camera with the reference of its rig, for cv2.FileStorage: width,
                                  height (px), K1, D1, K2, D2, R, T, E, F, rectification R1, R2, P1, P2, Q
     dice-LEFT-RIGHT.xml          the same pairs, camera system of DICe
+    matchid-LEFT-RIGHT.caldat    the same pairs for MatchID, in mm; where the unit of length is known
     rig_config.json              COLMAP's rig configuration, of all rigs
     kalibr-RIG.yaml              camera chain of Kalibr
     ros-CAMERA.yaml              camera_info of ROS; of a rig of two cameras with rectification
@@ -12,7 +13,8 @@ Camera axes are x right, y down, z forward, pixels count from the centre of the 
 corner). Lengths are in the unit of the result; in metres, where it is known, for Kalibr, ROS and mrcal.
 
 Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
-documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; Kalibr wiki, "YAML
+documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; pyvale 2026.10, its
+example calib.caldat, whose cameras converge by x_right = R x_left + T in these axes; Kalibr wiki, "YAML
 formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal 2.5, "The .cameramodel file format".
 """
 
@@ -87,6 +89,9 @@ def write_rig_files(folder: Path, content: Content) -> None:
             pair = f"{cameras[0].camera.name}-{one.camera.name}"
             add(f"opencv-{pair}.yml", "\n".join(_opencv(cameras[0].camera, one, unit)) + "\n")
             add(f"dice-{pair}.xml", "\n".join(_dice([cameras[0], one], unit)) + "\n")
+            if metres:
+                text = "\n".join(_matchid([cameras[0], one.scaled(1000.0 * metres)]))
+                add(f"matchid-{pair}.caldat", text + "\n")
         scaled = [one.scaled(metres or 1.0) for one in cameras]
         add(f"kalibr-{rig}.yaml", "\n".join(_kalibr(scaled, in_metres)) + "\n")
         for k, one in enumerate(scaled):
@@ -171,6 +176,20 @@ def _dice(pair: list[_Mounted], unit: str) -> Iterator[str]:
             yield "      " + entry(f"ROW {r}", "string", f"{{ {_numbers(row)} }}")
         yield from ("    </ParameterList>", "  </ParameterList>")
     yield "</ParameterList>"
+
+
+def _matchid(pair: list[_Mounted]) -> Iterator[str]:
+    """Yield the lines of two cameras; T in mm, R = Rz(Psi) Ry(Phi) Rx(Theta)."""
+    for k, one in enumerate(pair):
+        K, (k1, k2, p1, p2) = _matrix(one.camera), _distortion(one.camera)
+        values = {"Fx [pixels]": K[0, 0], "Fy [pixels]": K[1, 1], "Fs [pixels]": 0.0}
+        values |= {"Kappa 1": k1, "Kappa 2": k2, "Kappa 3": 0.0, "P1": p1, "P2": p2}
+        values |= {"Cx [pixels]": K[0, 2], "Cy [pixels]": K[1, 2]}
+        yield from (f"Cam{k}_{name};{float(value)!r}" for name, value in values.items())
+    yield from (f"T{axis} [mm];{value!r}" for axis, value in zip("xyz", pair[1].T.tolist(), strict=True))
+    angles = Rotation.from_matrix(pair[1].R).as_euler("xyz", degrees=True).tolist()
+    names = ("Theta", "Phi", "Psi")
+    yield from (f"{name} [deg];{value!r}" for name, value in zip(names, angles, strict=True))
 
 
 def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict[str, Any]]]:

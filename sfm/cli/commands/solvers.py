@@ -130,7 +130,7 @@ def convert(
 
     A camera is converted where the format lacks its model. Formats: colmap, colmap-text, colmap-database,
     tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig (calibration files of rigs
-    for OpenCV, COLMAP, DICe, Kalibr, ROS and mrcal) and ply.
+    for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
     """
     with loading():
         from adapters.formats.content import with_cameras

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
@@ -238,6 +239,25 @@ def test_dice_has_the_second_camera_after_the_first(tmp_path: Path) -> None:
             if "ROW" in one.attrib["name"]
         ]
         np.testing.assert_array_equal(np.array(rows, dtype=float), R)
+
+
+def test_matchid_has_angles_and_millimetres(tmp_path: Path) -> None:
+    """As pyvale reads such a file: R from Euler angles about fixed axes."""
+    network, truth = made()
+    folder = written(tmp_path / "r", network, truth, unit="m")
+    lines = (folder / "matchid-camera_1-camera_2.caldat").read_text("utf-8").splitlines()
+    value = {name: float(number) for name, number in (line.split(";") for line in lines)}
+    pair = opencv(folder / "opencv-camera_1-camera_2.yml")
+    angles = [value[f"{name} [deg]"] for name in ("Theta", "Phi", "Psi")]
+    np.testing.assert_allclose(
+        Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), pair["R"], atol=1e-14
+    )
+    T = [value[f"T{axis} [mm]"] for axis in "xyz"]
+    np.testing.assert_allclose(T, 1e3 * pair["T"][:, 0], rtol=1e-14)
+    for k, camera in enumerate(truth.cameras):
+        names = ("Fx [pixels]", "Fy [pixels]", "Cx [pixels]", "Cy [pixels]", "Kappa 1", "Kappa 2", "P1", "P2")
+        np.testing.assert_array_equal([value[f"Cam{k}_{name}"] for name in names], camera.parameters)
+    assert not list(written(tmp_path / "no", network, truth, unit="").glob("matchid*"))
 
 
 def test_mrcal_models_are_of_the_reference_camera(tmp_path: Path) -> None:
