@@ -21,6 +21,7 @@ from sfm.observations import TABLES
 from sfm.observations.groups import Group
 from sfm.observations.kind import PHOTOGRAPH, Kind, RowKind, TableKind
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import ScaleBar
 
 if TYPE_CHECKING:
@@ -83,6 +84,11 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     for row, names in enumerate(zip(*ends, strict=True) if ends else ()):
         if len(set(names)) < len(names):
             raise SurveyFileError(f"{table.place(row)}: {kind} from {names[0]} to itself, needed two")
+    if "phi" in of.angles:
+        k = columns.index("phi_deg")
+        locked = np.abs(np.cos(np.radians(table.values[:, k : k + 1]))) < MIN_COS_PHI
+        needed = "another than +-90, where omega and kappa cannot be distinguished; exchange from and to"
+        table.refuse(table.values[:, k : k + 1], locked, ("phi_deg",), needed)
     to_rad = 1 / of.in_tables()
     value = table.values[:, :-d].copy()
     value[:, len(of.numbers) :] *= to_rad

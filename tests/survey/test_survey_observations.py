@@ -31,6 +31,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.similarity import Similarity
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.observation_tables import read_observation_table
 from tests.survey.test_rigs import written
 from tests.synthetic import make_network, seed_of
 
@@ -314,6 +315,14 @@ def test_a_mistake_in_a_whole_table_is_named(
     both = {("kind_wrong", ("height differences",), ("exchanged",))} if open_with_heights else set()
     assert found == {("kind_wrong", (TABLES[kind].name,), (mistake,))} | both
     assert all("agree if" in one.text for one in said)
+
+
+def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:
+    path, of = tmp_path / "relative.csv", TABLES["relative orientation"]
+    columns = ",".join((*of.texts, *of.columns()))
+    path.write_text(f"{columns}\na,b,1,0,0,10,90,0,1,1,1,1,1,1\n", "utf-8")
+    with pytest.raises(SurveyFileError, match="omega and kappa cannot be distinguished"):
+        read_observation_table("relative orientation", path, "survey.toml")
 
 
 def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
