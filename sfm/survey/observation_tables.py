@@ -87,7 +87,7 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     if "phi" in of.angles:
         k = columns.index("phi_deg")
         locked = np.abs(np.cos(np.radians(table.values[:, k : k + 1]))) < MIN_COS_PHI
-        needed = "another than +-90, where omega and kappa cannot be distinguished; exchange from and to"
+        needed = "another than +-90, where omega and kappa cannot be distinguished"
         table.refuse(table.values[:, k : k + 1], locked, ("phi_deg",), needed)
     to_rad = 1 / of.in_tables()
     value = table.values[:, :-d].copy()
