@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, values_of
+from sfm.observations.groups import Group
 from sfm.remarks.remark import Remark
 from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
@@ -73,6 +75,15 @@ class ObservedResiduals:
     count: int  # scalar observations
     vPv: float
     redundancy: float  # of all of them; NaN without covariance
+
+
+class GroupParameter(NamedTuple):
+    """A parameter that observations of a group have in common, such as an additive constant."""
+
+    group: str
+    name: str
+    value: float  # object unit or rad
+    sigma: float
 
 
 @dataclass(frozen=True, repr=False)
@@ -145,6 +156,20 @@ class Adjustment:
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=JointOnDemand(self),
         )
+
+    @property
+    def group_parameters(self) -> tuple[GroupParameter, ...]:
+        """Parameters of groups of observations that a survey is made to find, with standard deviations."""
+        found: list[GroupParameter] = []
+        for group in self.network.observations:
+            if isinstance(group, Group) and group.reported and len(group):
+                own = group.own_parameters(values_of(self.estimate))
+                J = own.J.reshape(len(own.J), -1)
+                C = self.solution.covariance_of([self.network.points[j] for j in group.point])
+                sigma = np.sqrt(np.diagonal(self.sigma0**2 * own.cofactor + J @ C @ J.T))
+                rows = zip(group.reported, own.value.tolist(), sigma.tolist(), strict=True)
+                found += [GroupParameter(group.group, *row) for row in rows]
+        return tuple(found)
 
     @property
     def has_scale(self) -> bool:

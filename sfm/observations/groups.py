@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
+NO_PARAMETERS = np.zeros(0)
 SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of own parameters below which one is open
 
 
@@ -33,6 +34,15 @@ class Fit(NamedTuple):
     difference: FloatArray  # computed minus observed, (r, c)
     Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
     H: FloatArray  # derivatives by the own parameters, (r, c, h)
+    own: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
+
+
+class OwnParameters(NamedTuple):
+    """Parameters of a group at some values of its points."""
+
+    value: FloatArray  # object unit or rad, (h,)
+    cofactor: FloatArray  # were the points without error, (h, h)
+    J: FloatArray  # derivatives by the points, (h, p, 3)
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,7 @@ class Group(TableKind):
 
     texts: ClassVar[tuple[str, ...]] = ("group", "point")
     labelled: ClassVar[bool] = True  # whether the first of these names the group alone, and no point
+    reported: ClassVar[tuple[str, ...]] = ()  # names of own parameters that a survey is made to find
     least: ClassVar[int]  # points that a group needs to say anything
 
     group: str
@@ -88,6 +99,15 @@ class Group(TableKind):
         H = self.fit(values.points[self.point]).H.reshape(self.sigma.size, -1)
         inverse = _inverse(H.T @ (self.weights[:, None] * H))
         return np.asarray(H @ inverse @ H.T)[None]
+
+    def own_parameters(self, values: Values) -> OwnParameters:
+        """Return the parameters named `reported`: h = -(H'W H)^-1 H'W Jx dX about these values."""
+        fit = self.fit(values.points[self.point])
+        H = fit.H.reshape(self.sigma.size, -1)
+        HW = H.T * self.weights
+        inverse = _inverse(HW @ H)
+        J = -inverse @ (HW @ fit.Jx.reshape(self.sigma.size, -1))
+        return OwnParameters(fit.own, inverse, J.reshape(len(J), -1, 3))
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
         """Return the name of the group."""

@@ -23,6 +23,7 @@ class OffsetDistances(Group):
     single: ClassVar[str] = "distances with additive constant"
     components: ClassVar[tuple[str, ...]] = ("length",)
     texts: ClassVar[tuple[str, ...]] = ("instrument", "from", "to")
+    reported: ClassVar[tuple[str, ...]] = ("additive constant",)
     least: ClassVar[int] = 3  # two distances
 
     ends: IntArray  # of each distance, which of the points, (r, 2)
@@ -35,7 +36,8 @@ class OffsetDistances(Group):
         Jx = np.zeros((len(d), 1, len(X), 3))
         Jx[row, 0, self.ends[:, 1]] = d / length[:, None]
         Jx[row, 0, self.ends[:, 0]] = -d / length[:, None]
-        return Fit((away - (w * away).sum() / w.sum())[:, None], Jx, np.ones((len(d), 1, 1)))
+        constant = -(w * away).sum() / w.sum()
+        return Fit((away + constant)[:, None], Jx, np.ones((len(d), 1, 1)), np.array([constant]))
 
     def rows(self, network: Network) -> tuple[str, ...]:
         """Return the names of both points of each distance, (r,)."""

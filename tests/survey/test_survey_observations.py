@@ -123,7 +123,7 @@ def test_derivatives_are_those_of_differences(kind: str) -> None:
 
 def test_all_kinds_at_once_have_the_scatter_that_is_stated() -> None:
     """30 networks: chi-square of a point and of v'Pv; redundancy numbers add up."""
-    sums, vPv, redundancy = 0.0, [], 0
+    sums, vPv, redundancy, constants = 0.0, [], 0, []
     for k in range(30):
         network, truth = network_of(f"all kinds {k}")
         a = adjust(network, truth, reject="none", datum=Datum("free"), sigma_px=0.1)
@@ -134,9 +134,13 @@ def test_all_kinds_at_once_have_the_scatter_that_is_stated() -> None:
         dX = a.estimate.points[3] - truth.points[3]
         sums += dX @ np.linalg.solve(a.covariance.points[3] / a.sigma0**2, dX)
         vPv.append(a.vPv)
+        (constant,) = a.group_parameters
+        constants.append((constant.value - 0.123) / (constant.sigma / a.sigma0))
         redundancy = a.redundancy
     assert stats.chi2.ppf(0.001, 90) < sums < stats.chi2.ppf(0.999, 90)
     assert stats.kstest(vPv, stats.chi2(redundancy).cdf).pvalue > 0.001
+    assert stats.kstest(constants, "norm").pvalue > 0.001
+    assert 0.7 < np.std(constants) < 1.3
 
 
 def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
