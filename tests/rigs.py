@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.camera import project
-from sfm.conventions import rotation_from_vector
+from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.network import Estimate, ImagePoints, Mounts, Network
 from tests.synthetic import SIZE_PX, make_network
 
@@ -19,6 +19,7 @@ def make_rig(
     noise_px: float = 0.1,
     free: tuple[str, ...] = (),
     planar: bool = False,
+    figure: FloatArray | None = None,
 ) -> tuple[Network, Estimate]:
     """Return a network of a rig with noisy image points, and its truth.
 
@@ -30,9 +31,10 @@ def make_rig(
         noise_px: standard deviation of an image coordinate, px.
         free: parameters of interior orientation to adjust.
         planar: whether all points lie in one plane.
+        figure: the first object points, (n, 3).
     """
     network, seen = make_network(rng, images=cameras * moments, points=points, free=free, cameras=cameras,
-                                 planar=planar)  # fmt: skip
+                                 planar=planar, figure=figure)  # fmt: skip
     a, width = np.arange(cameras), 0.4 / max(cameras - 1, 1)
     mounts = Mounts(
         np.stack([width * a, 0.05 * np.sin(a), 0.04 * np.sin(2 * a)], axis=1),

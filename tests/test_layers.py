@@ -23,6 +23,7 @@ LAYERS = (
             "sfm.network",
             "sfm.observations",
             "sfm.reduced_network",
+            "sfm.simulated_network",
             "sfm.network_check",
             "sfm.depth_reversal",
             "sfm.similarity",

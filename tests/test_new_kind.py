@@ -13,6 +13,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import FloatArray
+from sfm.network import values_of
 from sfm.observations import TABLES
 from sfm.observations.point_pairs import PointPairs
 from sfm.pipeline import run_survey
@@ -45,8 +46,8 @@ def test_a_new_kind_is_one_file_and_one_row(tmp_path: Path, monkeypatch: pytest.
     rng = seed_of("new kind")
     network, truth = make_network(rng, images=6, points=20, free=())
     pairs = np.array([rng.choice(20, 2, replace=False) for _ in range(10)])
-    exact, _ = Slopes.computed(truth.points[pairs[:, 1]] - truth.points[pairs[:, 0]])
-    noisy = exact[:, 0] + 1e-4 * rng.standard_normal(10)
+    planned = Slopes(pairs[:, 0], pairs[:, 1], np.zeros((10, 1)), np.full((10, 1), 1e-4))
+    noisy = planned.simulated(values_of(truth), rng).value[:, 0]
     noisy[4] += 2e-3
     cells = [f"{i + 1},{j + 1},{float(v)!r},1e-4" for (i, j), v in zip(pairs.tolist(), noisy, strict=True)]
     (tmp_path / "slopes.csv").write_text("\n".join(["from,to,slope,sslope", *cells]), "utf-8")

@@ -38,6 +38,10 @@ class AntennaPositions(RowKind):
         """Positions, object unit, (n, 3)."""
         return self.position
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions."""
+        return replace(self, position=values)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the photographs."""
         return (Block(PHOTOGRAPH, self.image),)

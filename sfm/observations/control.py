@@ -45,6 +45,10 @@ class ObjectPoints(Kind):
         """Those of which all three coordinates are known."""
         return self.select(np.isfinite(np.einsum("nii->ni", self.covariance)).all(axis=1))
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other coordinates."""
+        return replace(self, xyz=values)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the points."""
         return (Block(POINT, self.point),)

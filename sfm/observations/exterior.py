@@ -30,6 +30,10 @@ class ExteriorObservations(PoseObservations):
         default_factory=lambda: np.zeros((0, 6, 6))
     )  # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions and angles."""
+        return replace(self, position=values[:, :3], angles=values[:, 3:])
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the photographs."""
         return (Block(PHOTOGRAPH, self.image),)

@@ -80,6 +80,10 @@ class Group(TableKind):
         """What was observed, (1, r c)."""
         return self.value.reshape(1, -1)[: len(self)]
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return the group with other observed values."""
+        return replace(self, value=values.reshape(self.value.shape))
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the points, each a block."""
         return tuple(Block(POINT, self.point[k : k + 1][: len(self)]) for k in range(len(self.point)))

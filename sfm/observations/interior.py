@@ -40,6 +40,10 @@ class InteriorObservations(Kind):
         """The parameters, (p, 1)."""
         return self.value[:, None]
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other values."""
+        return replace(self, value=values[:, 0])
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the parameters."""
         return (Block(PARAMETER, np.stack([self.camera, self.parameter], axis=1)),)

@@ -114,6 +114,40 @@ class Kind(ABC):
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the observations."""
 
+    @abstractmethod
+    def with_values(self, values: FloatArray) -> Self:
+        """Return the observations with other observed values, (n, d)."""
+
+    def simulated(self, values: Values, rng: np.random.Generator | None = None) -> Self:
+        """Return the observations that values of the unknowns give, with errors as stated.
+
+        Args:
+            values: taken as true.
+            rng: source of the errors, normally distributed with the covariance stated; no errors if None.
+        """
+        if not len(self):
+            return self
+        exact = self.values + self.linearise(values).difference
+        return self.with_values(exact if rng is None else exact + self.draw_errors(rng))
+
+    def displaced(self, values: Values, rng: np.random.Generator) -> FloatArray:
+        """Return object points with the errors of observations that have no values, (n, 3).
+
+        A wire is straight; what is on it only nearly are the points.
+        """
+        return values.points
+
+    def draw_errors(self, rng: np.random.Generator) -> FloatArray:
+        """Return errors of the components, normally distributed; 0 where fixed or not observed, (n, d)."""
+        P = self.weight_of_all()
+        C = self.covariances() if P is None else np.linalg.inv(P)[None]
+        variance = np.diagonal(C, axis1=1, axis2=2)
+        sigma = np.sqrt(np.where(is_observed(variance), variance, 1.0))
+        R = np.where(np.isfinite(C), C, 0.0) / (sigma[:, :, None] * sigma[:, None, :])
+        values, vectors = np.linalg.eigh(R)
+        normal = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
+        return np.asarray(sigma * np.einsum("nab,nb->na", vectors, normal)).reshape(self.values.shape)
+
     def met(self, values: Values) -> FloatArray:
         """Return object points that meet the observations, near those of values, (n, 3).
 

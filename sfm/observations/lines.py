@@ -44,6 +44,19 @@ class Lines(Group):
         points[self.point] -= self.fit(X).difference @ axes
         return points
 
+    def simulated(self, values: Values, rng: np.random.Generator | None = None) -> Self:
+        """Return them as they are: no offset is observed."""
+        return self
+
+    def displaced(self, values: Values, rng: np.random.Generator) -> FloatArray:
+        """Return the points at offsets from the line that have the standard deviation stated."""
+        points = self.met(values)
+        if len(self):
+            _, axes = self.axes(points[self.point], self.weights.reshape(-1, 2)[:, 0])
+            points = points.copy()
+            points[self.point] += self.draw_errors(rng).reshape(-1, 2) @ axes
+        return points
+
     @classmethod
     def axes(cls, X: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction of the line of least squares, (3,), and two axes across it, (2, 3)."""

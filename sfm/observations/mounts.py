@@ -26,6 +26,10 @@ class MountObservations(PoseObservations):
     angles: FloatArray  # omega, phi, kappa of image axes to those of the rig, rad, (c, 3)
     covariance: FloatArray  # of both; infinite = not observed, (c, 6, 6)
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions and angles."""
+        return replace(self, position=values[:, :3], angles=values[:, 3:])
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the mounts."""
         return (Block(MOUNT, self.camera),)

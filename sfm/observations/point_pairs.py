@@ -32,6 +32,10 @@ class Pairs(RowKind):
         """What was observed, (n, d)."""
         return self.value
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other observed values."""
+        return replace(self, value=values)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return both ends."""
         return Block(self.texts_of, self.start), Block(self.texts_of, self.end)

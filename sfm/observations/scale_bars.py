@@ -39,6 +39,10 @@ class ScaleBars(Kind):
         """Lengths, object unit, (b, 1)."""
         return self.length[:, None]
 
+    def with_values(self, values: FloatArray) -> Self:
+        """Return the bars with other lengths."""
+        return replace(self, length=values[:, 0])
+
     def blocks(self) -> tuple[Block, ...]:
         """Return both ends."""
         return Block(POINT, self.start), Block(POINT, self.end)

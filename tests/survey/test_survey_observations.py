@@ -16,7 +16,15 @@ from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate, Network, values_of
+from sfm.network import (
+    Estimate,
+    ExteriorObservations,
+    InteriorObservations,
+    Network,
+    ObjectPoints,
+    ScaleBars,
+    values_of,
+)
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
 from sfm.observations.height_differences import HeightDifferences
@@ -24,14 +32,17 @@ from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
 from sfm.observations.lines import Lines
 from sfm.observations.offset_distances import OffsetDistances
+from sfm.observations.mounts import MountObservations
 from sfm.observations.plumb_lines import PlumbLines
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.similarity import Similarity
+from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
+from tests.rigs import make_rig
 from tests.survey.test_rigs import written
 from tests.synthetic import make_network, seed_of
 
@@ -53,9 +64,7 @@ def observed(kind: str, truth: Estimate, rng: np.random.Generator, count: int = 
         indices, count = (np.arange(m), (np.arange(m) + 3) % m)[: len(of.texts)], m
         lever = rng.uniform(-0.2, 0.2, (count, len(of.numbers)))
     empty = of.of_table(indices, np.hstack([lever, np.zeros((count, d))]), np.full((count, d), sigma))
-    exact = empty.linearise(values_of(truth)).difference
-    noise = sigma * rng.standard_normal(exact.shape)
-    return of.of_table(indices, np.hstack([lever, exact + noise]), np.full((count, d), sigma))
+    return empty.simulated(values_of(truth), rng)
 
 
 def group_of(of: type[Group], truth: Estimate, rng: np.random.Generator, sigma: float) -> Group:
@@ -67,16 +76,13 @@ def group_of(of: type[Group], truth: Estimate, rng: np.random.Generator, sigma: 
         return of.of_group("group", point[:, None], np.zeros((7, 0)), np.full((7, 1), sigma), {})
     if of is OffsetDistances:
         ends = rng.permutation(np.stack([point, np.roll(point, 2)], axis=1))
-        value = np.linalg.norm(truth.points[ends[:, 0]] - truth.points[ends[:, 1]], axis=1)[:, None] + 0.123
-        value = value + sigma * rng.standard_normal((rows, 1))
-        return of.of_group("tape", ends, value, np.full((rows, 1), sigma), {})
+        tape = of.of_group("tape", ends, np.zeros((rows, 1)), np.full((rows, 1), sigma), {})
+        return tape.simulated(values_of(truth), rng)
     empty = of("group", point, np.zeros((rows, c)), np.full((rows, c), sigma))
     if of is RigidFrames:
         R = rotation_from_vector(rng.normal(0, 1, 3))
-        value = (truth.points[point] - rng.normal(0, 1, 3)) @ R
-    else:
-        value = empty.linearise(values_of(truth)).difference.reshape(rows, c)
-    return replace(empty, value=value + sigma * rng.standard_normal((rows, c)))
+        empty = replace(empty, value=(truth.points[point] - rng.normal(0, 1, 3)) @ R)
+    return empty.simulated(values_of(truth), rng)
 
 
 def network_of(name: str, kinds: tuple[str, ...] = tuple(TABLES)) -> tuple[Network, Estimate]:
@@ -121,26 +127,68 @@ def test_derivatives_are_those_of_differences(kind: str) -> None:
             assert slope == pytest.approx(by[:, axis], rel=1e-5, abs=1e-5 * max(np.abs(by).max(), 1e-2))
 
 
-def test_all_kinds_at_once_have_the_scatter_that_is_stated() -> None:
-    """30 networks: chi-square of a point and of v'Pv; redundancy numbers add up."""
-    sums, vPv, redundancy, constants = 0.0, [], 0, []
-    for k in range(30):
-        network, truth = network_of(f"all kinds {k}")
-        a = adjust(network, truth, reject="none", datum=Datum("free"), sigma_px=0.1)
+def network_of_all() -> tuple[Network, Estimate]:
+    """Return a rig of two cameras with observations of every kind, tables and others, and its truth."""
+    rng = seed_of("all kinds")
+    at = np.linspace(-0.5, 0.5, 7)[:, None]
+    line, plumb = at * [0.6, 0.5, -0.4] + [0.1, 0.2, 0.1], at * [0.0, 0.0, 1.0] + [0.2, -0.3, 0.0]
+    network, truth = make_rig(
+        rng, moments=5, points=34, free=("c", "K1"), figure=np.concatenate([line, plumb])
+    )
+    assert truth.mounts is not None
+    C = np.array([[1.0, 0.3, 0.0], [0.3, 1.0, -0.2], [0.0, -0.2, 1.0]]) * 1e-8
+    pose = np.diag([1e-3] * 3 + [1e-4] * 3) ** 2
+    first = np.arange(3)
+    mount = MountObservations(np.array([1]), np.zeros((1, 3)), np.zeros((1, 3)), pose[None])
+    correlated = np.array([[1.0, 0.5], [0.5, 1.0]])
+    interior = InteriorObservations(
+        np.array([0, 0]), np.array([0, 3]), np.zeros(2), np.array([1e-3, 1e-5]), correlated
+    )
+    return replace(
+        network,
+        control=ObjectPoints(first + 20, np.zeros((3, 3)), np.tile(C, (3, 1, 1))),
+        scale_bars=ScaleBars(first + 14, first + 25, np.ones(3), np.full(3, 1e-4)),
+        exterior=ExteriorObservations(first, np.zeros((3, 3)), np.zeros((3, 3)), np.tile(pose, (3, 1, 1))),
+        interior=interior,
+        observations=(*(observed(kind, truth, rng) for kind in TABLES), mount),
+    ), truth
+
+
+@pytest.mark.parametrize("datum", ["free", "control"])
+def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
+    """50 draws, rig included: chi-square of a point and of the mount, v'Pv; redundancy numbers add up."""
+    network, truth = network_of_all()
+    points, mount, vPv, redundancy, constants = 0.0, 0.0, [], 0, []
+    (tape,) = (kind for kind in network.observations if isinstance(kind, OffsetDistances))
+    (true_constant,) = tape.own_parameters(values_of(truth)).value
+    rng = seed_of(f"scatter {datum}")
+    for _ in range(50):
+        drawn, true = simulate_network(network, truth, rng)
+        a = adjust(drawn, true, reject="none", datum=Datum(datum), sigma_px=0.1)
         assert a.converged and a.defect == a.expected_defect == 0
         kinds = by_kind(a)
-        assert kinds.names[1:] == tuple(TABLES[kind].name for kind in TABLES)
+        assert set(kinds.names[1:]) >= {kind.name for kind in TABLES.values()} | {"mounts", "scale bars"}
         assert kinds.redundancy.sum() == pytest.approx(a.redundancy, abs=1e-3)
-        dX = a.estimate.points[3] - truth.points[3]
-        sums += dX @ np.linalg.solve(a.covariance.points[3] / a.sigma0**2, dX)
+        dX = a.estimate.points[3] - true.points[3]
+        points += dX @ np.linalg.solve(a.cofactors.points[3], dX)
+        assert a.estimate.mounts is not None and true.mounts is not None
+        dm = a.estimate.mounts.position[1] - true.mounts.position[1]
+        mount += dm @ np.linalg.solve(a.cofactors.mounts[1][:3, :3], dm)
         vPv.append(a.vPv)
         (constant,) = a.group_parameters
-        constants.append((constant.value - 0.123) / (constant.sigma / a.sigma0))
+        constants.append((constant.value - true_constant) / (constant.sigma / a.sigma0))
         redundancy = a.redundancy
-    assert stats.chi2.ppf(0.001, 90) < sums < stats.chi2.ppf(0.999, 90)
+    for chi2 in (points, mount):
+        assert stats.chi2.ppf(0.001, 150) < chi2 < stats.chi2.ppf(0.999, 150)
     assert stats.kstest(vPv, stats.chi2(redundancy).cdf).pvalue > 0.001
     assert stats.kstest(constants, "norm").pvalue > 0.001
     assert 0.7 < np.std(constants) < 1.3
+
+
+def test_without_errors_every_kind_has_the_values_of_the_truth() -> None:
+    network, truth = simulate_network(*network_of_all())
+    a = adjust(network, truth, reject="none", datum="control", sigma_px=0.1)
+    assert a.vPv == pytest.approx(0.0, abs=1e-10)
 
 
 def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
