@@ -14,7 +14,7 @@ from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
-from sfm.report.numbers import finer_unit, significant, with_exponent
+from sfm.report.numbers import finer_unit, significant
 from sfm.report.page import Banner
 from sfm.report.phrases import (
     words_left_out,
@@ -22,6 +22,7 @@ from sfm.report.phrases import (
     words_of_check,
     words_of_neighbours,
     words_of_precision,
+    words_of_rigs,
     words_of_sigma0,
     words_of_test,
 )
@@ -105,21 +106,6 @@ def _failures(findings: Findings) -> list[str]:
     ]
 
 
-def _rigs(findings: Findings) -> Iterator[tuple[str, str]]:
-    """Yield where the cameras of rigs are mounted: base and angles, each with its standard deviation."""
-    unit = findings.result.length_unit
-    for rig in findings.rigs:
-        for mount in rig.mounts:
-            base = " ± ".join(with_exponent(mount.base, mount.base_sigma))
-            angles = [
-                " ± ".join(with_exponent(value, sigma))
-                for value, sigma in zip(mount.rotation_deg, mount.rotation_sigma_deg, strict=True)
-            ]
-            where = f"{mount.camera} {base} {unit} from {rig.reference}"
-            turned = f"omega, phi, kappa {', '.join(angles)} deg (1 sigma)"
-            yield f"rig {rig.name}", f"{where}; {turned}"
-
-
 def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     """Return the figures of the summary, each with its unit."""
     result, precision = findings.result, findings.precision
@@ -131,7 +117,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
         *_cameras(findings),
-        *_rigs(findings),
+        *words_of_rigs(findings.rigs, findings.result.length_unit),
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
             "object points",

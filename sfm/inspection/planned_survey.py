@@ -53,7 +53,7 @@ class _Plan(Content):
     sigma_px: Positive
     scale_bars: Annotated[int, Field(ge=0)] = 0
     target: _Target
-    camera: _Camera
+    cameras: list[_Camera]
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def read_plan(folder: Path) -> PlannedSurvey:
             f"{folder / 'plan.json'}: planned with a scale bar, which a simulation has not, so that its "
             "standard deviations cannot be compared; plan without --scale-bar"
         )
-    c = plan.camera
+    (c,) = plan.cameras
     if c.model not in MODELS or set(c.parameters) != set(MODELS[c.model].names):
         raise SurveyFileError(
             f"{folder / 'plan.json'}: camera {c.name} has not the parameters of a known model"

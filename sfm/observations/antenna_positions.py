@@ -38,6 +38,11 @@ class AntennaPositions(RowKind):
         """Positions, object unit, (n, 3)."""
         return self.position
 
+    @property
+    def without_sigma(self) -> FloatArray:
+        """Lever arms, object unit, (n, 3)."""
+        return self.lever
+
     def with_values(self, values: FloatArray) -> Self:
         """Return them with other positions."""
         return replace(self, position=values)

@@ -131,7 +131,18 @@ class Group(TableKind):
 
     def rows(self, network: Network) -> tuple[str, ...]:
         """Return what the observations of the group are called, (r,)."""
-        return tuple(network.points[j] for j in self.point[len(self.point) - len(self.value) :])
+        return tuple(" - ".join(names) for names in self.row_points(network))
+
+    def row_points(self, network: Network) -> list[tuple[str, ...]]:
+        """Return the names of the points of each observation, as columns of a table have them, (r,)."""
+        return [(network.points[j],) for j in self.point[len(self.point) - len(self.value) :]]
+
+    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+        """Return the observations as a table has them."""
+        factor, group = self.in_tables(), self.group if self.labelled else network.points[self.point[0]]
+        numbers = np.hstack([factor * self.value, factor * self.sigma])[:, -len(self.columns()) :]
+        rows = zip(self.row_points(network), numbers.tolist(), strict=True)
+        return [(group, *names, *values) for names, values in rows]
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return the group, or nothing of it."""

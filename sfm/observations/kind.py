@@ -225,6 +225,10 @@ class TableKind(Kind):
         """Return the factor of each component from rad to degrees, 1 for lengths, (d,)."""
         return np.array([np.degrees(1.0) if name in cls.angles else 1.0 for name in cls.components])
 
+    @abstractmethod
+    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+        """Return the observations as a table has them: `texts`, then `columns`."""
+
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
         """Return the unit of each component: that of lengths, or rad."""
         return (tuple("rad" if name in self.angles else length_unit for name in self.components),) * len(self)
@@ -238,6 +242,21 @@ class RowKind(TableKind):
     def covariances(self) -> FloatArray:
         """Return the covariance of each, (n, d, d)."""
         return np.eye(self.sigma.shape[1]) * self.sigma[:, None] ** 2
+
+    @property
+    def without_sigma(self) -> FloatArray:
+        """Values of `numbers`, object unit, (n, q)."""
+        return np.zeros((len(self), 0))
+
+    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+        """Return the observations as a table has them."""
+        names = [
+            [(network.images if of == PHOTOGRAPH else network.points)[i] for i in at]
+            for of, at in self.blocks()
+        ]
+        factor = self.in_tables()
+        values = np.hstack([self.without_sigma, factor * self.values, factor * self.sigma])
+        return [(*row, *numbers) for *row, numbers in zip(*names, values.tolist(), strict=True)]
 
     @classmethod
     @abstractmethod

@@ -39,10 +39,10 @@ class OffsetDistances(Group):
         constant = -(w * away).sum() / w.sum()
         return Fit((away + constant)[:, None], Jx, np.ones((len(d), 1, 1)), np.array([constant]))
 
-    def rows(self, network: Network) -> tuple[str, ...]:
+    def row_points(self, network: Network) -> list[tuple[str, ...]]:
         """Return the names of both points of each distance, (r,)."""
         names = [network.points[j] for j in self.point]
-        return tuple(f"{names[i]} - {names[j]}" for i, j in self.ends)
+        return [(names[i], names[j]) for i, j in self.ends]
 
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
         """Return the distances between some points alone."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from sfm.adjustment.result import MOTIONS
 from sfm.planning.plan import Plan
 from sfm.planning.prediction import MIN_POINTS
 from sfm.planning.wanted import MIN_RAYS
@@ -45,15 +46,16 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
     few = int((p.rays < MIN_RAYS).sum())
     if few:
         yield remark("plan_points_with_few_rays", few=few, needed=MIN_RAYS)
-    c = plan.calibration
-    if c is not None and not c.good:
-        reasons = c.reasons or ("too few image points over the photograph",)
+    bad = [c for c in plan.calibrations if not c.good]
+    if bad:
+        reasons = tuple(dict.fromkeys(reason for c in bad for reason in c.reasons))
+        reasons = reasons or ("too few image points over the photograph",)
         yield remark("plan_does_not_calibrate", reasons=reasons)
     if plan.unusable:
         yield remark("plan_photographs_apart", photographs=plan.unusable, needed=MIN_POINTS)
     if plan.design is not None and plan.design.limit:
         yield remark("plan_limited", limit=plan.design.limit)
-    if not len(p.adjustment.network.scale_bars):
+    if p.adjustment.expected_defect == MOTIONS:
         yield remark("plan_without_scale")
     if p.planned.mesh is None:
         yield remark("plan_without_surface")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import IntArray
+from sfm.network import Network
+from sfm.planning.contributions import Contribution, contributions
 from sfm.planning.design.designer import Design
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
@@ -43,7 +45,8 @@ class Plan:
     weak: tuple[WeakPoint, ...]
     unusable: tuple[str, ...]  # photographs that share too few points with others
     groups: tuple[tuple[str, ...], ...]  # of photographs that are connected, the largest first
-    calibration: Calibratability | None  # None where the camera is held
+    calibrations: tuple[Calibratability, ...]  # of the cameras that are not held
+    contributions: tuple[Contribution, ...]  # of the rig and of observations beside image points
     target: TargetSize  # that shows MIN_PIXELS from the farthest station
     coded: IntArray  # points that are coded targets, so that every photograph has five
     shots: tuple[Shot, ...]
@@ -59,19 +62,20 @@ def plan_of(
     name: str,
     unit: str,
     planned: PlannedObject,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     stations: Stations,
     seeing: Seeing,
     *,
     wanted: Wanted,
     bars: Sequence[ScaleBarPlan] = (),
+    given: Callable[[Network], Network] | None = None,
 ) -> Plan:
     """Return the plan of given stations; arguments as of `predict_network`.
 
     Raises:
         GeometryError: as `predict_network`.
     """
-    prediction = predict_network(planned, camera, stations, seeing, bars=bars)
+    prediction = predict_network(planned, camera, stations, seeing, bars=bars, given=given)
     every = np.ones(len(planned.names), dtype=bool)
     return describe_plan(name, unit, prediction, seeing, wanted, short_of(prediction, wanted, every), None)
 
@@ -88,7 +92,7 @@ def describe_plan(
     """Return what is to be said of a prediction."""
     seen = prediction.sight.seen
     coded = choose_coded(seen)
-    camera = prediction.camera
+    camera = prediction.cameras[0]
     far = max(float(d) for d in _distances(prediction))
     width = camera.size_px[0]
     size = compute_target_size(
@@ -110,7 +114,12 @@ def describe_plan(
         weak_points(prediction),
         unusable_photographs(prediction),
         separate_groups(prediction),
-        calibratability(prediction, seeing),
+        tuple(
+            found
+            for a in range(len(prediction.cameras))
+            if (found := calibratability(prediction, seeing, a)) is not None
+        ),
+        contributions(prediction),
         size,
         coded,
         shots(

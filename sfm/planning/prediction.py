@@ -10,8 +10,8 @@ Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -24,11 +24,12 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of
 from sfm.orientation.ray_angles import ray_angles
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations
+from sfm.simulated_network import simulate_network
 
 MIN_POINTS = 4  # that a photograph must show to be oriented
 MAX_JOINT = 1000  # points of whose joint covariance lengths are predicted; evenly spread ones of more
@@ -48,12 +49,16 @@ class Prediction:
     """Prediction for photographs of an object from some stations."""
 
     planned: PlannedObject
-    camera: Camera
     stations: Stations
     sight: Sight
     adjustment: Adjustment  # of the points that two or more usable photographs show, for sigma0 = 1
     point: IntArray  # place of each point of the object in that network, -1 = not in it, (n,)
     photograph: IntArray  # likewise of each photograph, (m,)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Cameras, one or those of a rig."""
+        return self.adjustment.estimate.cameras
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -112,7 +117,8 @@ class Prediction:
         m, n = np.nonzero(seen)
         away = self.planned.xyz[n] - self.stations.position[m]
         depth = -(away * self.stations.rotation[m, :, 2]).sum(axis=1)
-        return float(depth.mean() / self.camera.c_px)
+        c_px = np.array([camera.c_px for camera in self.cameras])
+        return float(depth.mean() / c_px[self.stations.camera[m]].mean())
 
     @property
     def photographs_per_station(self) -> float:
@@ -129,9 +135,7 @@ class Prediction:
     def length_sigma(self) -> float:
         """Largest sigma of a length between two determined points, object unit; of at most MAX_JOINT."""
         a = self.adjustment
-        known = self.point[self.determined]
-        n = len(known)
-        some = known[np.unique(np.linspace(0, n - 1, min(n, MAX_JOINT)).astype(np.int64))]
+        some = spread_evenly(self.point[self.determined])
         Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
         return largest_length_sigma(a.estimate.points[some], Q)
 
@@ -139,11 +143,12 @@ class Prediction:
 @checked_arguments()
 def predict_network(
     planned: PlannedObject,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     stations: Stations,
     seeing: Seeing,
     *,
     bars: Sequence[ScaleBarPlan] = (),
+    given: Callable[[Network], Network] | None = None,
     sight: Sight | None = None,
 ) -> Prediction:
     """Return what photographs from stations will give, adjusted with the free parameters of the camera.
@@ -152,10 +157,11 @@ def predict_network(
 
     Args:
         planned: the object.
-        camera: interior orientation and which of its parameters are adjusted.
-        stations: where photographs are taken from.
+        camera: interior orientation and which of its parameters are adjusted; of a rig of all its cameras.
+        stations: where photographs are taken from, and on what rig.
         seeing: limits and precision of image points.
         bars: scale bars.
+        given: returns the network with observations of further kinds, whose values do not matter.
         sight: of these stations, where it is known already.
 
     Raises:
@@ -164,9 +170,10 @@ def predict_network(
 
     Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
     """
+    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
     if sight is None:
-        sight = sight_of(planned, camera, stations.position, stations.rotation, seeing)
-    photographs, points = usable(sight.seen)
+        sight = _sight(planned, cameras, stations, seeing)
+    photographs, points = usable(sight.seen, stations.taken_at)
     if len(photographs) < 2 or not len(points):
         raise GeometryError(
             f"plan: {len(photographs)} of {len(stations)} photographs show {MIN_POINTS} or more points that "
@@ -180,17 +187,21 @@ def predict_network(
     seen = ImagePoints(i, j, sight.xy[rows, columns], sight.covariance[rows, columns])
     network = Network(
         tuple(stations.names[k] for k in photographs),
-        np.zeros(len(photographs), dtype=np.int64),
+        stations.camera[photographs],
         names,
         seen,
         scale_bars=_scale_bars(planned, place, bars),
+        moment=None if stations.taken_at is None else stations.taken_at[photographs],
     )
     estimate = Estimate(
-        (camera,), stations.position[photographs], stations.rotation[photographs], planned.xyz[points]
+        *(cameras, stations.position[photographs], stations.rotation[photographs], planned.xyz[points]),
+        stations.rig,
     )
+    if given is not None:
+        network, _ = simulate_network(given(network), estimate)
     photograph = np.full(len(stations), -1, dtype=np.int64)
     photograph[photographs] = np.arange(len(photographs))
-    found = Prediction(planned, camera, stations, sight, predict(network, estimate), place, photograph)
+    found = Prediction(planned, stations, sight, predict(network, estimate), place, photograph)
     if not found.determined.any():
         raise GeometryError(
             f"plan: {counted(len(photographs), 'photograph')} determine none of the points, needed "
@@ -200,19 +211,41 @@ def predict_network(
     return found
 
 
-def usable(seen: BoolArray) -> tuple[IntArray, IntArray]:
+def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations, seeing: Seeing) -> Sight:
+    """Return what photographs show, each by its camera."""
+    rows = rows_of(stations.camera, len(cameras))
+    parts = [
+        sight_of(planned, camera, stations.position[own], stations.rotation[own], seeing)
+        for camera, own in zip(cameras, rows, strict=True)
+    ]
+    order = np.argsort(np.concatenate(rows))
+    joined = (np.concatenate([getattr(part, field.name) for part in parts])[order] for field in fields(Sight))
+    return Sight(*joined)
+
+
+def usable(seen: BoolArray, moment: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """Return the photographs that can be oriented and the points that two of them show, as indices.
 
     Args:
         seen: which photograph shows which point, (m, n).
+        moment: of photographs of a rig, which are oriented together; each is alone if None, (m,).
     """
     photographs = np.ones(len(seen), dtype=bool)
+    together = np.arange(len(seen)) if moment is None else moment
     while True:
         points = seen[photographs].sum(axis=0) >= 2
-        left = photographs & (seen[:, points].sum(axis=1) >= MIN_POINTS)
+        shown = np.zeros((int(together.max()) + 1, int(points.sum())), dtype=bool)
+        np.logical_or.at(shown, together[photographs], seen[np.ix_(photographs, points)])
+        left = photographs & (shown.sum(axis=1)[together] >= MIN_POINTS) & seen[:, points].any(axis=1)
         if (left == photographs).all():
             return np.flatnonzero(photographs), np.flatnonzero(points)
         photographs = left
+
+
+def spread_evenly(rows: IntArray) -> IntArray:
+    """Return at most MAX_JOINT rows, evenly spread."""
+    n = len(rows)
+    return rows[np.unique(np.linspace(0, n - 1, min(n, MAX_JOINT)).astype(np.int64))]
 
 
 def largest_length_sigma(xyz: FloatArray, covariance: FloatArray) -> float:

@@ -6,14 +6,16 @@ whose figures show them; Fraser (1984), Photogramm. Eng. Remote Sens. 50(8), for
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.arguments import checked_arguments
 from sfm.camera import Camera
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.network import Mounts
 from sfm.planning.planned_object import PlannedObject
 
 FILLING = 0.9  # share of the format that the object fills
@@ -38,17 +40,51 @@ class Stations:
     names: tuple[str, ...]
     position: FloatArray  # projection centres, object unit, (m, 3)
     rotation: FloatArray  # R, image to object axes, (m, 3, 3)
+    rig: Mounts | None = None  # of the cameras that are at each station together, see `with_rig`
+    taken_by: IntArray | None = None  # which camera takes each photograph; the only one if None, (m,)
+    taken_at: IntArray | None = None  # moment of each photograph of a rig, (m,)
 
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def camera(self) -> IntArray:
+        """Index of the camera of each photograph, (m,)."""
+        return np.zeros(len(self), dtype=np.int64) if self.taken_by is None else self.taken_by
+
     def of(self, which: AnyArray) -> Stations:
         """Return some of the stations, in this order."""
-        return Stations(tuple(self.names[i] for i in which), self.position[which], self.rotation[which])
+        return Stations(
+            tuple(self.names[i] for i in which),
+            self.position[which],
+            self.rotation[which],
+            self.rig,
+            None if self.taken_by is None else self.taken_by[which],
+            None if self.taken_at is None else self.taken_at[which],
+        )
 
     def renamed(self) -> Stations:
         """Return the stations with names that count them."""
-        return Stations(_numbered(len(self)), self.position, self.rotation)
+        return replace(self, names=_numbered(len(self)))
+
+    def with_rig(self, rig: Mounts, cameras: Sequence[Camera]) -> Stations:
+        """Return the photographs of all cameras of a rig whose reference camera is at the stations.
+
+        Args:
+            rig: mounts of its cameras.
+            cameras: the same, for their names, which stand before those of the stations.
+        """
+        m, a = len(self), len(cameras)
+        of, at = np.tile(np.arange(a), m), np.repeat(np.arange(m), a)
+        R = self.rotation[at]
+        return Stations(
+            tuple(f"{camera.name}-{name}" for name in self.names for camera in cameras),
+            self.position[at] + np.einsum("mab,mb->ma", R, rig.position[of]),
+            R @ rig.rotation[of],
+            rig,
+            of,
+            at,
+        )
 
     @property
     def places(self) -> int:

@@ -40,8 +40,9 @@ class WeakPoint:
 
 @dataclass(frozen=True)
 class Calibratability:
-    """Whether a network determines the interior orientation of its camera."""
+    """Whether a network determines the interior orientation of a camera."""
 
+    camera: str  # its name
     parameters: tuple[str, ...]  # that are adjusted
     sigma: FloatArray  # predicted, in the units of the camera's model, NaN where not determined
     contribution: (
@@ -136,34 +137,38 @@ def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
 
 
 @checked_arguments()
-def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability | None:
-    """Return whether the network determines the free parameters of its camera; None where it has none.
+def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 0) -> Calibratability | None:
+    """Return whether the network determines the free parameters of a camera; None where it has none.
 
     Args:
         prediction: of the network.
         seeing: by which it was predicted.
+        camera_index: which camera of a rig.
 
     Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
     """
-    a, camera = prediction.adjustment, prediction.camera
+    a, cameras = prediction.adjustment, prediction.cameras
+    camera = cameras[camera_index]
     if not camera.free.any():
         return None
-    held = replace(camera, free=np.zeros_like(camera.free))
+    held = list(cameras)
+    held[camera_index] = replace(camera, free=np.zeros_like(camera.free))
     fixed = predict_network(prediction.planned, held, prediction.stations, seeing, sight=prediction.sight)
-    free = predict_network(prediction.planned, camera, prediction.stations, seeing, sight=prediction.sight)
-    used = prediction.photograph >= 0
+    free = predict_network(prediction.planned, cameras, prediction.stations, seeing, sight=prediction.sight)
+    used = (prediction.photograph >= 0) & (prediction.stations.camera == camera_index)
     R, X0 = prediction.stations.rotation[used], prediction.stations.position[used]
     axes = R[:, :, 2]
     depth = -((prediction.planned.xyz[None] - X0[:, None]) * axes[:, None]).sum(axis=2)
     depth = np.where(prediction.sight.seen[used], depth, np.nan)
     names = tuple(n for n, f in zip(camera.names, camera.free, strict=True) if f)
-    sigma = a.interior_sigma(0)[camera.free]
+    sigma = a.interior_sigma(camera_index)[camera.free]
+    xy = a.network.image_points.xy[a.network.camera[a.network.image_points.image] == camera_index]
     rows = {f"{n} of camera {camera.name}" for n in names}
     return Calibratability(
+        camera=camera.name,
         parameters=names,
         sigma=np.where(sigma > 0, sigma, np.nan),
-        contribution=_contribution(camera, a.covariance.interior[0], a.network.image_points.xy)
-        / prediction.sigma_px,
+        contribution=_contribution(camera, a.covariance.interior[camera_index], xy) / prediction.sigma_px,
         cost=free.rms_sigma / fixed.rms_sigma,
         rolled=rolled_share(R),
         convergence_deg=float(np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1).min()))),
@@ -171,7 +176,7 @@ def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability |
             np.max((np.nanmax(depth, axis=1) - np.nanmin(depth, axis=1)) / np.nanmean(depth, axis=1))
         ),
         correlations=tuple(pair for pair in correlations(a) if pair.first in rows),
-        with_exterior=orientation_correlations(a),
+        with_exterior=tuple(one for one in orientation_correlations(a) if one.parameter in rows),
         undetermined=tuple(a.undetermined),
     )
 

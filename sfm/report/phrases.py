@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
 from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
@@ -14,6 +16,7 @@ from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.precision import Precision
+from sfm.report.findings.rigs import Rig
 from sfm.report.numbers import NOT_DETERMINED, alike, finer_unit, significant, with_exponent
 from sfm.result import SurveyResult
 
@@ -278,3 +281,17 @@ PHRASES = {
     )
 }
 """what the templates call"""
+
+
+def words_of_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
+    """Yield each rig and where one of its cameras is mounted: base and angles with standard deviations."""
+    for rig in rigs:
+        for mount in rig.mounts:
+            base = " ± ".join(with_exponent(mount.base, mount.base_sigma))
+            angles = [
+                " ± ".join(with_exponent(value, sigma))
+                for value, sigma in zip(mount.rotation_deg, mount.rotation_sigma_deg, strict=True)
+            ]
+            where = f"{mount.camera} {base} {unit} from {rig.reference}"
+            turned = f"omega, phi, kappa {', '.join(angles)} deg (1 sigma)"
+            yield f"rig {rig.name}", f"{where}; {turned}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from sfm.files.csv_tables import CsvTable, read_table
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
-from sfm.observations.kind import PHOTOGRAPH, Kind, RowKind, TableKind
+from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, RowKind, TableKind
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import ScaleBar
@@ -52,6 +52,12 @@ class ObservationTable:
     def named(self) -> tuple[tuple[str, ...], ...]:
         """The columns of names of points or photographs, without that of labels."""
         return self.table.texts[issubclass(self.of, Group) and self.of.labelled :]
+
+    def points(self) -> Iterator[tuple[str, tuple[str, ...]]]:
+        """Yield the name and the points of each observation."""
+        if self.of.texts_of == POINT:
+            for row, points in enumerate(zip(*self.named, strict=True)):
+                yield self.name(row), points
 
     def name(self, row: int) -> str:
         """Return what an observation is called: "distance 12 - 15"."""
@@ -91,7 +97,8 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
         table.refuse(table.values[:, k : k + 1], locked, ("phi_deg",), needed)
     to_rad = 1 / of.in_tables()
     value = table.values[:, :-d].copy()
-    value[:, len(of.numbers) :] *= to_rad
+    q = len(of.numbers)
+    value[:, q:] *= to_rad[: value.shape[1] - q]
     return ObservationTable(kind, value, to_rad[:d] * sigma, table)
 
 
@@ -107,10 +114,10 @@ def bars_of(table: ObservationTable) -> list[ScaleBar]:
     ]
 
 
-def with_tables(survey: Survey, network: Network) -> Network:
-    """Return the network with the observations of a survey's tables whose points or photographs it has."""
+def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network:
+    """Return the network with the observations of tables whose points or photographs it has."""
     added: list[TableKind] = []
-    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+    for one, labels in zip(tables, _labels(tables), strict=True):
         rows = np.flatnonzero(_known(one, network))
         number = {name: k for k, name in enumerate(_names(one, network))}
         named = one.named

@@ -42,7 +42,7 @@ def with_survey_data(survey: Survey, network: Network) -> Network:
         SurveyFileError: no moment is told of a photograph of a rig, two photographs of one camera are of one
             moment, or no moment has photographs of two cameras.
     """
-    network = with_tables(survey, network)
+    network = with_tables(survey.tables, network)
     if not survey.rigs:
         return network
     key: list[object] = [(name,) for name in network.images]
@@ -69,16 +69,19 @@ def with_survey_data(survey: Survey, network: Network) -> Network:
                 f"{where}: no moment has photographs of two cameras; moments are {some}; correct moment"
             )
     order = {one: k for k, one in enumerate(dict.fromkeys(key))}
-    given = _given_mounts(survey)
-    loose = given.select(np.flatnonzero(np.trace(given.covariance, axis1=1, axis2=2) > 0))
-    return replace(
-        network,
-        moment=np.array([order[one] for one in key], dtype=np.int64),
-        observations=(*network.observations, loose) if len(loose) else network.observations,
+    return with_given_mounts(
+        survey, replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
     )
 
 
-def _given_mounts(survey: Survey) -> MountObservations:
+def with_given_mounts(survey: Survey, network: Network) -> Network:
+    """Return the network with the mounts that a survey gives as observations, unless they are held fixed."""
+    given = given_mounts(survey)
+    loose = given.select(np.flatnonzero(np.trace(given.covariance, axis1=1, axis2=2) > 0))
+    return replace(network, observations=(*network.observations, loose)) if len(loose) else network
+
+
+def given_mounts(survey: Survey) -> MountObservations:
     """Return the mounts that a survey gives.
 
     Raises:
@@ -110,6 +113,33 @@ def _given_mounts(survey: Survey) -> MountObservations:
     value, sigma = np.array(rows).reshape(-1, 2, 6).swapaxes(0, 1)
     covariance = np.eye(6) * sigma[:, None, :] ** 2
     return MountObservations(np.array(cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance)
+
+
+def planned_mounts(survey: Survey) -> Mounts:
+    """Return the mounts of the cameras of a planned survey as they are given, free unless held fixed.
+
+    Raises:
+        SurveyFileError: cameras that are on no rig, several rigs, or a camera without mount.
+    """
+    names = [camera.name for camera in survey.cameras]
+    if len(survey.rigs) != 1 or set(survey.rigs[0].cameras) != set(names):
+        on = listed([name for rig in survey.rigs for name in rig.cameras]) or "none"
+        raise SurveyFileError(
+            f"{survey.source}: cameras {listed(names)}, on rigs {on}; a plan needs one camera, or one rig of "
+            "all cameras"
+        )
+    (rig,), given = survey.rigs, given_mounts(survey)
+    missing = [name for name in rig.cameras[1:] if names.index(name) not in given.camera]
+    if missing:
+        raise SurveyFileError(
+            f"{survey.source}: rig {rig.name}: no mount of {listed(missing)}; a plan needs their mounts"
+        )
+    a, n = given.camera, len(names)
+    position, rotation = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+    free = np.zeros((n, 6), dtype=bool)
+    position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
+    rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
+    return Mounts(position, rotation, free, (rig.name,) * n)
 
 
 def _moments(
@@ -161,7 +191,7 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
     if network.moment is None:
         return estimate
     mounts = mounts_of(survey.rigs, survey.cameras, network, estimate)
-    given = _given_mounts(survey)
+    given = given_mounts(survey)
     if len(given):
         a = given.camera
         base, scale = np.linalg.norm(mounts.position[a], axis=1), 1.0

@@ -208,7 +208,7 @@ def test_the_camera_of_a_survey_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     survey = write_observed_survey(tmp_path / "s", "plan")
     given = ("dish:2,0.4", "--unit", "m", "--camera", survey, "--sigma-px", "0.1", "--points", 20)
     assert plan(*given, "--stations", "hemisphere:8", "--out", tmp_path / "plan") == 0
-    camera = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))["camera"]
+    camera = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))["cameras"][0]
     assert camera["name"] == "synthetic" and camera["free"] == ["c"] and camera["parameters"]["K1"] == 8e-4
     text = survey.read_text(encoding="utf-8").replace("c_mm = 10.0\n", "")
     survey.write_text(text, encoding="utf-8")

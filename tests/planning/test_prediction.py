@@ -25,6 +25,7 @@ from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
 from sfm.report.viewer.scene import distance_sigmas
 from sfm.similarity import fit_similarity
+from sfm.simulated_network import simulate_network
 from tests.places import DATASETS, SHARED
 from tests.synthetic import make_network, seed_of
 
@@ -83,18 +84,9 @@ def sampling_score(prediction: Prediction, rng: np.random.Generator, runs: int) 
     n = len(a.network.points)
     Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(n))
     q = np.diagonal(Q)
-    seen = a.network.image_points
-    L = np.linalg.cholesky(seen.covariance)
-    bars = a.network.scale_bars
     total = []
     for _ in range(runs):
-        noise = np.einsum("kab,kb->ka", L, rng.standard_normal(seen.xy.shape))
-        length = bars.length + bars.sigma * rng.standard_normal(len(bars))
-        noisy = replace(
-            a.network,
-            image_points=replace(seen, xy=seen.xy + noise),
-            scale_bars=replace(bars, length=length),
-        )
+        noisy, _ = simulate_network(a.network, a.estimate, rng)
         found = adjust(noisy, a.estimate, reject="none", covariance=False)
         assert found.converged
         total.append((((found.estimate.points - a.estimate.points).ravel() ** 2) / q).mean())

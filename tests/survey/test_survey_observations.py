@@ -31,8 +31,8 @@ from sfm.observations.height_differences import HeightDifferences
 from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
 from sfm.observations.lines import Lines
-from sfm.observations.offset_distances import OffsetDistances
 from sfm.observations.mounts import MountObservations
+from sfm.observations.offset_distances import OffsetDistances
 from sfm.observations.plumb_lines import PlumbLines
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
@@ -78,7 +78,8 @@ def group_of(of: type[Group], truth: Estimate, rng: np.random.Generator, sigma: 
         ends = rng.permutation(np.stack([point, np.roll(point, 2)], axis=1))
         tape = of.of_group("tape", ends, np.zeros((rows, 1)), np.full((rows, 1), sigma), {})
         return tape.simulated(values_of(truth), rng)
-    empty = of("group", point, np.zeros((rows, c)), np.full((rows, c), sigma))
+    name = str(point[0] + 1) if of is HorizontalDirections else "group"
+    empty = of(name, point, np.zeros((rows, c)), np.full((rows, c), sigma))
     if of is RigidFrames:
         R = rotation_from_vector(rng.normal(0, 1, 3))
         empty = replace(empty, value=(truth.points[point] - rng.normal(0, 1, 3)) @ R)

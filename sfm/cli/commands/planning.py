@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
+from sfm.cli.commands.planning_inputs import (
+    Planned,
+    bars_of,
+    camera_of,
+    numbers,
+    object_of,
+    stations_of,
+    survey_plan,
+)
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.planning.sight import MIN_PIXELS
@@ -112,13 +120,25 @@ def network_command(
         ),
     ],
     camera: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--camera",
             metavar="CAMERA",
             help="Survey file, result folder, or a camera of the list, such as full-frame-24.",
         ),
-    ],
+    ] = None,
+    survey: Annotated[
+        Path | None,
+        typer.Option(
+            "--survey",
+            metavar="FILE.toml",
+            help="Planned survey: its cameras, rig, scale bars and survey observations, in place of "
+            "--camera. Values of its tables are not used.",
+        ),
+    ] = None,
+    free_mounts: Annotated[
+        bool, typer.Option("--free-mounts", help="Mounts of the rig are to be found, not given.")
+    ] = False,
     c: Annotated[
         float | None, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")
     ] = None,
@@ -237,10 +257,18 @@ def network_command(
         raise SurveyFileError(
             "plan: needed --sigma-px or --target-diameter, which say how precise image points are"
         )
+    if (camera is None) == (survey is None):
+        raise SurveyFileError("plan: needed --camera or --survey, one of them")
+    if survey is not None and any(one is not None for one in (c, camera_name, free)):
+        raise SurveyFileError(f"--survey {survey}: --c-mm, --camera-name and --free are for --camera")
     to_mm = METRES[unit] * 1000
     with working_on(planned), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
         object_ = object_of(planned, points, open_mesh=open_mesh)
-        one = camera_of(camera, camera_name, c, free)
+        if survey is not None:
+            taken = survey_plan(survey, object_, unit, free_mounts=free_mounts)
+        else:
+            taken = Planned((camera_of(str(camera), camera_name, c, free),))
+        one = taken.reference
         depth = _depth(one, f_number, focus, confusion, to_mm)
         seeing = Seeing(
             max_incidence_deg=incidence,
@@ -249,19 +277,28 @@ def network_command(
             sigma_px=sigma_px,
             target=TargetImage(contrast, noise, blur),
         )
-        bars = bars_of(scale_bar)
+        bars = (*taken.bars, *bars_of(scale_bar))
         name = Path(planned).stem if ":" not in planned else planned
         if stations is not None:
-            given = stations_of(stations, object_, one)
-            found = plan_of(name, unit, object_, one, given, seeing, wanted=wanted, bars=bars)
+            placed = taken.photographs(stations_of(stations, object_, one))
+            found = plan_of(
+                *(name, unit, object_, taken.cameras, placed, seeing),
+                wanted=wanted,
+                bars=bars,
+                given=taken.given,
+            )
         else:
+            taken.refuse_to_design()
             allowed = Allowed(
                 None if distance is None else _two(numbers("--distance", distance, 2)),
                 None if space is None else _space(space),
                 floor,
             )
             design = design_network(
-                object_, one, allowed, seeing, wanted, max_photographs=photographs, bars=bars
+                *(object_, one, allowed, seeing, wanted),
+                max_photographs=photographs,
+                bars=bars,
+                given=taken.given,
             )
             found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
     page = write_page(found, out)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfm.display import counted
+from sfm.display import counted, listed
 from sfm.errors import SurveyFileError
 
 if TYPE_CHECKING:
     from sfm.camera import Camera
+    from sfm.network import Mounts, Network
     from sfm.planning.planned_object import PlannedObject
     from sfm.planning.prediction import ScaleBarPlan
     from sfm.planning.stations import Stations
+    from sfm.survey.inputs.settings import CameraSettings
+    from sfm.survey.inputs.survey import Survey
+    from sfm.survey.observation_tables import ObservationTable
 
 
 NORMALS = ("nX", "nY", "nZ")
@@ -175,7 +180,6 @@ def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera
 
 
 def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
-    from sfm.camera import camera_from_values
     from sfm.survey.inputs.survey import read_survey
 
     setups = read_survey(path).cameras
@@ -183,7 +187,12 @@ def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
     if len(found) != 1:
         names = ", ".join(one.name for one in setups)
         raise SurveyFileError(f"{path}: cameras {names:.80}, say one of them with --camera-name")
-    (one,) = found
+    return _of_settings(path, found[0], c_mm)
+
+
+def _of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> Camera:
+    from sfm.camera import camera_from_values
+
     c = c_mm if c_mm is not None else one.c_mm
     if c is None:
         raise SurveyFileError(f"{path}: camera {one.name} has no focal length, needed c_mm there or --c-mm")
@@ -198,3 +207,91 @@ def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
     return camera_from_values(
         one.name, one.model, one.size_px, pixel, c_mm=c, free=one.may_be_free, values=(*one.fixed, *one.start)
     )
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Cameras of a plan, and what is observed beside image points."""
+
+    cameras: tuple[Camera, ...]
+    rig: Mounts | None = None
+    bars: tuple[ScaleBarPlan, ...] = ()
+    given: Callable[[Network], Network] | None = None
+    survey: Survey | None = None
+
+    @property
+    def reference(self) -> Camera:
+        """The camera, of a rig the one that stations are of."""
+        return self.cameras[0 if self.rig is None else int(self.rig.at_reference.argmax())]
+
+    def photographs(self, stations: Stations) -> Stations:
+        """Return the photographs of all cameras at stations.
+
+        Raises:
+            SurveyFileError: an observation of a photograph that is not among them.
+        """
+        if self.rig is not None:
+            stations = stations.with_rig(self.rig, self.cameras)
+        for table in self._tables_of_photographs():
+            missing = [name for name in table.table.texts[0] if name not in stations.names]
+            if missing:
+                raise SurveyFileError(
+                    f"{table.table.path}: photograph '{missing[0]}' is not in the plan; it has "
+                    f"{listed(stations.names, most=4)}"
+                )
+        return stations
+
+    def refuse_to_design(self) -> None:
+        """Refuse what needs stations that are given.
+
+        Raises:
+            SurveyFileError: a rig, or observations of photographs.
+        """
+        if self.rig is not None or self._tables_of_photographs():
+            raise SurveyFileError("plan: a rig or observations of photographs need --stations")
+
+    def _tables_of_photographs(self) -> list[ObservationTable]:
+        tables = () if self.survey is None else self.survey.tables
+        return [table for table in tables if table.of.texts == ("image",)]
+
+
+def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: bool) -> Planned:
+    """Return cameras, rig, scale bars and observations of a planned survey.
+
+    Args:
+        path: survey file.
+        planned: the object.
+        unit: of lengths, of the plan.
+        free_mounts: whether mounts are to be found, so that those given are only where they are planned.
+
+    Raises:
+        SurveyFileError: another unit of lengths, no rig of all cameras, or an observation of points that the
+            object has not.
+    """
+    import numpy as np
+
+    from sfm.planning.prediction import ScaleBarPlan
+    from sfm.survey.inputs.survey import read_survey
+    from sfm.survey.observation_tables import with_tables
+    from sfm.survey.rigs import planned_mounts, with_given_mounts
+
+    survey = read_survey(path)
+    if survey.unit != unit:
+        raise SurveyFileError(f"{path}: unit '{survey.unit}', the plan is in '{unit}'; see --unit")
+    cameras = tuple(_of_settings(path, one) for one in survey.cameras)
+    rig = None if len(cameras) == 1 and not survey.rigs else planned_mounts(survey)
+    if rig is not None and free_mounts:
+        rig = replace(rig, free=np.tile(~rig.at_reference[:, None], (1, 6)))
+    known = set(planned.names)
+    ends = [(f"scale bar {bar.start} - {bar.end}", (bar.start, bar.end)) for bar in survey.scale_bars]
+    for what, points in (*ends, *(row for table in survey.tables for row in table.points())):
+        missing = [point for point in points if point not in known]
+        if missing:
+            raise SurveyFileError(f"{path}: {what}: point '{missing[0]}' is not in the object of the plan")
+
+    def given(network: Network) -> Network:
+        network = with_tables(survey.tables, network)
+        return network if rig is None or free_mounts else with_given_mounts(survey, network)
+
+    bars = tuple(ScaleBarPlan(bar.start, bar.end, bar.sigma) for bar in survey.scale_bars)
+    return Planned(cameras, rig, bars, given, survey)

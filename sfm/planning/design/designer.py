@@ -10,7 +10,7 @@ choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
+from sfm.network import Network
 from sfm.planning.design.candidates import COUNT, Allowed, Candidates, candidates
 from sfm.planning.design.gain import cost_of, gains, image_rows
 from sfm.planning.planned_object import PlannedObject
@@ -61,6 +62,7 @@ def design_network(
     max_photographs: int = MAX_PHOTOGRAPHS,
     count: int = COUNT,
     bars: Sequence[ScaleBarPlan] = (),
+    given: Callable[[Network], Network] | None = None,
 ) -> Design:
     """Return the few stations that give what is wanted.
 
@@ -73,6 +75,7 @@ def design_network(
         max_photographs: photographs at most.
         count: candidates for stations, each upright and rolled.
         bars: scale bars.
+        given: as of `predict_network`.
 
     Raises:
         GeometryError: no room to stand in, or nothing can be determined from there.
@@ -84,7 +87,7 @@ def design_network(
             f"plan: at most {counted(max_photographs, 'photograph')}, needed {FEWEST} or more"
         )
     found = candidates(planned, camera, allowed, seeing, count=count)
-    return _Designer(planned, camera, seeing, wanted, found, max_photographs, bars).run()
+    return _Designer(planned, camera, seeing, wanted, found, max_photographs, bars, given).run()
 
 
 class _Designer:
@@ -99,9 +102,10 @@ class _Designer:
         found: Candidates,
         most: int,
         bars: Sequence[ScaleBarPlan],
+        given: Callable[[Network], Network] | None,
     ) -> None:
         self.planned, self.camera, self.seeing, self.wanted = planned, camera, seeing, wanted
-        self.found, self.most, self.bars = found, most, bars
+        self.found, self.most, self.bars, self.given = found, most, bars, given
         self.rows = image_rows(planned, camera, found.stations, found.sight)
         self.single = np.einsum("mnai,mnaj->mnij", self.rows, self.rows)
         self.prior = np.eye(3) / planned.size**2  # what is known of a point that nothing shows yet
@@ -177,6 +181,7 @@ class _Designer:
                 self.found.stations.of(which).renamed(),
                 self.seeing,
                 bars=self.bars,
+                given=self.given,
                 sight=self.found.sight.of(which),
             )
         except GeometryError:  # too few photographs yet

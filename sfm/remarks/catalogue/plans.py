@@ -70,8 +70,8 @@ ROWS = (
         "plan_without_scale",
         "note",
         "The scale is taken as known: without a scale bar, standard deviations leave it out.",
-        "no scale bar was planned",
-        "Give --scale-bar.",
+        "no scale bar and nothing else that gives the scale was planned",
+        "Give --scale-bar, or observations in a survey file with --survey.",
     ),
     Kind(
         "plan_without_surface",

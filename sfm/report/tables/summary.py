@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of
 from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
 from sfm.result import SurveyResult
@@ -118,30 +120,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
             }
             for index, camera in enumerate(adjustment.estimate.cameras)
         ],
-        "rigs": [
-            {
-                "name": rig.name,
-                "reference": rig.reference,
-                "moments": rig.moments,
-                "mounts": [
-                    {"camera": mount.camera}
-                    | {
-                        name: {"value": or_none(value), "sigma": or_none(sigma)}
-                        for name, value, sigma, is_length in mount.values
-                        if is_length
-                    }
-                    | {
-                        "rotation_deg": {
-                            name: {"value": or_none(value), "sigma": or_none(sigma)}
-                            for name, value, sigma, is_length in mount.values
-                            if not is_length
-                        }
-                    }
-                    for mount in rig.mounts
-                ],
-            }
-            for rig in findings.rigs
-        ],
+        "rigs": summary_of_rigs(findings.rigs),
         "statistics": summary_of_statistics(findings),
         "consistency": summary_of_consistency(findings),
         "geometry": _geometry(findings),
@@ -293,3 +272,29 @@ def summary_of_baseline(result: SurveyResult) -> dict[str, Any] | None:
         "targets": found.targets,
         **values_of(found, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
     }
+
+
+def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
+    """Return what files of a result or a plan say of rigs: every mount with its standard deviations."""
+    return [
+        {
+            "name": rig.name,
+            "reference": rig.reference,
+            "moments": rig.moments,
+            "mounts": [
+                {"camera": mount.camera}
+                | {name: _value(*one) for name, *one, is_length in mount.values if is_length}
+                | {
+                    "rotation_deg": {
+                        name: _value(*one) for name, *one, is_length in mount.values if not is_length
+                    }
+                }
+                for mount in rig.mounts
+            ],
+        }
+        for rig in rigs
+    ]
+
+
+def _value(value: float, sigma: float) -> dict[str, float | None]:
+    return {"value": or_none(value), "sigma": or_none(sigma)}

@@ -114,11 +114,11 @@ def plan_viewer(plan: Plan) -> Viewer:
     m, n = np.nonzero(p.sight.seen)
     network = Network(
         p.stations.names,
-        np.zeros(len(p.stations), dtype=np.int64),
+        p.stations.camera,
         p.planned.names,
         ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
     )
-    estimate = Estimate((p.camera,), p.stations.position, p.stations.rotation, p.planned.xyz)
+    estimate = Estimate(p.cameras, p.stations.position, p.stations.rotation, p.planned.xyz)
     covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
     of_position = np.full((len(p.stations), 3, 3), np.nan)
     used = p.photograph >= 0

@@ -1,0 +1,123 @@
+"""What the rig and each kind of observation beside image points add to a planned network.
+
+Precision is that of the shape of the object: its standard deviations with inner constraints for position,
+attitude and scale, in which networks with different datum can be compared.
+
+Source: Baarda (1973), S-transformations and criterion matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import predict
+from sfm.conventions import BoolArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network, ScaleBars
+from sfm.observations.mounts import MountObservations
+from sfm.planning.prediction import Prediction, spread_evenly, usable
+from sfm.reduced_network import reduce_network
+from sfm.similarity import similarity_motions
+
+RIG = "rig"
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """A kind of observation of a plan, or its rig."""
+
+    name: str  # of the kind
+    count: int  # observations, or moments of the rig
+    motions: int  # of position, attitude and scale that nothing else gives
+    points: int  # that nothing else determines
+    sigma_without: float  # of the shape of the other points, RMS of a coordinate, object unit
+    sigma_with: float
+
+    @property
+    def gain(self) -> float:
+        """Standard deviations of points without it over those with it."""
+        return self.sigma_without / self.sigma_with
+
+
+def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
+    """Return what the rig and each kind of observations add to a plan."""
+    a = prediction.adjustment
+    found = []
+    if a.estimate.mounts is not None and a.network.moment is not None:
+        moments = len(np.unique(a.network.moment))
+        found.append(_contribution(a, RIG, moments, *_without_rig(a.network, a.estimate)))
+    for name in dict.fromkeys(kind.name for kind in a.network.kinds if len(kind)):
+        count = sum(len(kind) for kind in a.network.kinds if kind.name == name)
+        found.append(_contribution(a, name, count, *_without(a.network, a.estimate, name)))
+    return tuple(found)
+
+
+def _contribution(a: Adjustment, name: str, count: int, network: Network, estimate: Estimate) -> Contribution:
+    """Return what is gained from a network without a kind to the whole one."""
+    try:
+        less = predict(network, estimate)
+    except GeometryError:  # others that need a scale, which only this one gives
+        rest = tuple(kind for kind in network.observations if not kind.needs_scale)
+        less = predict(replace(network, observations=rest), estimate)
+    known, left = _determined(a), _determined(less)
+    place = {point: j for j, point in enumerate(less.network.points) if left[j]}
+    both = [(j, place[point]) for j, point in enumerate(a.network.points) if known[j] and point in place]
+    whole, part = spread_evenly(np.array(both, dtype=np.int64).reshape(-1, 2)).T
+    return Contribution(
+        name,
+        count,
+        less.expected_defect - a.expected_defect,
+        int(known.sum()) - len(both),
+        shape_sigma(less, part),
+        shape_sigma(a, whole),
+    )
+
+
+def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, Estimate]:
+    """Return a network without the observations of a kind."""
+    mounts = estimate.mounts
+    if name == MountObservations.name and mounts is not None:
+        given = [a for one in network.observations if isinstance(one, MountObservations) for a in one.camera]
+        free = mounts.free.copy()
+        free[given] = True
+        estimate = replace(estimate, mounts=replace(mounts, free=free))
+    return replace(
+        network,
+        scale_bars=ScaleBars() if name == ScaleBars.name else network.scale_bars,
+        observations=tuple(kind for kind in network.observations if kind.name != name),
+    ), estimate
+
+
+def _without_rig(network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return a network of single photographs, of those that can be oriented alone."""
+    network, _ = _without(replace(network, moment=None), estimate, MountObservations.name)
+    seen = network.incidence(np.ones(len(network.image_points), dtype=bool)).toarray() > 0
+    images, points = np.zeros(len(network.images), dtype=bool), np.zeros(len(network.points), dtype=bool)
+    left = usable(seen)
+    images[left[0]], points[left[1]] = True, True
+    every = np.ones(len(network.image_points), dtype=bool)
+    return reduce_network(network, replace(estimate, mounts=None), images, points, every)
+
+
+def _determined(a: Adjustment) -> BoolArray:
+    """Return which points have a covariance, (n,)."""
+    trace = np.trace(a.covariance.points, axis1=1, axis2=2)
+    return np.asarray(np.isfinite(trace) & (trace > 0))
+
+
+def shape_sigma(adjustment: Adjustment, points: IntArray) -> float:
+    """Return the standard deviation of points with inner constraints on them, RMS of a coordinate.
+
+    Args:
+        adjustment: of the network.
+        points: index of each, three or more, (n,).
+    """
+    X = adjustment.estimate.points[points]
+    Q = marginal_of(adjustment).joint(np.zeros(0, dtype=np.int64), points)
+    motions = similarity_motions(X, centre=X.mean(axis=0), size=float(np.ptp(X, axis=0).max()))
+    H = np.linalg.qr(motions.reshape(-1, 7))[0]
+    return float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))

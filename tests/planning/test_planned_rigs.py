@@ -1,0 +1,141 @@
+"""Plans of rigs and of observations of every kind: what is predicted, and what each of them adds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.conventions import angles_from_rotation
+from sfm.files.plain_text import csv_text
+from sfm.network import Estimate, Network
+from sfm.observations import TABLES
+from sfm.observations.kind import TableKind
+from sfm.planning.contributions import contributions
+from sfm.planning.planned_object import shape_object
+from sfm.planning.prediction import predict_network
+from sfm.planning.sight.visibility import Seeing
+from sfm.planning.stations import arrangement
+from tests.cli.test_planning_commands import plan, rows
+from tests.rigs import make_rig
+from tests.survey.test_survey_observations import network_of_all
+from tests.synthetic import seed_of
+
+STATIONS = ("--unit", "m", "--sigma-px", "0.1", "--stations", "hemisphere:6")
+
+
+def planned_survey(folder: Path, network: Network, truth: Estimate, sigma: float = 1e-4) -> Path:
+    """Write the survey file of a plan: its cameras, rig and survey observations; beside it points.csv."""
+    assert truth.mounts is not None
+    points = [(name, *xyz) for name, xyz in zip(network.points, truth.points.tolist(), strict=True)]
+    (folder / "points.csv").write_text(csv_text(("id", "X", "Y", "Z"), points), "utf-8")
+    lines = ['[survey]\nname = "plan"\nunit = "m"\n']
+    for camera in truth.cameras:
+        lines += [f'[[camera]]\nname = "{camera.name}"\nimages = "{camera.name}-*"\nfree = []']
+        lines += [f"size_px = {list(camera.size_px)}\npixel_mm = {camera.pixel_mm.tolist()}\nc_mm = 10.0\n"]
+    names = [camera.name for camera in truth.cameras]
+    lines += [f'[[rig]]\nname = "stereo"\ncameras = {json.dumps(names)}\nmoment = "-(.*)"']
+    lines += ['mounts = "mounts.csv"\n']
+    columns = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
+    mounts = [
+        (name, *X, *np.degrees(angles_from_rotation(R)), *[sigma] * 3, *[np.degrees(sigma)] * 3)
+        for name, X, R in zip(names[1:], truth.mounts.position[1:], truth.mounts.rotation[1:], strict=True)
+    ]
+    header = ("camera", *columns, *(f"s{name}" for name in columns))
+    (folder / "mounts.csv").write_text(csv_text(header, mounts), "utf-8")
+    for number, one in enumerate(network.observations, 1):
+        for kind, of in TABLES.items():
+            if type(one) is of:
+                table = csv_text((*of.texts, *of.columns()), one.table_rows(network))
+                (folder / f"{number}.csv").write_text(table, "utf-8")
+                lines += [f'[[survey_observations]]\nkind = "{kind}"\nfile = "{number}.csv"\n']
+    path = folder / "survey.toml"
+    path.write_text("\n".join(lines), "utf-8")
+    return path
+
+
+def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, truth = network_of_all()
+    path = planned_survey(tmp_path, network, truth)
+    table = next(k for k, one in enumerate(network.observations, 1) if one.name == "antenna positions")
+    text = (tmp_path / f"{table}.csv").read_text("utf-8")
+    for k in range(5):  # of photographs of the plan
+        for camera in (1, 2):
+            text = text.replace(f"moment {k + 1} camera {camera},", f"camera {camera}-S{k + 1},")
+    (tmp_path / f"{table}.csv").write_text(text, "utf-8")
+    out = tmp_path / "plan"
+    assert plan(tmp_path / "points.csv", "--survey", path, *STATIONS, "--out", out) == 0
+    printed = capsys.readouterr().out
+    found = json.loads((out / "plan.json").read_text("utf-8"))
+    gain = {one["name"]: one for one in found["contributions"]}
+    kinds = {of.name for name, of in TABLES.items() if name != "distance"} | {"mounts", "scale bars", "rig"}
+    assert set(gain) == kinds
+    assert all(one["gain"] >= 1 - 1e-9 for one in gain.values()) and gain["rig"]["gain"] > 1.0001
+    assert {row[""] if "" in row else row["kind"] for row in rows(out / "gain.csv")} == kinds
+    assert "gain by plumb lines: points 1." in printed and "rig stereo: camera 2 0.4" in printed
+    (mount,) = found["rigs"][0]["mounts"]
+    assert 0 < mount["base"]["sigma"] < 1e-4 and found["photographs"] == 12
+    assert "plan_without_scale" not in {one["kind"] for one in found["remarks"]}
+
+
+def test_what_only_a_kind_gives_is_counted_as_motions() -> None:
+    plate = shape_object("plate", (1.0, 0.7), 30)
+    _, truth = make_rig(seed_of("motions"))
+    assert truth.mounts is not None
+    stations = arrangement("ring:5", plate, truth.cameras[0]).with_rig(truth.mounts, truth.cameras)
+    prediction = predict_network(plate, truth.cameras, stations, Seeing(sigma_px=0.1))
+    (rig,) = contributions(prediction)
+    assert (rig.name, rig.count, rig.motions) == ("rig", 5, 0) and rig.gain > 1.0
+    assert rig.sigma_with == pytest.approx(prediction.rms_sigma)  # both with inner constraints on all points
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("--camera", "full-frame-24"), "needed --camera or --survey, one of them"),
+        (("--free", "c"), "--c-mm, --camera-name and --free are for --camera"),
+        (("--unit", "mm"), "unit 'm', the plan is in 'mm'"),
+    ],
+)
+def test_contradicting_options_are_refused(
+    change: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, truth = make_rig(seed_of("refused"), moments=3)
+    path = planned_survey(tmp_path, network, truth)
+    assert plan(tmp_path / "points.csv", "--survey", path, *STATIONS, *change) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+
+
+def test_unknown_points_and_photographs_of_a_plan_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, truth = network_of_all()
+    path = planned_survey(tmp_path, network, truth)
+    given = (tmp_path / "points.csv", "--survey", path, *STATIONS)
+    assert plan(*given) == 2
+    assert "photograph 'moment 1 camera 1' is not in the plan" in capsys.readouterr().err
+    assert plan(*given[:3], "--unit", "m", "--sigma-px", "0.1", "--sigma", "0.001") == 2
+    assert "a rig or observations of photographs need --stations" in capsys.readouterr().err
+    text = (tmp_path / "points.csv").read_text("utf-8").splitlines()
+    (tmp_path / "points.csv").write_text("\n".join(text[:-5]), "utf-8")
+    assert plan(*given) == 2
+    assert "is not in the object of the plan" in capsys.readouterr().err
+
+
+def test_every_kind_is_written_as_the_table_that_it_is_read_from(tmp_path: Path) -> None:
+    from sfm.survey.observation_tables import read_observation_table, with_tables
+
+    network, truth = network_of_all()
+    planned_survey(tmp_path, network, truth)
+    for number, one in enumerate(network.observations, 1):
+        if isinstance(one, TableKind):
+            (kind,) = (kind for kind, of in TABLES.items() if type(one) is of)
+            table = read_observation_table(kind, tmp_path / f"{number}.csv", "survey.toml")
+            (again,) = with_tables((table,), network).observations[len(network.observations) :]
+            np.testing.assert_allclose(again.values, one.values, rtol=1e-12)
+            np.testing.assert_allclose(again.covariances(), one.covariances(), rtol=1e-12)
