@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angles
-from sfm.display import counted
+from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_angles
+from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
-from sfm.files.csv_tables import read_table
+from sfm.files.csv_tables import array_table, read_table
 from sfm.files.json_files import Content, Name, Text, read_json
 from sfm.files.open_folders import refuse_links_out
+from sfm.files.plain_text import csv_text
+from sfm.files.rig_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
+from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
+from sfm.observations import TABLES
+from sfm.observations.mounts import MountObservations
 from sfm.planning.stations import Stations
 from sfm.rendering.planned_targets import INK, PAPER, write_planned_photographs
 from sfm.rendering.scene import UNCODED, Optics
 from sfm.similarity import fit_similarity
+from sfm.simulated_network import simulate_network
 from sfm.solution import Solution
+from sfm.survey.observation_tables import ObservationTable, observation_table, with_tables
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 
+IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 MAX_PIXELS = 70_000_000  # of a simulated photograph: they are drawn whole, with oversampling
 NEAR = 0.3  # of the distance of neighbours within which a measured point is a planned one
 Positive = Annotated[float, Field(gt=0, lt=1e12)]
+Deviation = Annotated[float, Field(ge=0, lt=1e12)]
 
 
 class _Target(Content):
@@ -47,13 +58,25 @@ class _Camera(Content):
     free: list[str]
 
 
+class _Mount(Content):
+    camera: Name
+    rig: Name
+    value: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]  # X, Y, Z, omega_deg, phi_deg, ...
+    sigma: Annotated[list[Deviation], Field(min_length=6, max_length=6)] | None  # 0 = held; None = free
+
+
 class _Plan(Content):
     name: Text
     unit: Text
     sigma_px: Positive
-    scale_bars: Annotated[int, Field(ge=0)] = 0
+    scale_bars: tuple[tuple[Name, Name, Positive], ...] = ()
+    survey_observations: Annotated[
+        dict[Literal[tuple(TABLES)], list[list[Name | float]]],  # type: ignore[valid-type]
+        Field(default_factory=dict),
+    ]
+    mounts: tuple[_Mount, ...] = ()
     target: _Target
-    cameras: list[_Camera]
+    cameras: Annotated[list[_Camera], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -62,7 +85,7 @@ class PlannedSurvey:
 
     name: str
     unit: str
-    camera: Camera
+    cameras: tuple[Camera, ...]
     stations: Stations
     points: tuple[str, ...]
     xyz: FloatArray  # object unit, (n, 3)
@@ -75,6 +98,24 @@ class PlannedSurvey:
     noise: float
     blur_px: float
     sigma_px: float  # of an image coordinate, as the prediction has it
+    bars: tuple[tuple[str, str, float], ...]  # ends and standard deviation, object unit
+    tables: tuple[ObservationTable, ...]
+    given_mounts: MountObservations  # those held fixed have variance 0
+
+    def network(self) -> tuple[Network, Estimate]:
+        """Return what the survey is to measure, without values, and the truth."""
+        i, j = np.nonzero(self.seen)
+        C = np.tile(self.sigma_px**2 * np.eye(2), (len(i), 1, 1))
+        stations = self.stations
+        network = Network(
+            *(stations.names, stations.camera, self.points, ImagePoints(i, j, np.zeros((len(i), 2)), C)),
+            moment=stations.taken_at,
+        )
+        for start, end, sigma in self.bars:
+            network = network.with_scale_bar(start, end, 1.0, sigma)
+        network = with_tables(self.tables, network)
+        network = replace(network, observations=(*network.observations, self.given_mounts))
+        return network, Estimate(self.cameras, stations.position, stations.rotation, self.xyz, stations.rig)
 
 
 @dataclass(frozen=True)
@@ -87,6 +128,7 @@ class Achieved:
     error: float  # RMS error against the truth over the predicted RMS sigma, after a similarity
     sigma_px: float  # a posteriori, of an image coordinate
     predicted_px: float
+    mounts: float | None = None  # RMS true error of mounts over their a posteriori sigmas; None without any
 
 
 def read_plan(folder: Path) -> PlannedSurvey:
@@ -97,31 +139,25 @@ def read_plan(folder: Path) -> PlannedSurvey:
     """
     refuse_links_out(folder)
     plan = read_json(folder / "plan.json", _Plan, "a plan")
-    if plan.scale_bars:
-        raise SurveyFileError(
-            f"{folder / 'plan.json'}: planned with a scale bar, which a simulation has not, so that its "
-            "standard deviations cannot be compared; plan without --scale-bar"
-        )
-    (c,) = plan.cameras
-    if c.model not in MODELS or set(c.parameters) != set(MODELS[c.model].names):
-        raise SurveyFileError(
-            f"{folder / 'plan.json'}: camera {c.name} has not the parameters of a known model"
-        )
-    names = MODELS[c.model].names
-    if not all(side > 0 for side in c.size_px) or c.size_px[0] * c.size_px[1] > MAX_PIXELS:
-        raise SurveyFileError(f"{folder / 'plan.json'}: photographs of {c.size_px[0]} x {c.size_px[1]} px")
-    camera = Camera(
-        c.name,
-        c.model,
-        c.size_px,
-        np.array(c.pixel_mm),
-        np.array([c.parameters[name] for name in names]),
-        np.array([name in c.free for name in names]),
-    )
-    angles = ("omega_deg", "phi_deg", "kappa_deg")
-    table = read_table(folder / "exterior.csv", ("image",), ("X", "Y", "Z", *angles))
+    where = folder / "plan.json"
+    cameras = tuple(_camera(where, one) for one in plan.cameras)
+    rig = _rig(where, plan.mounts, cameras)
+    angles, path = ("omega_deg", "phi_deg", "kappa_deg"), folder / "exterior.csv"
+    texts = ("image",) if rig is None else ("image", "camera", "moment")
+    table = read_table(path, texts, ("X", "Y", "Z", *angles))
     rotation = np.array([rotation_from_angles(*np.radians(row)) for row in table.values[:, 3:]])
     stations = Stations(table.keys("image"), table.values[:, :3].copy(), rotation)
+    if rig is not None:
+        number = {camera.name: a for a, camera in enumerate(cameras)}
+        order = {name: k for k, name in enumerate(dict.fromkeys(table.texts[2]))}
+        for row, name in enumerate(table.texts[1]):
+            if name not in number:
+                raise SurveyFileError(f"{table.place(row)}: camera '{name}' is not in plan.json")
+        taken_by, taken_at = (
+            np.array([numbers[name] for name in column], dtype=np.int64)
+            for numbers, column in ((number, table.texts[1]), (order, table.texts[2]))
+        )
+        stations = replace(stations, rig=rig, taken_by=taken_by, taken_at=taken_at)
     columns = ("X", "Y", "Z", "nX", "nY", "nZ", "sX", "sY", "sZ", "coded")
     table = read_table(folder / "points.csv", ("id",), columns, ignored=None, blank=columns[3:9])
     points = table.keys("id")
@@ -137,14 +173,15 @@ def read_plan(folder: Path) -> PlannedSurvey:
         seen[rows[image], places[point]] = True
     v = table.values
     normals = v[:, 3:6].copy()
-    unknown = np.isnan(normals).any(axis=1)
-    if unknown.any():
-        first = points[int(np.argmax(unknown))]
-        raise SurveyFileError(f"{table.path}: point '{first}' has no normal; a simulation needs nX, nY, nZ")
+    known = {*points, *stations.names}
+    for kind, lines in plan.survey_observations.items():
+        for name in (str(cell) for line in lines for cell in line[: len(TABLES[kind].texts)]):
+            if name not in known and TABLES[kind].texts[0] != "group":
+                raise SurveyFileError(f"{where}: {kind}: '{name}' is not in the plan")
     return PlannedSurvey(
         plan.name,
         plan.unit,
-        camera,
+        cameras,
         stations,
         points,
         v[:, :3].copy(),
@@ -157,7 +194,70 @@ def read_plan(folder: Path) -> PlannedSurvey:
         plan.target.noise,
         plan.target.blur_px,
         plan.sigma_px,
+        plan.scale_bars,
+        tuple(_table(where, kind, rows) for kind, rows in plan.survey_observations.items()),
+        _given_mounts(plan.mounts),
     )
+
+
+def _camera(where: Path, c: _Camera) -> Camera:
+    if c.model not in MODELS or set(c.parameters) != set(MODELS[c.model].names):
+        raise SurveyFileError(f"{where}: camera {c.name} has not the parameters of a known model")
+    names = MODELS[c.model].names
+    if not all(side > 0 for side in c.size_px) or c.size_px[0] * c.size_px[1] > MAX_PIXELS:
+        raise SurveyFileError(f"{where}: photographs of {c.size_px[0]} x {c.size_px[1]} px")
+    return Camera(
+        c.name,
+        c.model,
+        c.size_px,
+        np.array(c.pixel_mm),
+        np.array([c.parameters[name] for name in names]),
+        np.array([name in c.free for name in names]),
+    )
+
+
+def _rig(where: Path, mounts: Sequence[_Mount], cameras: tuple[Camera, ...]) -> Mounts | None:
+    """Return the rig of a plan; None of one camera."""
+    if [one.camera for one in mounts] != [camera.name for camera in cameras][: len(mounts)] or (
+        len(cameras) > 1 and len(mounts) != len(cameras)
+    ):
+        raise SurveyFileError(f"{where}: mounts, needed one of each camera, in their order")
+    if not mounts:
+        return None
+    value = np.array([one.value for one in mounts])
+    return Mounts(
+        value[:, :3],
+        np.array([rotation_from_angles(*np.radians(row)) for row in value[:, 3:]]),
+        np.array([[one.sigma is None or any(one.sigma)] * 6 for one in mounts]),
+        tuple(one.rig for one in mounts),
+    )
+
+
+def _given_mounts(mounts: Sequence[_Mount]) -> MountObservations:
+    """Return the mounts that are given, but for the reference."""
+    on = [a for a, one in enumerate(mounts) if one.sigma is not None and any((*one.value, *one.sigma))]
+    value = np.array([mounts[a].value for a in on]).reshape(-1, 6) / IN_FILES
+    sigma = np.array([mounts[a].sigma for a in on]).reshape(-1, 6) / IN_FILES
+    covariance = np.eye(6) * sigma[:, None, :] ** 2
+    return MountObservations(np.array(on, dtype=np.int64), value[:, :3], value[:, 3:], covariance)
+
+
+def _table(where: Path, kind: str, rows: list[list[str | float]]) -> ObservationTable:
+    """Return survey observations of a plan.
+
+    Raises:
+        SurveyFileError: rows that have not the columns of the kind, or that a survey would refuse.
+    """
+    texts, columns = TABLES[kind].texts, TABLES[kind].columns()
+    n = len(texts)
+    for row in rows:
+        if len(row) != n + len(columns) or [isinstance(cell, str) for cell in row] != [
+            k < n for k in range(len(row))
+        ]:
+            raise SurveyFileError(f"{where}: {kind}: row {row!r:.60}, needed {listed([*texts, *columns])}")
+    names = {name: [str(row[k]) for row in rows] for k, name in enumerate(texts)}
+    values = {name: np.array([row[n + k] for row in rows], dtype=float) for k, name in enumerate(columns)}
+    return observation_table(kind, array_table(f"{where}: {kind}", names, values))
 
 
 def codes_of(plan: PlannedSurvey, family: CodeFamily) -> IntArray:
@@ -177,19 +277,73 @@ def codes_of(plan: PlannedSurvey, family: CodeFamily) -> IntArray:
     return code
 
 
-def write_simulation(plan: PlannedSurvey, folder: Path, *, codes: str = "ring14", seed: int = 0) -> Path:
-    """Render the photographs of a plan and write the survey file that measures them; return its path.
+def write_simulation(
+    plan: PlannedSurvey, folder: Path, *, codes: str | None = "ring14", seed: int = 0
+) -> Path:
+    """Write photographs or image points of a plan and the survey file of them; return its path.
+
+    Observations of every kind, those of the rig and image points among them, have errors with the standard
+    deviations that the plan states.
 
     Args:
         plan: the plan.
         folder: that is there; photographs go into `photographs` in it.
-        codes: family of the coded targets.
+        codes: family of the coded targets; image points in place of photographs if None.
         seed: of the noise.
 
     Raises:
         KolinearError: too many codes, targets that overlap, or a file that cannot be written.
     """
+    network, truth = simulate_network(*plan.network(), np.random.default_rng(seed))
+    if codes is None:
+        targets = ["[observations]", 'file = "image_points.csv"']
+        _write(folder / "image_points.csv", IMAGE_POINTS, _image_points(network))
+    else:
+        targets = ["[targets]", 'polarity = "dark"', f'codes = "{codes}"']
+        _write_photographs(plan, folder, truth.points, codes, seed)
+        names = tuple(name or "-" for name in names_of(plan, codes))
+        images = tuple(f"photographs/{name}.png" for name in network.images)
+        network = replace(network, points=names, images=images)
+    lines = ["[survey]", 'name = "simulation"', f'unit = "{plan.unit}"']
+    for a, camera in enumerate(plan.cameras):
+        own = [name for name, of in zip(network.images, network.camera, strict=True) if of == a]
+        lines += _camera_section(camera, own)
+    lines += [*_rig_section(folder, network, truth), *targets]
+    bars = network.scale_bars
+    for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
+        ends = [json.dumps(network.points[j]) for j in (start, end)]
+        lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
+        lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}"]
+    for kind, of in TABLES.items():
+        rows = [row for one in network.observations if type(one) is of for row in one.table_rows(network)]
+        if rows:
+            file = f"{kind.replace(' ', '_')}.csv"
+            _write(folder / file, (*of.texts, *of.columns()), rows)
+            lines += ["[[survey_observations]]", f'kind = "{kind}"', f'file = "{file}"']
+    lines += ["[datum]", 'kind = "free"', "[compare]", 'backend = "none"']
+    path = folder / "survey.toml"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    path.write_text(csv_text(header, rows), encoding="utf-8", newline="")
+
+
+def _image_points(network: Network) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of measured image points."""
+    seen = network.image_points
+    for i, j, xy, C in zip(seen.image, seen.point, seen.xy.tolist(), seen.covariance, strict=True):
+        yield network.images[i], network.points[j], *xy, *np.sqrt(np.diagonal(C)).tolist()
+
+
+def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes: str, seed: int) -> None:
+    """Render the photographs of a plan, whose points are at true places."""
     family = _rings(codes)
+    unknown = np.isnan(plan.normals).any(axis=1)
+    if unknown.any():
+        first = plan.points[int(np.argmax(unknown))]
+        raise SurveyFileError(f"plan: point '{first}' has no normal; photographs of it need nX, nY, nZ")
     exposure = plan.contrast / (255 * (PAPER - INK))
     if exposure * PAPER > 1:
         raise SurveyFileError(
@@ -201,42 +355,55 @@ def write_simulation(plan: PlannedSurvey, folder: Path, *, codes: str = "ring14"
     optics = Optics(
         blur_px=float(np.sqrt(max(plan.blur_px**2 - 1 / 12, 0.04))), exposure=exposure, noise=plan.noise / 255
     )
-    write_planned_photographs(
-        pictures,
-        tuple(f"{name}.png" for name in plan.stations.names),
-        plan.camera,
-        plan.stations.position,
-        plan.stations.rotation,
-        xyz=plan.xyz,
-        normals=plan.normals,
-        code=codes_of(plan, family),
-        radius=plan.diameter / 2,
-        seen=plan.seen,
-        family=family,
-        optics=optics,
-        seed=seed,
-    )
-    camera = plan.camera
-    held = [
-        f"{name} = {value!r}"
-        for name, value, free in zip(
-            camera.names, camera.parameters.tolist(), camera.free.tolist(), strict=True
+    stations = plan.stations
+    for a, own in enumerate(rows_of(stations.camera, len(plan.cameras))):
+        write_planned_photographs(
+            pictures,
+            tuple(f"{stations.names[i]}.png" for i in own),
+            plan.cameras[a],
+            stations.position[own],
+            stations.rotation[own],
+            xyz=xyz,
+            normals=plan.normals,
+            code=codes_of(plan, family),
+            radius=plan.diameter / 2,
+            seen=plan.seen[own],
+            family=family,
+            optics=optics,
+            seed=seed + a,
         )
-        if not free and name != "c"
-    ]
-    text = SURVEY.format(
-        unit=plan.unit,
-        size=list(camera.size_px),
-        pixel=camera.pixel_mm.tolist(),
-        c=camera.c_px * float(np.mean(camera.pixel_mm)),
-        model=camera.model,
-        free=str([n for n, f in zip(camera.names, camera.free, strict=True) if f]).replace("'", '"'),
-        fixed="" if not held else f"fixed = {{ {', '.join(held)} }}\n",
-        codes=codes,
-    )
-    path = folder / "survey.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
+
+
+def _camera_section(camera: Camera, images: list[str]) -> list[str]:
+    """Return the lines of a camera, whose free parameters begin at 0."""
+    free = [name for name, one in zip(camera.names, camera.free, strict=True) if one]
+    values = zip(camera.names, camera.parameters.tolist(), strict=True)
+    held = [f"{name} = {value!r}" for name, value in values if name not in free and name != "c"]
+    globs = [name.replace("[", "[[]").replace("*", "[*]").replace("?", "[?]") for name in images]
+    lines = ["[[camera]]", f"name = {json.dumps(camera.name)}", f"images = {json.dumps(globs)}"]
+    lines += [f"size_px = {list(camera.size_px)}", f"pixel_mm = {camera.pixel_mm.tolist()}"]
+    lines += [f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!r}", f'model = "{camera.model}"']
+    lines += [f"free = {json.dumps(free)}"]
+    return [*lines, f"fixed = {{ {', '.join(held)} }}"] if held else lines
+
+
+def _rig_section(folder: Path, network: Network, truth: Estimate) -> list[str]:
+    """Return the lines of the rig; writes moments, and the mounts that are given."""
+    if truth.mounts is None or network.moment is None:
+        return []
+    ((rig, on),) = truth.mounts.by_rig().items()
+    cameras = [truth.cameras[a].name for a in on]
+    _write(folder / MOMENTS, ("image", "moment"), zip(network.images, network.moment.tolist(), strict=True))
+    lines = ["[[rig]]", f"name = {json.dumps(rig)}", f"cameras = {json.dumps(cameras)}"]
+    lines += [f'moment = "{MOMENTS}"']
+    (given,) = (one for one in network.observations if isinstance(one, MountObservations))
+    if len(given):
+        sigma = np.sqrt(np.diagonal(given.covariance, axis1=1, axis2=2))
+        values = np.hstack([IN_FILES * given.values, IN_FILES * sigma]).tolist()
+        rows = [(truth.cameras[a].name, *row) for a, row in zip(given.camera, values, strict=True)]
+        _write(folder / MOUNTS, ("camera", *VALUES, *SIGMAS), rows)
+        lines += [f'mounts = "{MOUNTS}"']
+    return lines
 
 
 def _rings(codes: str) -> CodeFamily:
@@ -246,44 +413,33 @@ def _rings(codes: str) -> CodeFamily:
     return family
 
 
-SURVEY = """\
-[survey]
-name = "simulation"
-unit = "{unit}"
-[[camera]]
-name = "planned"
-images = "photographs/*.png"
-size_px = {size}
-pixel_mm = {pixel}
-c_mm = {c}
-model = "{model}"
-free = {free}
-{fixed}[targets]
-polarity = "dark"
-codes = "{codes}"
-[datum]
-kind = "free"
-[compare]
-backend = "none"
-"""
+def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
+    """Return what a survey calls the points of a plan, None of those without code, (n,).
+
+    Args:
+        plan: the plan.
+        codes: family of the coded targets; None where image points were simulated.
+    """
+    if codes is None:
+        return plan.points
+    return tuple(None if code == UNCODED else str(code) for code in codes_of(plan, _rings(codes)).tolist())
 
 
-def achieved(plan: PlannedSurvey, codes: str, result: Solution, sigma_px: float) -> Achieved:
+def achieved(plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px: float) -> Achieved:
     """Return what a simulated survey achieved against its plan.
 
     Args:
         plan: the plan.
-        codes: family of the coded targets.
+        codes: as of `write_simulation`.
         result: of the survey.
         sigma_px: of an image coordinate, a posteriori, px.
 
     Raises:
         SurveyFileError: fewer than 3 coded targets were measured, which tell what is what.
     """
-    code = codes_of(plan, _rings(codes))
     names = {name: j for j, name in enumerate(result.network.points)}
     xyz = result.estimate.points
-    pairs = [(names[str(c)], k) for k, c in enumerate(code) if c != UNCODED and str(c) in names]
+    pairs = [(names[name], k) for k, name in enumerate(names_of(plan, codes)) if name in names]
     pairs = [(j, k) for j, k in pairs if np.isfinite(xyz[j]).all()]
     if len(pairs) < 3:
         raise SurveyFileError(f"simulation: {counted(len(pairs), 'coded target')} in the result, needed 3")
@@ -308,4 +464,18 @@ def achieved(plan: PlannedSurvey, codes: str, result: Solution, sigma_px: float)
         float(np.sqrt((error**2).mean() / (predicted**2).mean())),
         sigma_px,
         plan.sigma_px,
+        _mount_error(plan, result, motion.scale),
     )
+
+
+def _mount_error(plan: PlannedSurvey, result: Solution, scale: float) -> float | None:
+    """Return the RMS true error of the mounts that were adjusted over their standard deviations."""
+    rig, found, Q = plan.stations.rig, result.estimate.mounts, result.mount_covariance
+    if rig is None or found is None or Q is None or not found.free.any():
+        return None
+    unit = np.repeat([scale, 1.0], 3)
+    values = [np.hstack([one.position, angles_from_rotation(one.rotation)]) for one in (found, rig)]
+    error = unit * values[0] - values[1]
+    error[:, 3:] = (error[:, 3:] + np.pi) % (2 * np.pi) - np.pi
+    w = error[found.free] / (unit * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)))[found.free]
+    return float(np.sqrt((w**2).mean()))

@@ -11,6 +11,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.network import Network
+from sfm.observations.kind import POINT
 from sfm.planning.contributions import Contribution, contributions
 from sfm.planning.design.designer import Design
 from sfm.planning.planned_object import PlannedObject
@@ -48,7 +49,7 @@ class Plan:
     calibrations: tuple[Calibratability, ...]  # of the cameras that are not held
     contributions: tuple[Contribution, ...]  # of the rig and of observations beside image points
     target: TargetSize  # that shows MIN_PIXELS from the farthest station
-    coded: IntArray  # points that are coded targets, so that every photograph has five
+    coded: IntArray  # points that are coded targets: five in every photograph, and those that are observed
     shots: tuple[Shot, ...]
 
     @property
@@ -91,7 +92,7 @@ def describe_plan(
 ) -> Plan:
     """Return what is to be said of a prediction."""
     seen = prediction.sight.seen
-    coded = choose_coded(seen)
+    coded = np.union1d(choose_coded(seen), _observed(prediction))
     camera = prediction.cameras[0]
     far = max(float(d) for d in _distances(prediction))
     width = camera.size_px[0]
@@ -130,6 +131,13 @@ def describe_plan(
             focus=None if seeing.depth is None else seeing.depth.focus,
         ),
     )
+
+
+def _observed(prediction: Prediction) -> IntArray:
+    """Return the points that observations beside image points are of; a code names them."""
+    network = prediction.adjustment.network
+    points = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
+    return np.flatnonzero(np.isin(prediction.point, np.concatenate([*points, np.zeros(0, dtype=np.int64)])))
 
 
 def _tilt(prediction: Prediction, seeing: Seeing) -> float:

@@ -12,6 +12,9 @@ from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
+from sfm.files.rig_tables import IN_FILES
+from sfm.observations import TABLES
+from sfm.observations.mounts import MountObservations
 from sfm.planning.contributions import Contribution
 from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
@@ -43,6 +46,7 @@ from sfm.report.page import (
     Table,
     axes,
     facts,
+    plain,
     values_of,
 )
 from sfm.report.phrases import NORMAL_95, words_of_rigs
@@ -96,17 +100,24 @@ def page(plan: Plan) -> Page:
         summary=_summary(plan),
         files=(
             Table(tuple(Column(name=name) for name in IMAGE_POINTS), seen, "image_points"),
-            exterior_table(p.stations),
+            exterior_table(p.stations, p.cameras),
             Table(columns, shot_rows(plan.shots, rounded=True), "shots"),
         ),
     )
 
 
-def exterior_table(stations: Stations) -> Table:
-    """Return the exterior orientation of planned photographs, for a file."""
+def exterior_table(stations: Stations, cameras: Sequence[Camera] = ()) -> Table:
+    """Return the exterior orientation of planned photographs, for a file; of a rig with camera and moment."""
     angles = np.degrees(angles_from_rotation(stations.rotation)).tolist()
-    rows = [(n, *X0, *a) for n, X0, a in zip(stations.names, stations.position.tolist(), angles, strict=True)]
-    return Table(tuple(Column(name=name) for name in ("image", *EXTERIOR)), rows, "exterior")
+    rows: list[tuple[object, ...]] = [
+        (n, *X0, *a) for n, X0, a in zip(stations.names, stations.position.tolist(), angles, strict=True)
+    ]
+    names: tuple[str, ...] = ("image", *EXTERIOR)
+    if stations.taken_at is not None:
+        names = (*names, "camera", "moment")
+        taken = zip(stations.camera, stations.taken_at.tolist(), strict=True)
+        rows = [(*row, cameras[a].name, at + 1) for row, (a, at) in zip(rows, taken, strict=True)]
+    return Table(tuple(Column(name=name) for name in names), rows, "exterior")
 
 
 def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Column, ...]:
@@ -278,7 +289,10 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             f"{plan.target.diameter:.4g} {plan.unit} for {MIN_PIXELS:g} px from the farthest station at the "
             "steepest ray",
         ),
-        ("coded targets", f"{len(plan.coded)} give every photograph five, or all that it shows"),
+        (
+            "coded targets",
+            f"{len(plan.coded)} give every photograph five, or all that it shows, and name what is observed",
+        ),
     ]
     rows += words_of_rigs(rigs_of(a), plan.unit)
     rows += [(f"gain by {one.name}", _gain_in_words(one)) for one in plan.contributions]
@@ -319,7 +333,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
             **values_of(plan.seeing.target, "contrast noise blur_px"),
         },
         "coded_targets": len(plan.coded),
-        "scale_bars": len(p.adjustment.network.scale_bars),
+        **_observed(plan),
         "cameras": [_camera_summary(camera, found.get(camera.name)) for camera in p.cameras],
         "rigs": summary_of_rigs(rigs_of(p.adjustment)),
         "contributions": [
@@ -328,6 +342,37 @@ def _summary(plan: Plan) -> dict[str, Any]:
         ],
         "weak_points": [{"point": w.name, "sigma": w.sigma, "reason": w.reason} for w in plan.weak],
     }
+
+
+def _observed(plan: Plan) -> dict[str, Any]:
+    """Return what a plan has beside image points, with the values that it gives, for a simulation."""
+    network, mounts = plan.prediction.adjustment.network, plan.prediction.stations.rig
+    bars = network.scale_bars
+    ends = ([network.points[j] for j in side] for side in (bars.start, bars.end))
+    tables = {
+        kind: [row for one in network.observations if type(one) is of for row in one.table_rows(network)]
+        for kind, of in TABLES.items()
+    }
+    found: dict[str, Any] = {
+        "scale_bars": [list(bar) for bar in zip(*ends, bars.sigma.tolist(), strict=True)],
+        "survey_observations": {kind: rows for kind, rows in tables.items() if rows},
+        "mounts": [],
+    }
+    if mounts is None:
+        return found
+    sigma = {int(a): np.zeros(6) for a in np.flatnonzero(~mounts.free.any(axis=1))}
+    for one in network.observations:
+        if isinstance(one, MountObservations):
+            deviations = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
+            sigma |= dict(zip(one.camera.tolist(), deviations, strict=True))
+    values = np.hstack([mounts.position, angles_from_rotation(mounts.rotation)])
+    for a, camera in enumerate(plan.prediction.cameras):
+        own = {
+            "value": plain(IN_FILES * values[a]),
+            "sigma": plain(IN_FILES * sigma[a]) if a in sigma else None,
+        }
+        found["mounts"].append({"camera": camera.name, "rig": mounts.rig[a], **own})
+    return found
 
 
 def _camera_summary(camera: Camera, c: Calibratability | None) -> dict[str, Any]:

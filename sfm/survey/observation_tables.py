@@ -78,9 +78,17 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     """
     if kind not in TABLES:
         raise SurveyFileError(f"{source}: kind = '{kind}', needed one of {listed(list(TABLES))}")
+    return observation_table(kind, read_table(path, TABLES[kind].texts, TABLES[kind].columns()))
+
+
+def observation_table(kind: str, table: CsvTable) -> ObservationTable:
+    """Return the observations of a table with the columns of their kind.
+
+    Raises:
+        SurveyFileError: a standard deviation that is not positive; an observation between a point and itself.
+    """
     of = TABLES[kind]
     columns = of.columns()
-    table = read_table(path, of.texts, columns)
     d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")

@@ -123,9 +123,9 @@ def test_a_plan_has_one_focus_and_says_what_it_takes_as_known(
     )
     assert "plan_without_scale" not in kinds(out)
     assert {row["focus"] for row in rows(out / "shots.csv")} == {"150.0"}
-    # a simulation has no scale bar that it could be compared with
+    # what has no normal cannot be painted
     assert plan(out, "--out", tmp_path / "simulation", command="simulate") == 2
-    assert "planned with a scale bar" in capsys.readouterr().err
+    assert "point 'b' has no normal" in capsys.readouterr().err
 
 
 BAD = [

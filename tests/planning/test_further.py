@@ -81,7 +81,7 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=Wanted())
     write_page(plan, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
-    assert (read.seen == plan.prediction.sight.seen).all() and read.camera.free.sum() == 1
+    assert (read.seen == plan.prediction.sight.seen).all() and read.cameras[0].free.sum() == 1
     assert np.allclose(read.stations.rotation, stations.rotation, atol=1e-9)
     path = write_simulation(read, tmp_path)
     result = sfm.run_survey(path, compare_with="none")

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sfm
+from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation
 from sfm.files.plain_text import csv_text
+from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.kind import TableKind
 from sfm.planning.contributions import contributions
+from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
-from sfm.planning.prediction import predict_network
+from sfm.planning.prediction import ScaleBarPlan, predict_network
+from sfm.planning.sight.image_precision import TargetImage
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import arrangement
+from sfm.planning.wanted import Wanted
+from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan, rows
 from tests.rigs import make_rig
 from tests.survey.test_survey_observations import network_of_all
@@ -139,3 +147,58 @@ def test_every_kind_is_written_as_the_table_that_it_is_read_from(tmp_path: Path)
             (again,) = with_tables((table,), network).observations[len(network.observations) :]
             np.testing.assert_allclose(again.values, one.values, rtol=1e-12)
             np.testing.assert_allclose(again.covariances(), one.covariances(), rtol=1e-12)
+
+
+def test_image_points_of_a_planned_rig_give_its_mounts_within_their_standard_deviations(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With all kinds of observations, whose names a simulated survey keeps; mounts given as observations."""
+    network, truth = network_of_all()
+    observations = tuple(one for one in network.observations if one.name != "antenna positions")
+    path = planned_survey(tmp_path, replace(network, observations=observations), truth, sigma=1e-3)
+    out = tmp_path / "plan"
+    (tmp_path / "points.csv").write_text(
+        csv_text(
+            ("id", "X", "Y", "Z", "nX", "nY", "nZ"),
+            [
+                (name, *X, 0.0, 0.0, 1.0)
+                for name, X in zip(network.points, truth.points.tolist(), strict=True)
+            ],
+        ),
+        "utf-8",
+    )
+    given = (*STATIONS[:4], "--stations", "hemisphere:8", "--max-incidence-deg", "89")
+    assert plan(tmp_path / "points.csv", "--survey", path, *given, "--out", out) == 0
+    simulated = tmp_path / "simulation"
+    assert plan(out, "--image-points", "--out", simulated, command="simulate") == 0
+    found = json.loads((simulated / "simulation.json").read_text("utf-8"))
+    assert found["points"] == found["planned"] == 34 and found["sigma_px"] == pytest.approx(0.1, rel=0.15)
+    assert (
+        found["mounts"] < 2.0 and 0.5 < found["error"] < 1.5 and found["ratio"] == pytest.approx(1, rel=0.15)
+    )
+    result = json.loads((simulated / "result" / "summary.json").read_text("utf-8"))
+    assert set(result["further_observations"]) >= {"plane", "line", "rigid frame", "horizontal direction"}
+    assert result["rigs"][0]["moments"] == 8
+
+
+def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) -> None:
+    """Mounts to be found, a scale bar: codes name its ends, and the mounts are found within their sigmas."""
+    _, truth = make_rig(seed_of("rendered"))
+    assert truth.mounts is not None
+    mounts = replace(truth.mounts, position=100 * truth.mounts.position)
+    small = camera_from_values("left", "brown", (900, 700), (0.005, 0.005), c_mm=6.0, free=())
+    cameras = (small, replace(small, name="right"))
+    plate = shape_object("plate", (500.0, 380.0), 20)
+    seeing = Seeing(diameter=12.0, target=TargetImage(contrast=120, noise=3, blur_px=0.8))
+    stations = arrangement("ring:5", plate, small).with_rig(mounts, cameras)
+    bar = ScaleBarPlan(plate.names[3], plate.names[16], 0.02)
+    found = plan_of("plate", "mm", plate, cameras, stations, seeing, wanted=Wanted(), bars=[bar])
+    write_page(found, tmp_path / "plan")
+    read = read_plan(tmp_path / "plan")
+    assert read.coded[[3, 16]].all()
+    result = sfm.run_survey(write_simulation(read, tmp_path), compare_with="none")
+    assert result.adjustment.expected_defect == 6 and len(result.adjustment.network.images) == 10
+    reached = achieved(read, "ring14", result.solution, result.adjustment.sigma0_px)
+    assert reached.points == reached.planned == 20
+    assert reached.mounts is not None and reached.mounts < 2.0
+    assert reached.ratio == pytest.approx(1.0, abs=0.25)

@@ -16,6 +16,9 @@ from sfm.runtime.faults import working_on
 def simulate_command(
     folder: Annotated[Path, typer.Argument(metavar="PLAN", help="Folder that `plan network` has written.")],
     codes: Annotated[str, typer.Option("--family", help="Rings of the coded targets.")] = "ring14",
+    image_points: Annotated[
+        bool, typer.Option("--image-points", help="Simulate image points in place of photographs.")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the noise.")] = 0,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder of photographs, survey file and result.")
@@ -23,7 +26,8 @@ def simulate_command(
 ) -> None:
     """Photograph a plan by rendering, run the survey, and compare it.
 
-    Its points become targets; predicted standard deviations stand beside those achieved and the true errors.
+    Its points become targets, its rig, scale bars and observations have errors as planned; predicted standard
+    deviations stand beside those achieved and the true errors.
     """
     with loading():
         from sfm.api import run_survey
@@ -35,20 +39,23 @@ def simulate_command(
     refuse_foreign_folder(out)
     with working_on(str(folder)):
         planned = read_plan(folder)
+        family = None if image_points else codes
         with locked(out.parent / f".{out.name}.lock", out):
             remove_leftovers(out)
             with whole_folder(out, "the simulation", replaceable=True) as part:
-                survey = write_simulation(planned, part, codes=codes, seed=seed)
+                survey = write_simulation(planned, part, codes=family, seed=seed)
                 result = run_survey(survey, compare_with="none", progress=True)
                 result.write(part / "result")
                 (part / ".result.lock").unlink(missing_ok=True)
-                found = achieved(planned, codes, result.solution, result.adjustment.sigma0_px)
+                found = achieved(planned, family, result.solution, result.adjustment.sigma0_px)
                 text = json.dumps(asdict(found), indent=2, allow_nan=False)
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
     print(f"{found.points} of {found.planned} planned points measured")
     print(f"sigma of points: {found.ratio:.3f} times the predicted (median)")
     print(f"true errors: {found.error:.3f} times the predicted, RMS")
     print(f"sigma of an image coordinate: {found.sigma_px:.4f} px, predicted {found.predicted_px:.4f} px")
+    if found.mounts is not None:
+        print(f"true errors of mounts: {found.mounts:.3f} times their standard deviations, RMS")
     print(f"Report: {out / 'result' / 'report.html'}")
 
 
