@@ -127,7 +127,7 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         (
             "unit =",
             "units =",
-            r"survey.toml, line 3: unknown key 'units' in \[survey\], known are name, unit$",
+            r"survey.toml, line 3: unknown key 'units' in \[survey\], known are name, unit, equipment",
         ),
         (
             "sigma = 0.010",

@@ -43,6 +43,7 @@ FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+Temperature = Annotated[float, Field(ge=-100, le=200)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
 Unit = Annotated[
     Literal["km", "m", "dm", "cm", "mm", "um", "µm", "nm", "in", "ft"],
@@ -94,6 +95,9 @@ class Head(Section):
 
     name: Name  # of the survey, in the report and its file names
     unit: Unit  # of the object coordinates
+    equipment: Name | None = None  # a file of bars and frames that [[equipment]] refers to
+    temperature: Temperature | None = None  # of this equipment during the survey, deg C
+    temperature_sigma: Length = 1.0  # standard deviation of temperature, K
 
 
 class CameraSettings(Section):
@@ -244,6 +248,13 @@ class ScaleBarSettings(Section):
     end: Name = Field(alias="to")  # name of the point at the other end
     length: Length  # between the two points, object unit
     sigma: Length  # standard deviation of the length, object unit
+
+
+class EquipmentSettings(Section):
+    """[[equipment]]: a bar or frame of the equipment file, once for each place where it was photographed."""
+
+    name: Name  # in the equipment file
+    points: Names = ()  # its points as the survey names them, in the order there; left out: as there
 
 
 class ObservationSettings(Section):

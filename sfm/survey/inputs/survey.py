@@ -19,6 +19,7 @@ from sfm.files.rig_tables import read_moments
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
+from sfm.survey.inputs.equipment import given_by, read_equipment
 from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
 from sfm.survey.inputs.given import (
     Diameters,
@@ -246,6 +247,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     def read(reader: Callable[[Path], T], name: str | None) -> T | None:
         return None if name is None else reader(file.beside(name))
 
+    bars, frames = _given_by_equipment(file)
     return Survey(
         name=file.name,
         unit=file.unit,
@@ -270,11 +272,17 @@ def survey_of_file(file: SurveyFile) -> Survey:
             for name in dict.fromkeys(rig.table for rig in file.rigs if rig.table is not None)
             for image, moment in read_moments(file.beside(name))
         },
-        tables=tuple(
-            read_observation_table(one.kind, file.beside(one.file), file.source)
-            for one in file.observation_tables
+        tables=(
+            *(
+                read_observation_table(one.kind, file.beside(one.file), file.source)
+                for one in file.observation_tables
+            ),
+            *frames,
         ),
-        scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
+        scale_bars=(
+            *(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
+            *bars,
+        ),
         observations=read(read_image_points, file.observations.file if file.observations else None),
         diameters=read(read_diameters, file.targets.diameters),
         start_orientations=read(read_exterior, file.approximate.images),
@@ -283,6 +291,25 @@ def survey_of_file(file: SurveyFile) -> Survey:
         folder=file.folder,
         allow_outside=file.allow_outside,
         source=file.source,
+    )
+
+
+def _given_by_equipment(file: SurveyFile) -> tuple[tuple[ScaleBar, ...], tuple[ObservationTable, ...]]:
+    """Return the scale bars and frames of the equipment that a survey file names.
+
+    Raises:
+        SurveyFileError: equipment without a file, or as `read_equipment` and `given_by`.
+    """
+    if file.head.equipment is None:
+        if file.equipment:
+            raise SurveyFileError(
+                f"{file.source}: [[equipment]] without survey.equipment; needed the file that describes it"
+            )
+        return (), ()
+    path = file.beside(file.head.equipment)
+    return given_by(
+        *(read_equipment(path, allow_outside=file.allow_outside), file.equipment, file.source, file.unit),
+        *(file.head.temperature, file.head.temperature_sigma),
     )
 
 

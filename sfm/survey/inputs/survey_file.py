@@ -13,6 +13,7 @@ from sfm.files.toml_files import read_toml
 from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
+from sfm.survey.inputs.equipment import read_equipment
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
     MAX_RIGS,
@@ -23,6 +24,7 @@ from sfm.survey.inputs.settings import (
     CompareSettings,
     ControlSettings,
     DatumSettings,
+    EquipmentSettings,
     ExteriorSettings,
     Head,
     ObservationSettings,
@@ -52,6 +54,7 @@ class SurveyFile(Section):
     exterior: ExteriorSettings | None = None
     rigs: Annotated[tuple[RigSettings, ...], Field(strict=False, max_length=MAX_RIGS, alias="rig")] = ()
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
+    equipment: Annotated[tuple[EquipmentSettings, ...], Field(strict=False, max_length=MAX_TABLES)] = ()
     observations: ObservationSettings | None = None
     observation_tables: Annotated[
         tuple[ObservationTableSettings, ...],
@@ -135,6 +138,11 @@ class SurveyFile(Section):
         ]
         names += [name for rig in self.rigs for name in (rig.mounts, rig.table)]
         names += [table.file for table in self.observation_tables]
+        if self.head.equipment is not None:
+            path = self.beside(self.head.equipment)
+            found = read_equipment(path, allow_outside=self._allow_outside)
+            folder = Path(self.head.equipment).parent
+            names += [self.head.equipment, *(str(folder / one.file) for one in found.content.frames)]
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]

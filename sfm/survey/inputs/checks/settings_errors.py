@@ -22,6 +22,7 @@ _NEEDED = (
     ("int_type", "a whole number"),
     ("int_from_float", "a whole number"),
     ("bool_type", "true or false"),
+    ("date_type", "a date without quotes, such as 2026-03-01"),
     ("tuple_type", "a list in square brackets"),
     ("finite_number", "a finite number"),
     ("model_type", "a table"),

@@ -1,0 +1,212 @@
+"""The equipment file (TOML), shared by many surveys: bars, scale crosses, frames and probes with calibration.
+
+Lengths are corrected from the temperature of their calibration to that of the survey,
+
+    l = l0 (1 + alpha (T - T0)),
+
+and what is not known of T and alpha is part of their standard deviations. An error of T is common to all
+lengths: it is taken with each of N of them as sqrt(N) times as large, so that it is what it is in the scale
+that they give together.
+
+Source: ISO 1 (reference temperature of 20 deg C); JCGM 100 (GUM), sec. 5.1 and annex H.1 (end gauges).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from sfm.conventions import METRES, FloatArray
+from sfm.display import listed
+from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import CsvTable, array_table, read_table
+from sfm.files.toml_files import read_toml
+from sfm.survey.inputs.checks.settings_errors import first_error
+from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.settings import (
+    EquipmentSettings,
+    Length,
+    Name,
+    Names,
+    Section,
+    Temperature,
+    Unit,
+)
+from sfm.survey.observation_tables import ObservationTable, observation_table
+
+FRAME = "rigid frame"  # the kind of observation that frames are
+PPM = 1e-6
+SMALLEST_PPM = 1e-3  # smaller coefficients are those of nothing, but for 11.5e-6 in place of 11.5
+COORDINATES = ("X", "Y", "Z", "sX", "sY", "sZ")
+
+
+class Calibrated(Section):
+    """What is known of a bar or a frame beside its lengths."""
+
+    name: Name  # by which surveys refer to it
+    calibrated: date  # day of its calibration, as on its certificate
+    temperature: Temperature = 20.0  # of its calibration, for which its lengths are stated, deg C
+    expansion: Annotated[float, Field(ge=-50, le=200)]  # coefficient, 1e-6 per K: steel 11.5
+    expansion_sigma: Annotated[float, Field(ge=0, le=50)] = 0.0  # standard deviation of it, 1e-6 per K
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Self:
+        if 0 < abs(self.expansion) < SMALLEST_PPM:
+            raise ValueError(f"expansion = {self.expansion:g}, needed in 1e-6 per K, such as 11.5 for steel")
+        if self.calibrated > date.today():
+            raise ValueError(f"calibrated = {self.calibrated}, which is in the future")
+        return self
+
+    def factor(self, temperature: float) -> float:
+        """Return by what lengths are multiplied at a temperature, deg C."""
+        return 1 + PPM * self.expansion * (temperature - self.temperature)
+
+    def relative_sigma(self, temperature: float, temperature_sigma: float) -> float:
+        """Return the standard deviation of the factor."""
+        away = temperature - self.temperature
+        return PPM * float(np.hypot(self.expansion * temperature_sigma, away * self.expansion_sigma))
+
+
+class Bar(Calibrated):
+    """[[bar]]: a scale bar."""
+
+    points: Annotated[Names, Field(max_length=2)] = ()  # names of its ends
+    length: Length  # between its ends
+    sigma: Length  # standard deviation of the length
+
+
+class Frame(Calibrated):
+    """[[frame]]: targets that are rigid to one another, as of a bar of several, a scale cross or a probe."""
+
+    file: Name  # point,X,Y,Z,sX,sY,sZ in a system of its own, beside the equipment file
+
+
+class EquipmentFile(Section):
+    """Content of an equipment file."""
+
+    unit: Unit  # of its lengths
+    bars: Annotated[tuple[Bar, ...], Field(strict=False, alias="bar")] = ()
+    frames: Annotated[tuple[Frame, ...], Field(strict=False, alias="frame")] = ()
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """An equipment file with its tables."""
+
+    path: Path
+    content: EquipmentFile
+    tables: dict[str, CsvTable]  # of frames, by their names
+
+
+def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
+    """Read an equipment file and the tables that it names.
+
+    Args:
+        path: of the file.
+        allow_outside: whether its tables may lie outside its folder.
+
+    Raises:
+        SurveyFileError: unreadable, an unknown key, a wrong type or bound, a calibration in the future, a
+            name that comes twice, or a table that leaves its folder or cannot be read.
+    """
+    from sfm.survey.inputs.survey_file import inside
+
+    text, table = read_toml(path, "an equipment file", repeated=("bar", "frame"))
+    try:
+        content = EquipmentFile.model_validate(table)
+    except ValidationError as error:
+        raise SurveyFileError(first_error(path, text, error, EquipmentFile)) from error
+    names = [one.name for one in (*content.bars, *content.frames)]
+    for name in names:
+        if names.count(name) > 1:
+            raise SurveyFileError(f"{path}: '{name}' comes twice, needed different names of bars and frames")
+    tables = {}
+    for frame in content.frames:
+        own = inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
+        found = read_table(own, ("point",), COORDINATES)
+        found.keys("point")
+        tables[frame.name] = found
+    return Equipment(path, content, tables)
+
+
+def given_by(
+    equipment: Equipment,
+    used: Iterable[EquipmentSettings],
+    where: str,
+    unit: str,
+    temperature: float | None,
+    temperature_sigma: float,
+) -> tuple[tuple[ScaleBar, ...], tuple[ObservationTable, ...]]:
+    """Return the scale bars and rigid frames of a survey by what equipment was photographed.
+
+    Args:
+        equipment: the bars and frames that there are.
+        used: those of the survey, each as often as it was placed.
+        where: survey file, for messages.
+        unit: of the survey.
+        temperature: of the equipment in the survey, deg C.
+        temperature_sigma: its standard deviation, K.
+
+    Raises:
+        SurveyFileError: no temperature, an unknown name, or another number of points.
+    """
+    used = tuple(used)
+    if used and temperature is None:
+        raise SurveyFileError(
+            f"{where}: [[equipment]] without survey.temperature; needed that of {used[0].name}, deg C"
+        )
+    known = {one.name: one for one in (*equipment.content.bars, *equipment.content.frames)}
+    scale = METRES[equipment.content.unit] / METRES[unit]
+    spread = temperature_sigma * len(used) ** 0.5
+    bars, frames, placed = [], [], dict[str, int]()
+    for one in used:
+        if one.name not in known:
+            some = listed(list(known)) or "none"
+            raise SurveyFileError(
+                f"{where}: unknown equipment '{one.name}', {equipment.path.name} has {some}"
+            )
+        item = known[one.name]
+        assert temperature is not None
+        factor, relative = scale * item.factor(temperature), item.relative_sigma(temperature, spread)
+        if isinstance(item, Bar):
+            start, end = _points(one, item.points, 2, where)
+            sigma = float(np.hypot(scale * item.sigma, factor * item.length * relative))
+            bars.append(ScaleBar(start, end, factor * item.length, sigma))
+            continue
+        table = equipment.tables[one.name]
+        points = _points(one, table.texts[0], len(table.texts[0]), where)
+        placed[one.name] = placed.get(one.name, 0) + 1
+        group = one.name if placed[one.name] == 1 else f"{one.name} {placed[one.name]}"
+        frames.append(_frame(group, points, table, scale, factor, relative))
+    return tuple(bars), tuple(frames)
+
+
+def _points(one: EquipmentSettings, own: Names, count: int, where: str) -> Names:
+    """Return what a survey calls the points of its equipment."""
+    points = one.points or own
+    if len(points) != count or len(set(points)) < count:
+        raise SurveyFileError(
+            f"{where}: equipment '{one.name}': points = {listed(list(points)) or 'none'}, needed {count} "
+            "different names, in the order of the equipment file"
+        )
+    return tuple(points)
+
+
+def _frame(
+    group: str, points: Names, table: CsvTable, scale: float, factor: float, relative: float
+) -> ObservationTable:
+    """Return a frame at its place, coordinates at the temperature of the survey."""
+    xyz, sigma = np.split(table.values, [3], axis=1)
+    away: FloatArray = factor * np.abs(xyz - xyz.mean(axis=0))
+    common = relative * np.sqrt((away > 0).sum()) * away  # of one scale, as in the source of this module
+    values = np.hstack([factor * xyz, np.hypot(scale * sigma, common)])
+    columns = dict(zip(COORDINATES, values.T, strict=True))
+    return observation_table(
+        FRAME, array_table(str(table.path), {"group": [group] * len(points), "point": points}, columns)
+    )
