@@ -16,7 +16,7 @@ from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
-from sfm.observations.kind import TableKind
+from sfm.observations.kind import PHOTOGRAPH, TableKind
 from sfm.planning.contributions import contributions
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
@@ -69,12 +69,13 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
 ) -> None:
     network, truth = network_of_all()
     path = planned_survey(tmp_path, network, truth)
-    table = next(k for k, one in enumerate(network.observations, 1) if one.name == "antenna positions")
-    text = (tmp_path / f"{table}.csv").read_text("utf-8")
-    for k in range(5):  # of photographs of the plan
-        for camera in (1, 2):
-            text = text.replace(f"moment {k + 1} camera {camera},", f"camera {camera}-S{k + 1},")
-    (tmp_path / f"{table}.csv").write_text(text, "utf-8")
+    for table, one in enumerate(network.observations, 1):
+        if isinstance(one, TableKind) and one.texts_of == PHOTOGRAPH:
+            text = (tmp_path / f"{table}.csv").read_text("utf-8")
+            for k in range(5):  # of photographs of the plan
+                for camera in (1, 2):
+                    text = text.replace(f"moment {k + 1} camera {camera},", f"camera {camera}-S{k + 1},")
+            (tmp_path / f"{table}.csv").write_text(text, "utf-8")
     out = tmp_path / "plan"
     assert plan(tmp_path / "points.csv", "--survey", path, *STATIONS, "--out", out) == 0
     printed = capsys.readouterr().out
@@ -154,7 +155,9 @@ def test_image_points_of_a_planned_rig_give_its_mounts_within_their_standard_dev
 ) -> None:
     """With all kinds of observations, whose names a simulated survey keeps; mounts given as observations."""
     network, truth = network_of_all()
-    observations = tuple(one for one in network.observations if one.name != "antenna positions")
+    observations = tuple(
+        one for one in network.observations if not (isinstance(one, TableKind) and one.texts_of == PHOTOGRAPH)
+    )
     path = planned_survey(tmp_path, replace(network, observations=observations), truth, sigma=1e-3)
     out = tmp_path / "plan"
     (tmp_path / "points.csv").write_text(

@@ -233,7 +233,7 @@ class Planned:
         if self.rig is not None:
             stations = stations.with_rig(self.rig, self.cameras)
         for table in self._tables_of_photographs():
-            missing = [name for name in table.table.texts[0] if name not in stations.names]
+            missing = [name for column in table.named for name in column if name not in stations.names]
             if missing:
                 raise SurveyFileError(
                     f"{table.table.path}: photograph '{missing[0]}' is not in the plan; it has "
@@ -251,8 +251,10 @@ class Planned:
             raise SurveyFileError("plan: a rig or observations of photographs need --stations")
 
     def _tables_of_photographs(self) -> list[ObservationTable]:
+        from sfm.observations.kind import PHOTOGRAPH
+
         tables = () if self.survey is None else self.survey.tables
-        return [table for table in tables if table.of.texts == ("image",)]
+        return [table for table in tables if table.of.texts_of == PHOTOGRAPH]
 
 
 def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: bool) -> Planned:
