@@ -154,13 +154,15 @@ def _held_cameras(a: Solution, b: Solution) -> tuple[tuple[str, ...], tuple[str,
 
 
 def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
-    found = {}
-    for camera in result.estimate.cameras:
+    found: dict[str, tuple[tuple[str, float], ...]] = {}
+    mounts = result.estimate.mounts
+    for a, camera in enumerate(result.estimate.cameras):
         held = ~camera.free & (camera.parameters != 0)
-        if held.any():
-            found[camera.name] = tuple(
-                (camera.names[k], float(camera.parameters[k])) for k in np.flatnonzero(held)
-            )
+        values = [(camera.names[k], float(camera.parameters[k])) for k in np.flatnonzero(held)]
+        if mounts is not None and not mounts.free[a].any():
+            values += zip("XYZ", mounts.position[a].tolist(), strict=True) if mounts.position[a].any() else ()
+        if values:
+            found[camera.name] = tuple(values)
     return found
 
 

@@ -22,6 +22,19 @@ HEADLINES: Mapping[Level, str] = {
 def verdict_of_epochs(found: EpochSeries) -> Verdict:
     """Return the verdict on epochs with the remarks on every pair, those with the first epoch first."""
     remarks = [one for pair in found.pairs for one in remarks_of_pair(pair.displacements)]
+    remarks += [
+        remark(
+            "mount_changed",
+            camera=one.camera,
+            first=pair.displacements.differences.names[0],
+            second=pair.displacements.differences.names[1],
+            statistic=one.statistic,
+            critical=one.critical,
+        )
+        for pair in found.pairs
+        for one in pair.mounts
+        if one.changed
+    ]
     cameras = [
         remark(
             "one_camera",

@@ -18,6 +18,7 @@ from sfm.epochs.blocks import MIN_POINTS, MODELS, BlockMotion, block_motion
 from sfm.epochs.differences import Differences, epoch_differences
 from sfm.epochs.displacements import ALPHA, Displacements, find_displacements
 from sfm.epochs.epoch import Epoch
+from sfm.epochs.mounts import MountChange, mount_changes
 from sfm.epochs.together import SharedCamera, adjust_together
 from sfm.errors import GeometryError
 from sfm.geometry.measured import matches
@@ -32,6 +33,7 @@ class EpochPair:
     displacements: Displacements
     groups: tuple[BlockMotion, ...]  # those asked for
     together: BlockMotion | None  # of all points that moved, as one rigid block; None where they are too few
+    mounts: tuple[MountChange, ...] = ()  # of the cameras of rigs that both have
 
     @property
     def blocks(self) -> tuple[BlockMotion, ...]:
@@ -111,6 +113,7 @@ def analyse_epochs(
                 for name, patterns in (groups or {}).items()
             ),
             _together(moved),
+            mount_changes(first.result, second.result, alpha=alpha, redundancy=found.redundancy),
         )
 
     first = [analysed(epochs[0], epoch) for epoch in epochs[1:]]

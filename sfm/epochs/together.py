@@ -248,7 +248,8 @@ def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray
         raise GeometryError(
             f"{epoch.name}: adjusting its image points again leads {off:.2g} standard deviations away from "
             "its result: it was given what its tables do not keep (weights by robust estimation or of single "
-            "photographs, correlated calibrations, exterior orientation), and cannot be adjusted together"
+            "photographs, correlated calibrations, exterior orientation, survey observations, mounts), and "
+            "cannot be adjusted together"
         )
 
 

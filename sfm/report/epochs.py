@@ -182,6 +182,7 @@ def _section(pair: EpochPair, number: int) -> Section:
         _picture(found, number),
         Folded(counted(len(d.points), "point"), *points, open=bool(found.moved.any())),
         *(part for block in pair.blocks for part in _block(block, factor, unit)),
+        *_mounts(pair, factor, unit),
     )
 
 
@@ -208,6 +209,24 @@ def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
         Table((Column("parameter"), *numbers, Column("unit")), rows),
         Table((Column(), *limits, Column()), tests),
     )
+
+
+def _mounts(pair: EpochPair, factor: float, unit: str) -> tuple[Part, ...]:
+    """Return how cameras of rigs were moved on them."""
+    if not pair.mounts:
+        return ()
+    scale = np.repeat([factor, DEGREES], 3)
+    rows = [
+        (one.camera, *(scale * one.difference), one.statistic, one.critical, "moved" if one.changed else "")
+        for one in pair.mounts
+    ]
+    columns = (
+        *(Column("camera"), *axes("d", unit)),
+        *(Column(f"d{name}", "", "deg", significant) for name in ("omega", "phi", "kappa")),
+        *(Column(name, format=significant) for name in ("T", "critical value")),
+        Column(),
+    )
+    return Heading("Mounts of rigs"), Table(columns, rows)
 
 
 def words_of_stable(found: Displacements) -> str:
@@ -273,6 +292,9 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
                 "moved_as_one": one.fits,
             }
             for one in pair.blocks
+        ],
+        "mounts": [
+            values_of(one, "camera difference sigma statistic critical changed") for one in pair.mounts
         ],
     }
 

@@ -169,6 +169,14 @@ ROWS = (
         "Adjust it (free).",
     ),
     Kind(
+        "mount_changed",
+        "warning",
+        "Camera {camera} was moved on its rig between {first} and {second} (T {statistic}, limit "
+        "{critical}).",
+        "the camera was taken off or knocked, or the frame of the rig bent",
+        "Use mounts from the calibration that is nearer in time to a survey.",
+    ),
+    Kind(
         "one_camera",
         "note",
         "Camera {camera} has one interior orientation in {epochs}, on which they agree (T {statistic}, limit "
