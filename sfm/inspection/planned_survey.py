@@ -102,8 +102,8 @@ class PlannedSurvey:
     tables: tuple[ObservationTable, ...]
     given_mounts: MountObservations  # those held fixed have variance 0
 
-    def network(self) -> tuple[Network, Estimate]:
-        """Return what the survey is to measure, without values, and the truth."""
+    def simulated(self, seed: int) -> tuple[Network, Estimate]:
+        """Return what the survey measures, with errors, and the truth."""
         i, j = np.nonzero(self.seen)
         C = np.tile(self.sigma_px**2 * np.eye(2), (len(i), 1, 1))
         stations = self.stations
@@ -115,7 +115,8 @@ class PlannedSurvey:
             network = network.with_scale_bar(start, end, 1.0, sigma)
         network = with_tables(self.tables, network)
         network = replace(network, observations=(*network.observations, self.given_mounts))
-        return network, Estimate(self.cameras, stations.position, stations.rotation, self.xyz, stations.rig)
+        truth = Estimate(self.cameras, stations.position, stations.rotation, self.xyz, stations.rig)
+        return simulate_network(network, truth, np.random.default_rng(seed))
 
 
 @dataclass(frozen=True)
@@ -294,7 +295,7 @@ def write_simulation(
     Raises:
         KolinearError: too many codes, targets that overlap, or a file that cannot be written.
     """
-    network, truth = simulate_network(*plan.network(), np.random.default_rng(seed))
+    network, truth = plan.simulated(seed)
     if codes is None:
         targets = ["[observations]", 'file = "image_points.csv"']
         _write(folder / "image_points.csv", IMAGE_POINTS, _image_points(network))
@@ -425,7 +426,9 @@ def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
     return tuple(None if code == UNCODED else str(code) for code in codes_of(plan, _rings(codes)).tolist())
 
 
-def achieved(plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px: float) -> Achieved:
+def achieved(
+    plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px: float, *, seed: int = 0
+) -> Achieved:
     """Return what a simulated survey achieved against its plan.
 
     Args:
@@ -433,26 +436,28 @@ def achieved(plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px:
         codes: as of `write_simulation`.
         result: of the survey.
         sigma_px: of an image coordinate, a posteriori, px.
+        seed: as of `write_simulation`.
 
     Raises:
         SurveyFileError: fewer than 3 coded targets were measured, which tell what is what.
     """
     names = {name: j for j, name in enumerate(result.network.points)}
     xyz = result.estimate.points
+    true = plan.simulated(seed)[1].points
     pairs = [(names[name], k) for k, name in enumerate(names_of(plan, codes)) if name in names]
     pairs = [(j, k) for j, k in pairs if np.isfinite(xyz[j]).all()]
     if len(pairs) < 3:
         raise SurveyFileError(f"simulation: {counted(len(pairs), 'coded target')} in the result, needed 3")
     j, k = (np.array(column) for column in zip(*pairs, strict=True))
-    placed = fit_similarity(xyz[j], plan.xyz[k]).apply(xyz)
-    away = np.linalg.norm(plan.xyz[:, None] - placed[None], axis=2)
-    apart = np.linalg.norm(plan.xyz[:, None] - plan.xyz[None], axis=2)
+    placed = fit_similarity(xyz[j], true[k]).apply(xyz)
+    away = np.linalg.norm(true[:, None] - placed[None], axis=2)
+    apart = np.linalg.norm(true[:, None] - true[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
     found = (away[np.arange(len(away)), nearest] < NEAR * apart.min(axis=1)) & np.isfinite(plan.sigma[:, 0])
     j, k = nearest[found], np.flatnonzero(found)
-    motion = fit_similarity(xyz[j], plan.xyz[k])
-    error = motion.apply(xyz[j]) - plan.xyz[k]
+    motion = fit_similarity(xyz[j], true[k])
+    error = motion.apply(xyz[j]) - true[k]
     predicted = np.sqrt((plan.sigma[k] ** 2).mean(axis=1))
     if result.point_covariance is None:
         raise SurveyFileError("simulation: the result has no standard deviations")
