@@ -99,7 +99,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/adjustment/hypotheses/rig_bumps.py": ("tests/adjustment/test_rig_bumps.py",),
     "sfm/survey/rigs.py": ("tests/survey/test_rigs.py",),
     "sfm/survey/observation_tables.py": ("tests/survey/test_survey_observations.py",),
-    "sfm/survey/adjusting/placing.py": ("tests/survey/test_survey_observations.py",),
+    "sfm/survey/placing.py": ("tests/survey/test_survey_observations.py",),
     "sfm/orientation/resection": ("tests/orientation/resection",),
     "sfm/orientation/absolute.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
     "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),

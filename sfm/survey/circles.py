@@ -12,10 +12,10 @@ from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.remarks.remark import Remark, remark
 from sfm.result import Eccentricity
-from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.given import Diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.placing import object_scale
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import (
@@ -24,7 +24,6 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
-from sfm.survey.adjusting.placing import place_on_observations
 from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
@@ -35,6 +34,7 @@ from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.placing import place_on_observations
 from sfm.survey.rigs import mount_cameras
 
 ORIENTATION_POINTS = (
@@ -59,7 +59,9 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     if survey.tie_points is not None:
         refuse_no_base(measured.network, measured.cameras)
     # they are judged by the adjustment first
-    network = replace(measured.network, scale_bars=ScaleBars(), observations=())
+    network = replace(
+        measured.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=()
+    )
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None
 

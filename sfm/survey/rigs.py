@@ -21,18 +21,16 @@ from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
-from sfm.observations.mounts import MountObservations
 from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import CameraSettings, RigSettings
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.observation_tables import with_tables
 
 TINY = float(np.finfo(float).tiny)
 ROUNDS = 10  # of the mean of rotations; it moves by less than their scatter after two
 
 
-def with_survey_data(survey: Survey, network: Network) -> Network:
-    """Return the network with survey observations and, where the survey has rigs, moments of photographs.
+def with_moments(survey: Survey, network: Network) -> Network:
+    """Return the network with the moments of photographs of rigs; as it is without rigs.
 
     Args:
         survey: says which cameras make a rig and what tells the moment of a photograph.
@@ -42,7 +40,6 @@ def with_survey_data(survey: Survey, network: Network) -> Network:
         SurveyFileError: no moment is told of a photograph of a rig, two photographs of one camera are of one
             moment, or no moment has photographs of two cameras.
     """
-    network = with_tables(survey.tables, network)
     if not survey.rigs:
         return network
     key: list[object] = [(name,) for name in network.images]
@@ -69,50 +66,7 @@ def with_survey_data(survey: Survey, network: Network) -> Network:
                 f"{where}: no moment has photographs of two cameras; moments are {some}; correct moment"
             )
     order = {one: k for k, one in enumerate(dict.fromkeys(key))}
-    return with_given_mounts(
-        survey, replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
-    )
-
-
-def with_given_mounts(survey: Survey, network: Network) -> Network:
-    """Return the network with the mounts that a survey gives as observations, unless they are held fixed."""
-    given = given_mounts(survey)
-    loose = given.select(np.flatnonzero(np.trace(given.covariance, axis1=1, axis2=2) > 0))
-    return replace(network, observations=(*network.observations, loose)) if len(loose) else network
-
-
-def given_mounts(survey: Survey) -> MountObservations:
-    """Return the mounts that a survey gives.
-
-    Raises:
-        SurveyFileError: of a camera that is on no rig or the reference of one, not of all six values, or held
-            fixed in part.
-    """
-    number = {camera.name: a for a, camera in enumerate(survey.cameras)}
-    mounted = {name for rig in survey.rigs for name in rig.cameras[1:]}
-    references = {rig.cameras[0] for rig in survey.rigs}
-    cameras: list[int] = []
-    rows: list[tuple[FloatArray, FloatArray]] = []
-    for table in survey.mounts:
-        for k, name in enumerate(table.names):
-            if name in references and not table.value[k].any() and not table.sigma[k].any():
-                continue
-            if name not in mounted:
-                some = listed(sorted(mounted))
-                raise SurveyFileError(
-                    f"{table.table.place(k)}: camera '{name}' is on no rig, or its reference; needed {some}"
-                )
-            sigma = table.sigma[k]
-            if not np.isfinite(sigma).all() or ((sigma == 0).any() and (sigma > 0).any()):
-                raise SurveyFileError(
-                    f"{table.table.place(k)}: camera '{name}': needed all six values, held fixed (sigma 0) "
-                    "together or none of them"
-                )
-            cameras.append(number[name])
-            rows.append((table.value[k], sigma))
-    value, sigma = np.array(rows).reshape(-1, 2, 6).swapaxes(0, 1)
-    covariance = np.eye(6) * sigma[:, None, :] ** 2
-    return MountObservations(np.array(cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance)
+    return replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
 
 
 def planned_mounts(survey: Survey) -> Mounts:
@@ -128,7 +82,7 @@ def planned_mounts(survey: Survey) -> Mounts:
             f"{survey.source}: cameras {listed(names)}, on rigs {on}; a plan needs one camera, or one rig of "
             "all cameras"
         )
-    (rig,), given = survey.rigs, given_mounts(survey)
+    (rig,), given = survey.rigs, survey.given_mounts
     missing = [name for name in rig.cameras[1:] if names.index(name) not in given.camera]
     if missing:
         raise SurveyFileError(
@@ -182,7 +136,7 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
 
     Args:
         survey: names the rigs.
-        network: with moments, see `with_survey_data`.
+        network: with moments, see `with_moments`.
         estimate: with photographs oriented one by one.
 
     Raises:
@@ -191,7 +145,7 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
     if network.moment is None:
         return estimate
     mounts = mounts_of(survey.rigs, survey.cameras, network, estimate)
-    given = given_mounts(survey)
+    given = survey.given_mounts
     if len(given):
         a = given.camera
         base, scale = np.linalg.norm(mounts.position[a], axis=1), 1.0

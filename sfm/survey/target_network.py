@@ -17,11 +17,10 @@ from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import MAX_LENGTH_PER_SIGMA, TargetSettings
-from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
-from sfm.survey.rigs import with_survey_data
+from sfm.survey.survey_network import network_of, scale_bars
 from sfm.targets.codes.plates import plates_of
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
@@ -93,22 +92,16 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
     image = np.repeat(np.arange(len(named)), [len(rows) for rows in named])
     targets = list(zip(photographs.targets, named, strict=True))
     covariance = [image_point_covariance(found, survey.adjust.sigma_px)[rows] for found, rows in targets]
-    network = Network(
-        photographs.names,
-        photographs.camera,
-        naming.names,
-        ImagePoints(
-            image,
-            np.concatenate([point[rows] for point, rows in zip(naming.point, named, strict=True)]),
-            np.concatenate([found.xy[rows] for found, rows in targets]),
-            np.concatenate(covariance),
-        ),
+    image_points = ImagePoints(
+        image,
+        np.concatenate([point[rows] for point, rows in zip(naming.point, named, strict=True)]),
+        np.concatenate([found.xy[rows] for found, rows in targets]),
+        np.concatenate(covariance),
     )
     bars = scale_bars((*survey.scale_bars, *plate_bars(survey, naming)), naming.names)
     if not survey.scale_bars and survey.control is None:
         bars = tag_bars(survey.targets, naming)
-    network = with_survey_data(survey, network)
-    return replace(network, control=control_points(survey.control, naming.names), scale_bars=bars)
+    return network_of(survey, photographs.names, photographs.camera, naming.names, image_points, bars=bars)
 
 
 def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:

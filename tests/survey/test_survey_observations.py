@@ -224,7 +224,7 @@ def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
 
 
 def test_start_values_in_any_attitude_come_to_the_observations() -> None:
-    from sfm.survey.adjusting.placing import place_on_observations
+    from sfm.survey.placing import place_on_observations
 
     network, truth = network_of("attitude", ("height difference", "antenna position"))
     turned = Similarity(0.3, rotation_from_vector(np.array([2.0, -1.0, 0.5])), np.array([5.0, 1.0, 2.0]))

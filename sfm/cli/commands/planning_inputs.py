@@ -275,7 +275,8 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     from sfm.planning.prediction import ScaleBarPlan
     from sfm.survey.inputs.survey import read_survey
     from sfm.survey.observation_tables import with_tables
-    from sfm.survey.rigs import planned_mounts, with_given_mounts
+    from sfm.survey.rigs import planned_mounts
+    from sfm.survey.survey_network import with_given_mounts
 
     survey = read_survey(path)
     if survey.unit != unit:

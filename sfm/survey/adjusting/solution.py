@@ -35,17 +35,8 @@ from sfm.result import (
 )
 from sfm.runtime.progress import report_step
 from sfm.solution import NO_SCALE
-from sfm.survey.adjusting.datum_definition import (
-    MIN_CONTROL,
-    datum_remarks,
-    has_held_mounts,
-    place_on_control,
-    place_on_frame,
-    scale_to_bars,
-)
-from sfm.survey.adjusting.exterior import add_exterior, hold_fixed
+from sfm.survey.adjusting.datum_definition import datum_remarks
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
-from sfm.survey.adjusting.placing import place_on_observations, scale_sigma
 from sfm.survey.adjusting.settling import (
     MIN_IMAGE_POINTS,
     Settled,
@@ -73,6 +64,17 @@ from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 from sfm.survey.observation_tables import find_gross, unused_observations, without_observations
+from sfm.survey.placing import (
+    MIN_CONTROL,
+    has_held_mounts,
+    hold_fixed,
+    place_on_control,
+    place_on_exterior,
+    place_on_frame,
+    place_on_observations,
+    scale_sigma,
+    scale_to_bars,
+)
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
@@ -254,9 +256,13 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         matched: network and approximate values.
         varying: names of the cameras of which every photograph has c by itself, where it is adjusted.
     """
-    placed = add_exterior(matched.network, matched.estimate, survey.exterior, survey.datum.kind)
-    network, estimate = placed.network, placed.estimate
+    network, estimate = matched.network, matched.estimate
     datum = Datum(survey.datum.kind)
+    unused: tuple[Remark, ...] = ()
+    if survey.exterior is not None and datum.kind == "control":
+        estimate = place_on_exterior(network, estimate)
+    elif survey.exterior is not None:
+        unused = (remark("exterior_unused", datum=datum.kind),)
     report_step("choosing the free parameters of the cameras")
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
@@ -281,11 +287,11 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         Task(survey, datum, network, matched.min_rays, least, survey.reject, matched.suspected),
         estimate,
         frame,
-        placed.network,
+        matched.network,
         known,
         oriented,
         matched.min_rays,
-        (*placed.remarks, *chosen.remarks),
+        (*unused, *chosen.remarks),
     )
 
 

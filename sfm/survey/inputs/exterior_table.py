@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_header, read_table
+from sfm.observations.mounts import MountObservations
 from sfm.survey.inputs.given import (
     ANGLES,
     AXES,
@@ -21,6 +23,7 @@ from sfm.survey.inputs.given import (
     SIGMAS_OF_AXES,
     columns_of,
 )
+from sfm.survey.inputs.settings import RigSettings
 
 FULL_TURN = 360.0  # deg
 MIN_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
@@ -120,6 +123,49 @@ def _observed_exterior(table: CsvTable, value: FloatArray, sigma: FloatArray) ->
     value, sigma = value.copy(), sigma.copy()
     value[:, 3:], sigma[:, 3:] = np.radians(value[:, 3:]), np.radians(sigma[:, 3:])
     return ObservedExterior(table.keys("image"), value, sigma, table)
+
+
+def mount_observations(
+    tables: Sequence[ObservedExterior], rigs: Sequence[RigSettings], cameras: Sequence[str]
+) -> MountObservations:
+    """Return the mounts that the tables of rigs give.
+
+    Args:
+        tables: position and angles of cameras in the axes of their rigs.
+        rigs: of the survey.
+        cameras: names of all its cameras.
+
+    Raises:
+        SurveyFileError: of a camera that is on no rig or the reference of one, not of all six values, or held
+            fixed in part.
+    """
+    number = {name: a for a, name in enumerate(cameras)}
+    mounted = {name for rig in rigs for name in rig.cameras[1:]}
+    references = {rig.cameras[0] for rig in rigs}
+    mounted_cameras: list[int] = []
+    rows: list[tuple[FloatArray, FloatArray]] = []
+    for table in tables:
+        for k, name in enumerate(table.names):
+            if name in references and not table.value[k].any() and not table.sigma[k].any():
+                continue
+            if name not in mounted:
+                some = listed(sorted(mounted))
+                raise SurveyFileError(
+                    f"{table.table.place(k)}: camera '{name}' is on no rig, or its reference; needed {some}"
+                )
+            sigma = table.sigma[k]
+            if not np.isfinite(sigma).all() or ((sigma == 0).any() and (sigma > 0).any()):
+                raise SurveyFileError(
+                    f"{table.table.place(k)}: camera '{name}': needed all six values, held fixed (sigma 0) "
+                    "together or none of them"
+                )
+            mounted_cameras.append(number[name])
+            rows.append((table.value[k], sigma))
+    value, sigma = np.array(rows).reshape(-1, 2, 6).swapaxes(0, 1)
+    covariance = np.eye(6) * sigma[:, None, :] ** 2
+    return MountObservations(
+        np.array(mounted_cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance
+    )
 
 
 def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: str, sigma_name: str) -> None:

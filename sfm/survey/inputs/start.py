@@ -21,17 +21,17 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
 from sfm.display import listed
 from sfm.distributions import chi2_ppf
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.checks.same_photographs import same_photographs
-from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
+from sfm.survey.inputs.given import Observations
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.rigs import with_survey_data
+from sfm.survey.survey_network import network_of
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
 
@@ -82,15 +82,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     images, owner = tuple(name for name, keep in zip(images, own, strict=True) if keep), owner[own]
     image, point = number[image[rows]], point[rows]
     merged = merge_repeated(ImagePoints(image, point, xy[rows], covariance[rows], stated[rows]))
-    network = Network(
-        images,
-        owner,
-        points,
-        merged.image_points,
-        control=control_points(survey.control, points),
-        scale_bars=scale_bars(survey.scale_bars, points),
-    )
-    network = with_survey_data(survey, network)
+    network = network_of(survey, images, owner, points, merged.image_points)
     times = Counter(zip(image.tolist(), point.tolist(), strict=True)) if merged.dropped else Counter()
     contradicting = tuple(
         LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
@@ -109,40 +101,6 @@ def measurements_from_observations(survey: Survey) -> Measurements:
             *contradicting,
             *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
         ),
-    )
-
-
-def control_points(control: KnownPoints | None, points: Sequence[str]) -> ObjectPoints:
-    """Return the control among the points of a network, by their names."""
-    if control is None:
-        return ObjectPoints()
-    index = {name: k for k, name in enumerate(points)}
-    given, covariance = np.isfinite(control.xyz), control.covariance
-    if control.check is not None:  # as if it were not known
-        given = given & ~control.check
-        covariance = np.where(control.check[:, :, None] | control.check[:, None, :], 0.0, covariance)
-        point, axis = np.nonzero(control.check)
-        covariance[point, axis, axis] = np.inf
-    known = np.array([name in index for name in control.names], dtype=bool) & given.any(axis=1)
-    # an unknown coordinate has any finite value, here the mean of the others, and no weight
-    count = np.maximum(given.sum(axis=0), 1)
-    mean = np.where(given, control.xyz, 0.0).sum(axis=0) / count
-    return ObjectPoints(
-        np.array([index[control.names[k]] for k in np.flatnonzero(known)], dtype=np.int64),
-        np.where(given, control.xyz, mean)[known],
-        covariance[known],
-    )
-
-
-def scale_bars(bars: Sequence[ScaleBar], points: Sequence[str]) -> ScaleBars:
-    """Return the scale bars of which both ends are among the points of a network, by their names."""
-    index = {name: k for k, name in enumerate(points)}
-    bars = [bar for bar in bars if bar.start in index and bar.end in index]
-    return ScaleBars(
-        np.array([index[bar.start] for bar in bars], dtype=np.int64),
-        np.array([index[bar.end] for bar in bars], dtype=np.int64),
-        np.array([bar.length for bar in bars], dtype=float),
-        np.array([bar.sigma for bar in bars], dtype=float),
     )
 
 

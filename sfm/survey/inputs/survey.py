@@ -16,11 +16,12 @@ from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 from sfm.files.rig_tables import read_moments
+from sfm.observations.mounts import MountObservations
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.equipment import given_by, read_equipment
-from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
+from sfm.survey.inputs.exterior_table import ObservedExterior, mount_observations, read_observed_exterior
 from sfm.survey.inputs.given import (
     Diameters,
     KnownPoints,
@@ -197,6 +198,15 @@ class Survey:
         if self.plates:
             return plate_group(self.targets, self.plates)
         return survey_family(self.targets, self.codes)
+
+    @cached_property
+    def given_mounts(self) -> MountObservations:
+        """Mounts of cameras of rigs that are known beforehand, held fixed or observed.
+
+        Raises:
+            SurveyFileError: a table gives a mount of another camera, or a part of one.
+        """
+        return mount_observations(self.mounts, self.rigs, [one.name for one in self.cameras])
 
     def __repr__(self) -> str:
         count = len(self.cameras)

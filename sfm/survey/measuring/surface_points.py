@@ -32,11 +32,10 @@ from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import TiePointSettings
-from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
-from sfm.survey.rigs import with_survey_data
+from sfm.survey.survey_network import network_of
 
 # Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
 # several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine
@@ -113,15 +112,13 @@ def cover_photographs(
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
     order = np.argsort(found.image_points.point, kind="stable")
     covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
-    covering = Network(
+    covering = network_of(
+        survey,
         network.images,
         network.camera,
         points,
         replace(found.image_points, covariance=covariance).select(order),
-        control=control_points(survey.control, points),
-        scale_bars=scale_bars(survey.scale_bars, points),
     )
-    covering = with_survey_data(survey, covering)
     placed = replace(estimate, points=found.points)
     covering = _with_common_part(
         covering, placed, found.image_points.covariance[order], survey.adjust.sigma_px

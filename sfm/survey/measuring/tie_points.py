@@ -28,7 +28,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.neighbours import neighbours_by_position, neighbours_in_sequence
 from sfm.survey.measuring.photographs import each_photograph
-from sfm.survey.rigs import with_survey_data
+from sfm.survey.survey_network import network_of
 
 # Image points of a photograph: matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
@@ -120,7 +120,7 @@ def tie_photographs(
     points = tuple(f"tie {j + 1}" for j in range(int(tied.point.max()) + 1))
     covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
     image_points = ImagePoints(tied.image, tied.point, tied.xy, covariance)
-    network = with_survey_data(survey, Network(names, camera, points, image_points))
+    network = network_of(survey, names, camera, points, image_points)
     paths = tuple(photographs.paths[k] for k in read)
     drawn = drawn_windows(network, paths, settings.window_px)
     return Measurements(

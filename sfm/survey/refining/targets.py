@@ -15,11 +15,11 @@ from sfm.orientation.image_rays import intersect_image_points
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.adjusting.datum_definition import MIN_CONTROL, object_scale
 from sfm.survey.circles import check_circles
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.targets import targets_in
+from sfm.survey.placing import MIN_CONTROL, object_scale
 from sfm.survey.refining.model_photographs import photograph_paths, read_of_size
 from sfm.survey.target_network import build_network, min_rays, name_coded
 

@@ -1,0 +1,321 @@
+"""Place, attitude and scale of a network: by control, scale bars, observations, or the frame of its datum.
+
+Image points leave these seven open. Start values are brought into the frame of the adjustment, and adjusted
+free networks to the coordinates that their datum refers to, without a change of their shape. Heights,
+coordinate differences, antenna positions and distances determine a part of the seven: they are found by least
+squares, from attitudes all round, so that the adjustment starts near.
+
+Observed exterior orientation takes part in the datum `control` beside the control, and in no other.
+
+Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 2.2.3 (spatial similarity).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations, product
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angles, rotation_from_vector, skew
+from sfm.display import counted
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network, values_of
+from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, inverse_of_observed
+from sfm.result import ControlCheck
+from sfm.similarity import Similarity, fit_similarity, nearest_rotation
+
+ROUNDS = 20  # of Gauss-Newton from each attitude
+LARGEST_STEP = 0.5  # turn of one step, rad, and change of the scale
+MIN_POINTS = 3  # that fix position, attitude and scale
+NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
+SURE = 3.0  # standard deviations by which places must be off a line to give the turn about it
+FLAT = 1e-6  # the same for places without error, over their extent
+ROUGH = 1e-3  # of the extent of the places: no start value needs to be better
+MIN_CONTROL = 3  # points that a control datum needs, and that place a free network
+
+
+def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
+    """Return the estimate in the scale and attitude that survey observations give; as it is without.
+
+    Args:
+        network: with observations of points and photographs.
+        estimate: start values.
+    """
+    kinds = [one for one in (_usable(kind, estimate) for kind in network.observations) if len(one)]
+    if not kinds:
+        return estimate
+    centre = np.nanmean(estimate.points, axis=0)
+    start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
+    scaled = not has_held_mounts(estimate)
+    turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in _attitudes()]
+    tried = [_fitted(kinds, one, scaled=scaled) for one in turned]
+    return min(tried, key=lambda one: one[1])[0]
+
+
+def scale_sigma(network: Network, estimate: Estimate) -> float:
+    """Return the relative standard deviation of the scale that observations of points and photographs give.
+
+    It is that of a network in which nothing else gives one; infinite where they do not either.
+    """
+    kinds = [one for one in (_usable(kind, estimate) for kind in network.observations) if len(one)]
+    if not kinds:
+        return float("inf")
+    centre = np.nanmean(estimate.points, axis=0)
+    rows, _ = _rows(kinds, Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate))
+    N, others = rows.T @ rows, rows[:, :6]
+    left = N[6, 6] - N[6, :6] @ np.linalg.pinv(others.T @ others, hermitian=True) @ N[:6, 6]
+    return float(1 / np.sqrt(left)) if left > 0 else float("inf")
+
+
+def _usable(kind: Kind, estimate: Estimate) -> Kind:
+    """Return the observations of a kind whose points and photographs have start values."""
+    on = np.ones(len(kind), dtype=bool)
+    for of, at in kind.blocks():
+        if of not in (POINT, PHOTOGRAPH):
+            on[:] = False  # of mounts and cameras, which motions leave alone
+        else:
+            on &= (estimate.determined if of == POINT else estimate.oriented)[at]
+    return kind.select(on)
+
+
+def _fitted(kinds: list[Kind], estimate: Estimate, *, scaled: bool) -> tuple[Estimate, float]:
+    """Return the estimate moved, and scaled, to least v'Pv of observations, and it."""
+    for _ in range(ROUNDS):
+        rows, l = _rows(kinds, estimate)
+        rows[:, 6] *= scaled
+        step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
+        size = max(float(np.abs(step[3:]).max()), LARGEST_STEP) / LARGEST_STEP
+        step /= size
+        R = rotation_from_vector(step[3:6])
+        estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
+        if np.abs(step[3:]).max() < 1e-9:
+            break
+    return estimate, float((_rows(kinds, estimate)[1] ** 2).sum())
+
+
+def _rows(kinds: list[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return whitened derivatives by shift, turn and scale, (n, 7), and differences, (n,)."""
+    values, rows, differences = values_of(estimate), [], []
+    for kind in kinds:
+        linear = kind.linearise(values)
+        J = np.zeros((*linear.difference.shape, 7))
+        for (of, at), by in zip(kind.blocks(), linear.J, strict=True):
+            X = values.points[at] if of == POINT else values.position[at]
+            motion = np.zeros((len(at), by.shape[2], 7))
+            motion[:, :3, :3] = np.eye(3)
+            motion[:, :3, 3:6] = -skew(X)
+            motion[:, :3, 6] = X
+            if of == PHOTOGRAPH:
+                motion[:, 3:, 3:6] = values.M[at]
+            J += by @ motion
+        weight = inverse_of_observed(kind.covariances())
+        F = np.swapaxes(np.linalg.cholesky(weight), 1, 2)
+        rows.append((F @ J).reshape(-1, 7))
+        differences.append(np.einsum("nab,nb->na", F, linear.difference).ravel())
+    return np.concatenate(rows), np.concatenate(differences)
+
+
+def _attitudes() -> list[FloatArray]:
+    """Return the 24 rotations of a cube."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.zeros((3, 3))
+            R[np.arange(3), list(order)] = signs
+            if np.linalg.det(R) > 0:
+                found.append(R)
+    return found
+
+
+def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
+    """Return start values in the frame of control and observed exterior orientation.
+
+    Args:
+        network: all image points, control and observed exterior orientation.
+        estimate: after the orientation; photographs without start values are NaN.
+
+    Raises:
+        GeometryError: control and observed exterior orientation cannot place the network.
+    """
+    image, covariance = network.exterior.image, network.exterior.covariance
+    variances = np.einsum("nii->ni", covariance)
+    value = np.where(np.isfinite(variances), network.exterior.values, np.nan)
+    control = network.control.complete
+    known = estimate.determined[control.point]
+    length, breadth = _extents(control.xyz[known], np.ones(int(known.sum())))
+    if known.sum() >= MIN_POINTS and breadth >= NARROW * length:
+        return estimate  # the orientation has brought it there
+    oriented = estimate.oriented[image]
+    centres = oriented & np.isfinite(value[:, :3]).all(axis=1)
+    source = np.concatenate([estimate.points[control.point[known]], estimate.position[image[centres]]])
+    target = np.concatenate([control.xyz[known], value[centres, :3]])
+    variance = np.concatenate(
+        [np.einsum("nii->n", control.covariance[known]), variances[centres, :3].sum(axis=1)]
+    )
+    turned = oriented & np.isfinite(value[:, 3:]).all(axis=1)
+    if not len(target) or not (len(target) >= MIN_POINTS or turned.any()):
+        raise GeometryError(_too_few(len(target), int(turned.sum())))
+    least = (ROUGH * float(np.ptp(target, axis=0).max())) ** 2
+    weight = 1 / np.maximum(variance, least if least > 0 else 1.0)
+    length, breadth = _extents(target, weight)
+    noise = float(np.sqrt(weight @ variance / weight.sum() / 3))
+    if turned.any() and (len(target) < MIN_POINTS or breadth < NARROW * length):
+        similarity = _by_angles(network, estimate, image[turned], value[turned, 3:], source, target, weight)
+    elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
+        similarity = fit_similarity(source, target, weights=weight)
+    else:
+        raise GeometryError(_too_few(len(target), 0, f", {_arrangement(length, breadth, noise)}"))
+    return similarity.apply_estimate(estimate)
+
+
+def hold_fixed(network: Network, estimate: Estimate) -> Estimate:
+    """Return the estimate with fixed control, projection centres and rotations at their given values."""
+    points, position = estimate.points.copy(), estimate.position.copy()
+    rotation, oriented = estimate.rotation.copy(), estimate.oriented
+    control, seen = network.control, network.exterior
+    fixed = np.einsum("nii->ni", control.covariance) == 0
+    points[control.point] = np.where(fixed, control.xyz, points[control.point])
+    for e, i in enumerate(seen.image):
+        variance = np.diagonal(seen.covariance[e])
+        if oriented[i]:
+            position[i] = np.where(variance[:3] == 0, seen.position[e], position[i])
+            if (variance[3:] == 0).all():
+                rotation[i] = rotation_from_angles(*seen.angles[e])
+    return replace(estimate, points=points, position=position, rotation=rotation)
+
+
+def _by_angles(
+    network: Network,
+    estimate: Estimate,
+    image: IntArray,
+    angles: FloatArray,
+    source: FloatArray,
+    target: FloatArray,
+    weight: FloatArray,
+) -> Similarity:
+    """Return the similarity whose rotation is the mean that observed angles say (Horn 1987)."""
+    observed = np.stack([rotation_from_angles(*one) for one in angles])
+    R = nearest_rotation(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
+    w = weight / weight.sum()
+    centre_s, centre_t = w @ source, w @ target
+    spread_s, spread_t = (w @ ((x - c) ** 2).sum(axis=1) for x, c in ((source, centre_s), (target, centre_t)))
+    scale = float(np.sqrt(spread_t / spread_s)) if spread_s > 0 else object_scale(network, estimate)
+    if not scale > 0:
+        raise GeometryError(
+            "observed exterior orientation: one projection centre gives no scale; a second one, control or a "
+            "scale bar is needed"
+        )
+    return Similarity(scale, R, centre_t - scale * R @ centre_s)
+
+
+def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
+    """Return the first and second principal extent of weighted places, (n, 3) and (n,), as RMS."""
+    if len(places) < 2:
+        return 0.0, 0.0
+    w = weight / weight.sum()
+    spread = np.linalg.svd((places - w @ places) * np.sqrt(w)[:, None], compute_uv=False)
+    return float(spread[0]), float(spread[1])
+
+
+def _arrangement(length: float, breadth: float, noise: float) -> str:
+    """Say how places that do not place the network lie, by their extents and standard deviation."""
+    if length == 0:
+        return "all the same"
+    if length > SURE * noise and breadth <= max(noise, FLAT * length):  # no broader than by their errors
+        return "on a line"
+    return (
+        f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
+        f"{SURE:g} in both directions"
+    )
+
+
+def _too_few(places: int, turned: int, how: str = "") -> str:
+    """Say why observed exterior orientation and control do not place the network."""
+    return (
+        f"datum 'control': the network has {counted(places, 'place')} of projection centres and control "
+        f"points with X, Y and Z{how}, and the angles of {counted(turned, 'photograph')}; needed three "
+        'places that are not on a line, or two and the angles of a photograph; for the shape alone, "free"'
+    )
+
+
+def object_scale(network: Network, estimate: Estimate) -> float:
+    """Return object units per unit of an estimate by its scale bars, else its control, else NaN."""
+    bars, control = network.scale_bars, network.control.complete
+    length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
+    usable = np.isfinite(length) & (length > 0)
+    if usable.any():
+        return float(np.median(bars.length[usable] / length[usable]))
+    known = estimate.determined[control.point]
+    if known.sum() < 2:
+        return float("nan")
+    given, found = control.xyz[known], estimate.points[control.point[known]]
+    spread = np.linalg.norm(found - found.mean(axis=0))
+    return float(np.linalg.norm(given - given.mean(axis=0)) / spread) if spread > 0 else float("nan")
+
+
+def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
+    """Bring a network that control does not hold to the length of its scale bars, else of its control."""
+    if datum.kind == "control" or has_held_mounts(estimate):
+        return estimate
+    scale = object_scale(network, estimate)
+    if not scale > 0:
+        return estimate
+    centre = np.nanmean(estimate.points, axis=0)
+    return Similarity(scale, np.eye(3), (1 - scale) * centre).apply_estimate(estimate)
+
+
+def is_scaled(network: Network, estimate: Estimate) -> bool:
+    """Return whether scale bars, other observations or mounts held fixed give a network its scale."""
+    return bool(len(network.scale_bars) or len(network.observations) or has_held_mounts(estimate))
+
+
+def has_held_mounts(estimate: Estimate) -> bool:
+    """Return whether the mount of a camera is held fixed, beside those of reference cameras."""
+    mounts = estimate.mounts
+    if mounts is None:
+        return False
+    return bool((mounts.position.any(axis=1) & ~mounts.free[:, :3].any(axis=1)).any())
+
+
+def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
+    """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
+    control = network.control.complete
+    points = estimate.points[control.point]
+    fitted = fit_similarity(points, control.xyz)
+    scaled = is_scaled(network, estimate)
+    placing = fit_similarity(points, control.xyz, scale=1.0) if scaled else fitted
+    scale = fitted.scale if scaled else 1.0
+    names = tuple(network.points[j] for j in control.point)
+    return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
+
+
+def place_on_frame(
+    network: Network, estimate: Estimate, frame: Estimate, carriers: BoolArray | None
+) -> Estimate:
+    """Place an adjusted free network on the coordinates that its inner constraints refer to.
+
+    The similarity of least squares over the datum points meets the inner constraints exactly, however
+    far the network moved in between: the sum of the differences and their turning and scaling moments are 0.
+    Scale bars keep the scale, and so do two control points.
+
+    Args:
+        network: what was adjusted, in a free datum.
+        estimate: adjusted.
+        frame: coordinates to refer to, NaN where there are none; with fewer than three points those of
+            the projection centres count.
+        carriers: points that carry the datum, all if None, (n,).
+    """
+    on = frame.determined if carriers is None else frame.determined & carriers
+    source, target = estimate.points[on], frame.points[on]
+    if on.sum() < MIN_CONTROL:
+        both = frame.oriented & estimate.oriented
+        source, target = estimate.position[both], frame.position[both]
+    scaled = is_scaled(network, estimate)
+    keep = scaled or len(network.control) == MIN_CONTROL - 1
+    scale = object_scale(network, estimate) if len(network.control) and not scaled else 1.0
+    try:
+        return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
+    except GeometryError:  # too few of them, or on a line: the adjustment has kept what they say
+        return estimate
