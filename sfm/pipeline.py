@@ -18,16 +18,15 @@ from sfm.kernels.threads import own_threads
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
-from sfm.survey.adjusting.solution import Correspondences, SolvedSurvey, solve_survey
+from sfm.survey.adjusting.solution import SolvedSurvey, solve_survey
 from sfm.survey.assembly import assemble_result
 from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.camera_models import orient_with_models
-from sfm.survey.correspondences import find_correspondences
+from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
-from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.photograph_list import find_photographs, refuse_incomplete_cameras
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore

@@ -8,10 +8,12 @@ from typing import TypeVar
 import numpy as np
 
 from sfm.conventions import BoolArray, IntArray
+from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import Kind
 
 K = TypeVar("K", bound=Kind)
+MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 
 
 def reduce_network(
@@ -88,3 +90,32 @@ def supported(
         if (still_images == images).all() and (still_points == points).all():
             return images, points
         images, points = still_images, still_points
+
+
+def determined(
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    min_rays: IntArray,
+    min_points: int | IntArray = MIN_IMAGE_POINTS,
+) -> tuple[BoolArray, BoolArray]:
+    """Return the photographs (m,) and points (n,) that accepted image points determine.
+
+    Raises:
+        GeometryError: fewer than two photographs are left.
+    """
+    images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
+    if images.sum() < 2:
+        raise GeometryError(
+            f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
+            "network, at least 2 photographs are needed"
+        )
+    return images, points
+
+
+def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
+    position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
+    xyz = np.full_like(estimate.points, np.nan)
+    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
+    return Estimate(part.cameras, position, rotation, xyz, part.mounts)

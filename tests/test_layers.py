@@ -54,6 +54,14 @@ CV2_ROOMS = (
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
 TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
+STAGES = (  # of a survey, in the order of `sfm.pipeline`
+    ("sfm.survey.inputs",),
+    ("sfm.survey.measuring", "sfm.survey.target_network"),
+    ("sfm.survey.orientation", "sfm.survey.camera_models", "sfm.survey.board_turns"),
+    ("sfm.survey.correspondences",),
+    ("sfm.survey.adjusting",),
+    ("sfm.survey.assembly",),
+)
 ROOMS = LAYERS[1]  # of which none knows another
 
 
@@ -99,6 +107,19 @@ def test_modules_import_only_to_the_left(name: str) -> None:
             continue
         assert layer_of(other) is not None, f"{name} imports {other}, which is in no layer"
         assert layer_of(other) <= own, f"{name} imports {other}, which stands to its right"  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("stage", range(len(STAGES)))
+def test_no_stage_of_a_survey_reaches_a_later_one(stage: int) -> None:
+    later = [name for names in STAGES[stage + 1 :] for name in names]
+    for first in (name for name in MODULES for one in STAGES[stage] if belongs(name, one)):
+        found, left = set[str](), [first]
+        while left:
+            name = left.pop()
+            if name in MODULES and name not in found:
+                assert not any(belongs(name, one) for one in later), f"{first} reaches {name}"
+                found.add(name)
+                left += [one for one in imported(MODULES[name]) if belongs(one, "sfm.survey")]
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -14,7 +14,8 @@ from sfm.conventions import IntArray
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
-from sfm.survey.adjusting.solution import Correspondences, SolvedSurvey
+from sfm.survey.adjusting.solution import SolvedSurvey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.diagnosis.missing_plates import plates_not_in_result
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import Section

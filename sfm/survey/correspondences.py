@@ -10,16 +10,23 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, BoolArray
-from sfm.network import Estimate, Network, rows_of, without_given
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
+from sfm.network import (
+    Estimate,
+    Network,
+    rows_of,
+    without_given,
+)
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
-from sfm.reduced_network import reduce_network
+from sfm.reduced_network import MIN_IMAGE_POINTS, determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.result import (
+    Eccentricity,
+    PhotographTargets,
+)
 from sfm.runtime.progress import reported
-from sfm.survey.adjusting.settling import MIN_IMAGE_POINTS, determined, merge_estimate
-from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
     ContestedCodes,
@@ -37,6 +44,25 @@ from sfm.survey.target_network import build_network, match_uncoded, min_rays
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 LET_GO = 100.0  # tolerances: median residual of a photograph beyond which nothing has held it
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
+TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """The network of a survey with all its points, and approximate values."""
+
+    network: Network
+    estimate: Estimate  # NaN for points that have left it
+    min_rays: IntArray  # photographs that each point needs, (n,)
+    naming: Naming | None = None  # of targets; None without
+    eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
+    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    remarks: tuple[Remark, ...] = ()
+    point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
+    given: bool = False  # whether the survey's own approximate values were what the orientation started from
+    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
+    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
 
 def find_correspondences(

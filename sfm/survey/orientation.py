@@ -7,10 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
+from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.network import (
+    Estimate,
+    ExteriorObservations,
+    Network,
+    ObjectPoints,
+    ScaleBars,
+    rows_of,
+)
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import (
@@ -23,18 +32,18 @@ from sfm.orientation.incremental.sequence import (
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
-from sfm.survey.adjusting.free_parameters import choose_free_parameters
-from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
 from sfm.survey.diagnosis.no_base import refuse_no_base
-from sfm.survey.diagnosis.second_motion import find_second_motion
-from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
+from sfm.survey.diagnosis.second_object import find_second_motion, find_second_objects
+from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.placing import place_on_observations
+from sfm.survey.placing import (
+    place_on_observations,
+)
 from sfm.survey.rigs import mount_cameras
 
 ORIENTATION_POINTS = (
@@ -98,7 +107,9 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
             found, remarks=(*found.remarks, *find_second_motion(network, found, _orient_strongest))
         )
     elif not wrong_c:
-        found = tell_second_objects(found, find_second_objects(network, found, _orient))
+        second = find_second_objects(network, found, _orient)
+        failures = tuple((image, second.get(image, reason)) for image, reason in found.failures)
+        found = replace(found, failures=failures)
     estimate = mount_cameras(survey, network, found.estimate)
     if survey.datum.kind != "control":
         estimate = place_on_observations(measured.network, estimate)
@@ -236,3 +247,8 @@ def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
     every = np.ones(len(network.image_points), dtype=bool)
     return max(int(common.max(initial=0)) for _, _, common in network.common_points(every))
+
+
+def refine(network: Network, estimate: Estimate) -> Estimate:
+    """Adjust a growing network for its approximate values only; see `orientation.sequence.orient`."""
+    return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate

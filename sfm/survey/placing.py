@@ -23,6 +23,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, inverse_of_observed
+from sfm.observations.mounts import MountObservations
 from sfm.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity, nearest_rotation
 
@@ -277,6 +278,12 @@ def has_held_mounts(estimate: Estimate) -> bool:
     if mounts is None:
         return False
     return bool((mounts.position.any(axis=1) & ~mounts.free[:, :3].any(axis=1)).any())
+
+
+def mounts_give_scale(network: Network, estimate: Estimate) -> bool:
+    """Return whether mounts that were given, held fixed or observed, take part in the scale of a network."""
+    observed = any(isinstance(one, MountObservations) for one in network.observations)
+    return observed or has_held_mounts(estimate)
 
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:

@@ -22,7 +22,8 @@ from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.report.numbers import significant
 from sfm.report.phrases import words_of_neighbours
-from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -16,7 +16,7 @@ from sfm.orientation.incremental.misfits import _Resected
 from sfm.orientation.incremental.rivals import bounded_costs
 from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity
-from sfm.survey.adjusting.solution import refine
+from sfm.survey.orientation import refine
 from tests.facades import SIZE_PX, facade_network
 
 SIGMAS_PX = (0.005, 0.15, 1.0)  # stated; the noise is 0.15 px

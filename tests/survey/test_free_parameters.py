@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.survey.adjusting.free_parameters import FreeParameters, choose_free_parameters
+from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of

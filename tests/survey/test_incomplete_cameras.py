@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.camera import camera_from_values
 from sfm.errors import SurveyFileError
-from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
+from sfm.survey.adjusting.solution_remarks import unlike_squares
 from sfm.survey.inputs.survey import CameraSetup
 
 
@@ -46,5 +47,5 @@ def test_nominal_sensor_sizes_that_make_odd_pixels_are_told(
     settings: dict[str, tuple[float, float]], pixel: tuple[float, float], free: tuple[str, ...], told: bool
 ) -> None:
     camera = CameraSetup(name="a", images="*.png", free=free, **settings)
-    remarks = unlike_squares([camera], [pixel], [camera.adjusted])
+    remarks = unlike_squares([camera], [camera_from_values("a", "brown", (60, 40), pixel, c_mm=50.0)])
     assert [one.kind for one in remarks] == (["pixels_not_square"] if told else [])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sfm.remarks.remark import remark
-from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

@@ -17,7 +17,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.diagnosis.left_out import datum_carriers
+from sfm.survey.adjusting.settling import datum_carriers
 from tests.surveys import survey_of
 from tests.synthetic import add_narrow_points, make_network, seed_of
 

@@ -15,7 +15,7 @@ from sfm.depth_reversal import reverse_depth
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.survey.adjusting.nearer_start import held_to_converge, nearer_start
+from sfm.survey.adjusting.settling import held_to_converge, nearer_start
 from tests.survey.weak_networks import _measured, _stations
 from tests.surveys import survey_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, seed_of

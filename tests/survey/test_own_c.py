@@ -11,7 +11,8 @@ from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity
-from sfm.survey.adjusting.solution import OF_CAMERAS, Correspondences, SolvedSurvey, solve_survey
+from sfm.survey.adjusting.solution import OF_CAMERAS, SolvedSurvey, solve_survey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.synthetic import make_network, seed_of

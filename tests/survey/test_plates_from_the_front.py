@@ -10,7 +10,7 @@ import numpy as np
 from sfm.network import Estimate
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
-from sfm.survey.diagnosis.principal_distance import not_calibrated
+from sfm.survey.adjusting.solution_remarks import not_calibrated
 from tests.plates import camera
 from tests.survey.seen_plates import FREE, Plates, about, plates_survey, run_plates
 from tests.synthetic import seed_of

@@ -10,7 +10,7 @@ import pytest
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
-from sfm.survey.diagnosis.principal_distance import far_principal_distances
+from sfm.survey.adjusting.solution_remarks import far_principal_distances
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

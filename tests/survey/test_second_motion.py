@@ -10,8 +10,8 @@ import pytest
 from sfm.camera import project
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation, orient
-from sfm.survey.adjusting.solution import refine
-from sfm.survey.diagnosis.second_motion import MIN_POINTS, find_second_motion
+from sfm.survey.diagnosis.second_object import MOTION_POINTS, find_second_motion
+from sfm.survey.orientation import refine
 from tests.synthetic import make_network, seed_of
 
 IMAGES, POINTS, NOISE_PX = 8, 200, 0.1
@@ -45,7 +45,7 @@ def orient_again(network: Network, start: Estimate) -> Orientation:
     return orient(network, start, refine=refine)
 
 
-@pytest.mark.parametrize("count", [60, MIN_POINTS + 5])
+@pytest.mark.parametrize("count", [60, MOTION_POINTS + 5])
 def test_points_that_walk_on_together_are_told_with_their_share(count: int) -> None:
     network, truth = walked(count)
     (found,) = find_second_motion(network, oriented(network, truth), orient_again)
@@ -61,7 +61,7 @@ def test_errors_by_chance_are_no_motion() -> None:
     assert find_second_motion(network, found, orient_again) == ()
 
 
-@pytest.mark.parametrize("count", [0, MIN_POINTS - 2])
+@pytest.mark.parametrize("count", [0, MOTION_POINTS - 2])
 def test_few_points_are_not_even_tried(count: int) -> None:
     network, truth = walked(count)
 

@@ -20,13 +20,13 @@ from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
-from sfm.survey.adjusting.solution import refine
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
-from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
+from sfm.survey.diagnosis.second_object import find_second_objects
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.orientation import refine
 from tests.survey.test_own_camera import with_zoom
 from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations, survey_of
@@ -124,10 +124,9 @@ def test_photographs_that_fit_one_another_only_are_a_second_object(seed: int) ->
     own = mine.image < 6
     network = replace(network, image_points=join(mine.select(own), its.select(its.image >= 6)))
     found = orient(network, empty_estimate(network, truth.cameras))
-    (group,) = find_second_objects(network, found, orient)
-    assert group.images == ("image 7", "image 8", "image 9", "image 10")
-    told = dict(tell_second_objects(found, (group,)).failures)
-    assert all(told[image].kind == "photograph_of_second_object" for image in group.images)
+    reasons = find_second_objects(network, found, orient)
+    assert list(reasons) == ["image 7", "image 8", "image 9", "image 10"]
+    assert {one.kind for one in reasons.values()} == {"photograph_of_second_object"}
 
 
 def join(first: ImagePoints, second: ImagePoints) -> ImagePoints:
@@ -146,7 +145,7 @@ def test_zoomed_photographs_are_no_second_object(seed: int) -> None:
     network, truth = with_zoom(f"zoomed alike {seed}", dict.fromkeys(range(6, 10), 1.4))
     found = orient(network, empty_estimate(network, truth.cameras), refine=refine)
     assert not found.estimate.oriented.all()
-    assert find_second_objects(network, found, orient) == ()
+    assert find_second_objects(network, found, orient) == {}
 
 
 @pytest.mark.parametrize("mirrored", [4, pytest.param(6, marks=pytest.mark.slow)])

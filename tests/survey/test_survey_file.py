@@ -12,7 +12,7 @@ from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.photographs.exif import Metadata
-from sfm.survey.adjusting.datum_definition import datum_remarks
+from sfm.survey.adjusting.solution_remarks import datum_remarks
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, start_values

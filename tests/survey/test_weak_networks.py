@@ -14,7 +14,7 @@ from sfm.camera import camera_from_values, project
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
-from sfm.survey.diagnosis.principal_distance import contradicted
+from sfm.survey.adjusting.solution_remarks import contradicted
 from sfm.survey.inputs.survey import CameraSetup
 from tests.survey.weak_networks import outcome_of, study, weak_network
 from tests.synthetic import make_network, seed_of

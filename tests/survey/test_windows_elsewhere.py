@@ -10,7 +10,8 @@ import pytest
 from sfm.adjustment.hypotheses.hypotheses import Judged
 from sfm.remarks.remark import of_kind, remark
 from sfm.survey.adjusting import solution
-from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

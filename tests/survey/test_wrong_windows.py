@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sfm.network import Estimate, Network
-from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey
 from tests.surveys import survey_of

@@ -1,40 +1,51 @@
-"""Adjusting a survey until nothing leaves it any more: points, photographs, weights."""
+"""Adjusting a survey until nothing leaves it any more: points, photographs, weights.
+
+With long lenses all rays of a photograph are nearly parallel: principal distance, distance of the photographs
+and depth of the object can hardly be distinguished, Gauss-Newton creeps along a bent valley, and the object
+turned inside out in depth is a minimum of its own. With the cameras held at their start values there is no
+such valley; from where that ends the cameras are freed.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 13.3.6 (affine cameras, reversal).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.other_solutions import scaled
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.depth_reversal import reverse_depth
+from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed
 from sfm.orientation.ray_angles import ray_angles
-from sfm.reduced_network import reduce_network, supported
+from sfm.reduced_network import determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.adjusting.nearer_start import held_to_converge, nearer_start
-from sfm.survey.diagnosis.left_out import datum_carriers
-from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
 from sfm.survey.diagnosis.own_camera import Treated, treat_lost
 from sfm.survey.inputs.interior import without_idle_cameras
 from sfm.survey.inputs.survey import Survey
 
-MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MAX_ITERATIONS = 50  # of an adjustment from the usual start values
 MANY_ITERATIONS = 300  # from nearer ones, where it has not converged: along a flat valley steps are short
 # what is held where it does not converge with all: x0, y0 look like a rotation, c like another distance
 HELD_ONE_AFTER_ANOTHER = ((), (Role.X0, Role.Y0), (Role.X0, Role.Y0, Role.FOCAL))
 CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
+DAMPED_ITERATIONS, UNDAMPED_ITERATIONS = 50, 300  # with the cameras held, where a step is cheap
+NEAR = 1e-3  # |A dx| / |v| that is near enough for a start
+MOTIONS = 7  # of a network whose position, attitude and scale the datum fixes
 
 
 @dataclass(frozen=True)
@@ -253,35 +264,6 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start:
     return final
 
 
-def determined(
-    network: Network,
-    estimate: Estimate,
-    accepted: BoolArray,
-    min_rays: IntArray,
-    min_points: int | IntArray = MIN_IMAGE_POINTS,
-) -> tuple[BoolArray, BoolArray]:
-    """Return the photographs (m,) and points (n,) that accepted image points determine.
-
-    Raises:
-        GeometryError: fewer than two photographs are left.
-    """
-    images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
-    if images.sum() < 2:
-        raise GeometryError(
-            f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
-            "network, at least 2 photographs are needed"
-        )
-    return images, points
-
-
-def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
-    """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
-    position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
-    xyz = np.full_like(estimate.points, np.nan)
-    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
-    return Estimate(part.cameras, position, rotation, xyz, part.mounts)
-
-
 def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     """Return which points of an adjustment have residuals that are together larger than chance, (n,).
 
@@ -307,3 +289,126 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
     accepted = part.copy()
     accepted[part] = ~adjustment.rejected
     return accepted
+
+
+def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datum) -> Estimate | None:
+    """Return start values by an adjustment with all cameras held, of the smaller v'Pv of both depths.
+
+    Args:
+        network: what is adjusted.
+        start: start values from which its adjustment did not converge.
+        ended: where that adjustment ended.
+        datum: of the adjustment.
+
+    Returns:
+        The cameras as in the start values; None where nothing converges.
+    """
+    found = [one for one in (_held(network, one, datum) for one in _candidates(start, ended, datum)) if one]
+    if not found:
+        return None
+    best = min(found, key=lambda one: one.vPv)
+    return replace(best.estimate, cameras=start.cameras)
+
+
+def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[Remark, ...]:
+    """Return a remark for each camera of which parameters were held that were free before."""
+    names: dict[str, tuple[str, ...]] = {}
+    for one, held in zip(before, after, strict=True):
+        lost = np.flatnonzero(one.free & ~held.free)
+        if len(lost):
+            names[one.owner_of(int(lost[0]))] = tuple(one.names[s] for s in lost)
+    return tuple(
+        remark("held_to_converge", camera=camera, parameters=parameters)
+        for camera, parameters in names.items()
+    )
+
+
+def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
+    """Yield where the adjustment ended, brought back to c of the start, and the start; each reflected too."""
+    factor = start.cameras[0].c_px / ended.cameras[0].c_px
+    back = replace(scaled(ended, factor), cameras=start.cameras) if factor > 0 else start
+    for one in (back, start):
+        yield one
+        if datum.kind != "control":
+            yield reverse_depth(one)
+
+
+def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
+    """Return the adjustment with all cameras held, at first damped; None if it does not converge."""
+    values = replace(
+        start, cameras=tuple(replace(one, free=np.zeros_like(one.free)) for one in start.cameras)
+    )
+    for method, steps in (("levenberg-marquardt", DAMPED_ITERATIONS), ("gauss-newton", UNDAMPED_ITERATIONS)):
+        try:
+            a = adjust(
+                network,
+                values,
+                datum=datum,
+                reject="none",
+                method=method,
+                max_iterations=steps,
+                tolerance=NEAR,
+                covariance=False,
+            )
+        except GeometryError:
+            return None
+        if a.rejected.any() or not np.isfinite(a.vPv):
+            return None
+        if a.converged:
+            return a
+        values = a.estimate
+    return None
+
+
+def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str) -> None:
+    """Raise GeometryError if a network has no redundancy, so that nothing could be checked or judged.
+
+    Args:
+        network: the part that is to be adjusted.
+        estimate: its cameras say what is free.
+        datum: kind of datum; control and observed exterior orientation count in that of control.
+    """
+    m, n, k = len(network.images), len(network.points), len(network.image_points)
+    interior = len(
+        {
+            (camera.group_of(int(s)) or a, int(s))
+            for a, camera in enumerate(estimate.cameras)
+            if (network.camera == a).any()
+            for s in np.flatnonzero(camera.free)
+        }
+    )
+    if datum == "control":
+        outer = network.control.covariance, network.exterior.covariance
+        variances = [np.einsum("nii->ni", covariance) for covariance in outer]
+        known = sum(int(((one == 0) | is_observed(one)).sum()) for one in variances)
+    else:
+        known = MOTIONS
+    given = len(network.scale_bars) + int((network.interior.sigma > 0).sum())
+    observations, unknowns = 2 * k + given + known, 6 * m + 3 * n + interior
+    if observations > unknowns:
+        return
+    free = f", {interior} of them free camera parameters" if interior else ""
+    advice = (
+        "; free fewer parameters, or add photographs and points"
+        if interior
+        else "; add photographs or points"
+    )
+    raise GeometryError(
+        f"{counted(n, 'common point')} in {counted(m, 'photograph')}: {counted(observations, 'observation')} "
+        "and datum conditions for "
+        f"{counted(unknowns, 'unknown')}{free}, more are needed{advice}"
+    )
+
+
+def datum_carriers(angles_deg: np.ndarray, least_deg: float) -> BoolArray | None:
+    """Return the points that carry a free datum, None for all.
+
+    A point far away at a small angle is a long and soft lever on which position, attitude and scale of
+    all the others would hang.
+
+    Args:
+        angles_deg: largest angle between two rays of each point, NaN with fewer than two, deg, (n,).
+        least_deg: smallest of a point that carries the datum, deg.
+    """
+    weak = angles_deg < least_deg
+    return None if not weak.any() or 2 * weak.sum() > len(weak) else np.asarray(~weak)

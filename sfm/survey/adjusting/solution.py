@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -23,39 +23,29 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
-from sfm.observations.mounts import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
-from sfm.reduced_network import reduce_network
+from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.result import (
     ControlCheck,
-    Eccentricity,
     LeftOutPoint,
-    PhotographTargets,
 )
 from sfm.runtime.progress import report_step
 from sfm.solution import NO_SCALE
-from sfm.survey.adjusting.datum_definition import datum_remarks
-from sfm.survey.adjusting.free_parameters import choose_free_parameters
-from sfm.survey.adjusting.settling import (
-    MIN_IMAGE_POINTS,
-    Settled,
-    Task,
-    adjust_finally,
-    merge_estimate,
-    on_points,
-    settle,
-    treat,
-)
-from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
-from sfm.survey.diagnosis.own_camera import Treated
-from sfm.survey.diagnosis.principal_distance import (
+from sfm.survey.adjusting.settling import Settled, Task, adjust_finally, on_points, settle, treat
+from sfm.survey.adjusting.solution_remarks import (
     contradicted,
-    far_principal_distances,
+    handedness_unchecked,
+    left_out_points,
     not_calibrated,
+    remarks_on_solution,
+    unused_image_points,
+    windows_elsewhere,
 )
+from sfm.survey.correspondences import Correspondences
+from sfm.survey.diagnosis.own_camera import Treated
+from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.hypotheses.given import JudgedGiven, judge_given
-from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
@@ -63,16 +53,14 @@ from sfm.survey.inputs.settings import CameraSettings, DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
-from sfm.survey.observation_tables import find_gross, unused_observations, without_observations
+from sfm.survey.observation_tables import find_gross, without_observations
 from sfm.survey.placing import (
     MIN_CONTROL,
-    has_held_mounts,
     hold_fixed,
     place_on_control,
     place_on_exterior,
     place_on_frame,
     place_on_observations,
-    scale_sigma,
     scale_to_bars,
 )
 from sfm.targets.codes.plates import points_of_plates
@@ -82,28 +70,8 @@ OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # difference is reported. Free in each photograph it costs more than it cures where one of them determines it
 # badly: halves of a video whose c differs by 2 % then differ by 4 % of the distance, before by 0.04 %.
 MAX_FOCUS_CHANGE = 1.03
-WEAK_SCALE = 0.01  # relative standard deviation of a scale from which it is reported
-TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation decides which of the four solutions is meant
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """The network of a survey with all its points, and approximate values."""
-
-    network: Network
-    estimate: Estimate  # NaN for points that have left it
-    min_rays: IntArray  # photographs that each point needs, (n,)
-    naming: Naming | None = None  # of targets; None without
-    eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
-    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
-    remarks: tuple[Remark, ...] = ()
-    point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
-    given: bool = False  # whether the survey's own approximate values were what the orientation started from
-    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
-    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
-    overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
 
 @dataclass(frozen=True)
@@ -118,11 +86,6 @@ class SolvedSurvey:
     unused_image_points: int  # of points and photographs that are not in it
     given_tests: tuple[GivenTest, ...]  # of control, bars and observed orientation against the image points
     others: tuple[OtherSolution, ...]  # that the image points allow as well
-
-
-def refine(network: Network, estimate: Estimate) -> Estimate:
-    """Adjust a growing network for its approximate values only; see `orientation.sequence.orient`."""
-    return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
 def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
@@ -179,8 +142,9 @@ def _solution(
         accepted_rays=settled.rays,
         needed=start.needed,
     )
+    known = set(np.array(whole.points, dtype=object)[start.known])
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
-    told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
+    told = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     report_step("testing the assumptions")
     plates = _plates(survey, matched.naming, final.network)
@@ -196,13 +160,13 @@ def _solution(
                 remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit))
                 for name, c, unit in _own_c(varying, final.estimate)
             ),
-            *_remarks(start.task.survey, told, len(whole.points), final),
+            *remarks_on_solution(start.task.survey, told, len(whole.points), final),
             *not_calibrated(survey, final.estimate),
-            *_handedness(start.task.survey, solved.given),
-            *_of_windows(survey, judged.causes),
+            *handedness_unchecked(survey, checked=solved.given.checks_handedness),
+            *windows_elsewhere(survey, judged.causes),
             *judged.unchecked,
             *bump_remarks(final, unit),
-            *_of_windows(survey, explain_rejections(final, unit=unit, bodies=plates)),
+            *windows_elsewhere(survey, explain_rejections(final, unit=unit, bodies=plates)),
             *contradicted(solved.c_held, judged.causes),
         ),
         left_out,
@@ -378,9 +342,6 @@ def _judged(
         rescale=task.survey.adjust.weights == "components",
         plates=plates if is_plate_control(task.survey.control, plate) else (),
     )
-    if _mounts_scale(network, start.estimate):
-        checked = tuple(one for one in given.remarks if one.kind != "scale_unchecked")
-        given = replace(given, remarks=checked)
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
@@ -568,30 +529,6 @@ def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
     )
 
 
-def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:
-    """Return those of the points that had approximate values."""
-    names = {name for name, is_in in zip(whole.points, known, strict=True) if is_in}
-    return tuple(one for one in left_out if one.point in names)
-
-
-def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
-    """Return the remarks on pixels by nominal sensor sizes, of the first camera of each of the survey's."""
-    names = [one.name for one in survey.cameras]
-    first = {base_name(camera.name, names): camera for camera in reversed(estimate.cameras)}
-    settings = [one for one in survey.cameras if one.name in first]
-    pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
-    return unlike_squares(settings, pixels, [one.adjusted for one in settings])
-
-
-def _of_windows(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
-    """Return remarks in which points of texture did not move, but are seen at other places."""
-    if survey.tie_points is None:
-        return tuple(remarks)
-    return tuple(
-        replace(one, kind="windows_elsewhere") if one.kind == "points_moved" else one for one in remarks
-    )
-
-
 def _is_zoomed(varying: frozenset[str], estimate: Estimate) -> bool:
     """Return whether c of the photographs of a camera differs by more than focusing changes it."""
     return any(max(c) > MAX_FOCUS_CHANGE * min(c) for _, c, _ in _own_c(varying, estimate))
@@ -603,52 +540,3 @@ def _own_c(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, l
         own = [one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name]
         if own:
             yield name, [float(one.parameters[0]) for one in own], own[0].units[0]
-
-
-def _sigma_of_c(a: Adjustment) -> list[float]:
-    """Return the standard deviation of the principal distance of each camera, in its unit."""
-    return [float(a.interior_sigma(k)[0]) for k in range(len(a.estimate.cameras))]
-
-
-def _handedness(survey: Survey, given: JudgedGiven) -> tuple[Remark, ...]:
-    """Return the note on image points of a file that fit as well turned over.
-
-    The mirror image of an object, seen in mirrored photographs, has the residuals of the object.
-    """
-    if survey.observations is None or given.checks_handedness:
-        return ()
-    return (remark("handedness_unchecked"),)
-
-
-def _mounts_scale(network: Network, estimate: Estimate) -> bool:
-    """Return whether mounts that were given have a say on the scale of a network."""
-    observed = any(isinstance(one, MountObservations) for one in network.observations)
-    return observed or has_held_mounts(estimate)
-
-
-def _weak_scale(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the remark on a scale that only survey observations give, and badly."""
-    network = a.network
-    given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
-    if given or _mounts_scale(network, a.estimate) or not network.observations or not a.has_scale:
-        return ()
-    sigma = scale_sigma(network, a.estimate)
-    names = list(dict.fromkeys(one.name for one in network.observations))
-    return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
-
-
-def _remarks(
-    survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
-) -> tuple[Remark, ...]:
-    """Return what a person must know beyond the numbers."""
-    absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
-    return (
-        *adjustment.remarks,
-        *remarks_on_left_out(left_out, measured),
-        *([remark("datum_points_missing", points=absent)] if absent else []),
-        *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
-        *_pixels_unlike_squares(survey, adjustment.estimate),
-        *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
-        *unused_observations(survey, adjustment.network),
-        *_weak_scale(adjustment),
-    )

@@ -30,6 +30,7 @@ from sfm.survey.hypotheses.given_groups import (
     remarks_on_unchecked,
 )
 from sfm.survey.hypotheses.given_scales import judge_scales
+from sfm.survey.placing import mounts_give_scale
 
 MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
 
@@ -71,13 +72,15 @@ def judge_given(
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
     places = None if free is None or free.redundancy < 1 else _places(network, free, datum)
-    if places is None:
+    if free is None or places is None:
         kinds = (("bars", network.scale_bars), ("control", network.control))
         of = [name for name, some in kinds if len(some)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    return _judged(Task(network, places, datum, unit, rescale, tuple(map(frozenset, plates))))
+    checked = mounts_give_scale(network, free.estimate)
+    task = Task(network, places, datum, unit, rescale, tuple(map(frozenset, plates)), checks_scale=checked)
+    return _judged(task)
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:

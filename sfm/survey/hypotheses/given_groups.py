@@ -45,6 +45,7 @@ class Task:
     unit: str
     rescale: bool
     plates: tuple[frozenset[str], ...] = ()  # points of each, the first of which is control; none without
+    checks_scale: bool = False  # whether given mounts check the scale of the others
 
     @property
     def of_plate(self) -> bool:

@@ -72,7 +72,7 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     judgement = judge_values(model, task.level)
     tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
     if len(scales) == 1:
-        alone = () if task.of_plate else (remark("scale_unchecked", given=names[0]),)
+        alone = () if task.of_plate or task.checks_scale else (remark("scale_unchecked", given=names[0]),)
         return JudgedScales(bars, alone, tests)
     if judgement.fits:
         return JudgedScales(bars, tuple(remarks_on_unchecked("lengths", names, model)), tests)

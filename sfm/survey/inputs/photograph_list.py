@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.display import counted
-from sfm.errors import SurveyFileError
+from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
+from sfm.photographs.exif import Metadata, read_metadata
 from sfm.survey.inputs.checks.contradictions import SurveySettings
 from sfm.survey.inputs.interior import refuse_ungrouped
+from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey_file import inside, is_own_file
 
 MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
@@ -118,3 +121,49 @@ def _holds(folder: Path) -> str:
     if not files:
         return "which holds no files (--images names another folder)"
     return f"which holds {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"
+
+
+def refuse_incomplete_cameras(
+    settings: Sequence[CameraSettings], source: str, photographs: PhotographList
+) -> None:
+    """Raise SurveyFileError if the pixel size or principal distance of cameras is not known from anywhere.
+
+    Args:
+        settings: what the survey says of its cameras.
+        source: what messages call the survey.
+        photographs: whose EXIF data may say the rest.
+    """
+    lines = []
+    for number, one in enumerate(settings):
+        wanted = _wanted(one)
+        paths = [photographs.paths[k] for k in np.flatnonzero(photographs.camera == number)]
+        metadata = _readable(paths) if wanted else []
+        missing = [
+            key for key, attribute in wanted if metadata and not any(getattr(m, attribute) for m in metadata)
+        ]
+        if missing:
+            lines.append(f"camera {one.name}: {' and '.join(missing)}")
+    if lines:
+        raise SurveyFileError(
+            f"{source}: EXIF data of the photographs do not state what is needed of {'; '.join(lines)}"
+        )
+
+
+def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
+    """Return (what to write, where EXIF data have it) of what a camera does not say."""
+    said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
+    wanted = []
+    if one.pixel_mm is None and one.sensor_mm is None:
+        wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
+    if one.c_mm is None and not said & {"c", "fx", "f"}:
+        wanted.append(("c_mm", "focal_mm"))
+    return wanted
+
+
+def _readable(paths: Sequence[Path]) -> list[Metadata]:
+    """Return the metadata of the photographs that have some; the others are reported where they are read."""
+    found = []
+    for path in paths:
+        with suppress(PhotographError, OSError):
+            found.append(read_metadata(path))
+    return found

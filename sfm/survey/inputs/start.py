@@ -25,7 +25,7 @@ from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
-from sfm.survey.inputs.checks.same_photographs import same_photographs
+from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.given import Observations
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements

@@ -12,7 +12,7 @@ from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph, take_back_srgb
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
-from sfm.survey.inputs.checks.same_photographs import MIN_COMMON
+from sfm.survey.inputs.checks.copies import MIN_COMMON
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings

@@ -16,9 +16,8 @@ from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.reduced_network import reduce_network
-from sfm.survey.adjusting.settling import determined, merge_estimate
-from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
+from sfm.reduced_network import determined, merge_estimate, reduce_network
+from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.refining.targets import ModelTargets, join_targets
 from sfm.survey.refining.windows import MIN_RAYS, Windows
 

@@ -30,7 +30,7 @@ from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
-from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
+from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.refining.model_photographs import Photographs, outside_masks
 from sfm.survey.refining.oriented_windows import (

@@ -7,8 +7,9 @@ sum of d is that of both residuals together, with the same errors it is 0:
 
     |d|^2 / (|r_i|^2 + |r_j|^2) = 1 - rho.
 
-Copies by their bytes and by identical image points are found before, see `sfm.survey.measuring.photographs`
-and `same_photographs`.
+Copies by their bytes are found before, see `sfm.survey.measuring.photographs`, and so are those by identical
+image points: no two exposures have the same noise, so that image points which are the same to the last digit
+were measured in one picture.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.7 (F distribution).
 """
@@ -21,7 +22,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import IntArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
 from sfm.distributions import f_sf
 from sfm.errors import GeometryError
@@ -33,8 +34,9 @@ from sfm.survey.inputs.measurements import Measurements
 
 ALPHA = 0.001  # probability of taking two exposures for one, of all pairs together
 MIN_CORRELATION = 0.7  # of the errors; 0.99 of real photographs saved as JPEG of quality 40
-MIN_COMMON = 4  # image points
 SAME_PLACE = 1e-3  # of the distance, and rad: two photographs that are farther apart are no copies
+MIN_COMMON = 4  # image points that must be the same
+DIGIT_PX = 1e-6  # differences below it are of writing, not of measuring, px
 
 
 def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
@@ -125,3 +127,28 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
         naming=naming,
         failed=(*measured.failed, *failed),
     )
+
+
+def same_photographs(image: IntArray, point: IntArray, xy: FloatArray, camera: IntArray) -> dict[int, int]:
+    """Return for each photograph that is a copy which earlier one it is a copy of.
+
+    Args:
+        image: photograph of each image point, (k,).
+        point: its object point, (k,).
+        xy: its position, px, (k, 2).
+        camera: of each photograph, (m,).
+    """
+    seen: dict[tuple[int, bytes], int] = {}
+    copies: dict[int, int] = {}
+    order = np.lexsort((point, image))
+    bounds = np.searchsorted(image[order], np.arange(len(camera) + 1))
+    for i in range(len(camera)):
+        rows = order[bounds[i] : bounds[i + 1]]
+        if len(rows) < MIN_COMMON:
+            continue
+        places = np.rint(xy[rows] / DIGIT_PX).astype(np.int64)
+        key = int(camera[i]), point[rows].tobytes() + places.tobytes()
+        first = seen.setdefault(key, i)
+        if first != i:
+            copies[i] = first
+    return copies

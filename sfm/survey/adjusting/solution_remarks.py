@@ -1,0 +1,257 @@
+"""Remarks on the solution of a survey: its datum, the points that it lacks, its cameras and its scale.
+
+Few photographs of a flat object let the principal distance run away along with the distance from it, to a
+false minimum with a small standard deviation; only its start value shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.camera import Camera, base_name
+from sfm.conventions import BoolArray, IntArray
+from sfm.distortion.models import MODELS
+from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark
+from sfm.result import (
+    LeftOutPoint,
+)
+from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
+from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.observation_tables import unused_observations
+from sfm.survey.placing import mounts_give_scale, scale_sigma
+
+WEAK_SCALE = 0.01  # relative standard deviation of a scale from which it is reported
+FAR = 0.2  # relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens
+UNLIKE_SQUARES = 0.005  # relative difference of the sides of a pixel; no sensor of a camera has it
+
+
+def remarks_on_solution(
+    survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
+) -> tuple[Remark, ...]:
+    """Return what a person must know beyond the numbers."""
+    sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
+    absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
+    return (
+        *adjustment.remarks,
+        *remarks_on_left_out(left_out, measured),
+        *([remark("datum_points_missing", points=absent)] if absent else []),
+        *far_principal_distances(survey, adjustment.estimate, sigma_of_c),
+        *unlike_squares(survey.cameras, adjustment.estimate.cameras),
+        *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
+        *unused_observations(survey, adjustment.network),
+        *weak_scale(adjustment),
+    )
+
+
+def windows_elsewhere(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+    """Return remarks in which points of texture did not move, but are seen at other places."""
+    if survey.tie_points is None:
+        return tuple(remarks)
+    return tuple(
+        replace(one, kind="windows_elsewhere") if one.kind == "points_moved" else one for one in remarks
+    )
+
+
+def handedness_unchecked(survey: Survey, *, checked: bool) -> tuple[Remark, ...]:
+    """Return the note on image points of a file that fit as well turned over.
+
+    The mirror image of an object, seen in mirrored photographs, has the residuals of the object.
+    """
+    if survey.observations is None or checked:
+        return ()
+    return (remark("handedness_unchecked"),)
+
+
+def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
+    """Return the remark on a scale that only survey observations give, and badly."""
+    network = a.network
+    given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
+    if given or mounts_give_scale(network, a.estimate) or not network.observations or not a.has_scale:
+        return ()
+    sigma = scale_sigma(network, a.estimate)
+    names = list(dict.fromkeys(one.name for one in network.observations))
+    return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
+
+
+def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:
+    """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
+
+    Points of a plate may be out of view: nobody expects all of them in the result.
+    """
+    remarks, known = [], set(network.points)
+    plate = is_plate_control(survey.control, plate_control(survey.targets))
+    control = [name for name in survey.control.names if name not in known] if survey.control else []
+    if control and not plate:
+        remarks.append(remark("control_missing", points=control))
+    if survey.targets.pitch_assumed and survey.targets.pitch is not None:
+        remarks.append(remark("plate_pitch_assumed", pitch=(survey.targets.pitch, survey.unit)))
+    bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
+    if bars:
+        remarks.append(remark("scale_bars_missing", bars=bars))
+    if not has_scale:
+        remarks.append(remark("scale_undefined", unit=survey.unit))
+    return tuple(remarks)
+
+
+def left_out_points(
+    whole: Network,
+    in_result: tuple[str, ...],
+    *,
+    reasons: tuple[tuple[str, Remark], ...],
+    accepted_rays: IntArray,
+    needed: IntArray,
+) -> tuple[LeftOutPoint, ...]:
+    """Return the measured points of a network that a result lacks, each with the reason.
+
+    Args:
+        whole: everything that was measured.
+        in_result: names of the points of the result.
+        reasons: (name, reason) of points for which the orientation found no coordinates.
+        accepted_rays: accepted rays of each point when it left, (n,).
+        needed: rays that each point needs, (n,).
+    """
+    told, rays = dict(reasons), whole.rays()
+    kept = set(in_result)
+    out = []
+    for j, name in enumerate(whole.points):
+        if name in kept or not rays[j]:
+            continue
+        if rays[j] < needed[j]:
+            reason = remark("point_with_few_rays", rays=int(rays[j]), needed=int(needed[j]))
+        elif name in told:
+            reason = told[name]
+        elif accepted_rays[j] >= needed[j]:
+            reason = remark("point_of_lost_photographs", measured=int(rays[j]), needed=int(needed[j]))
+        else:
+            reason = remark(
+                "point_with_rays_rejected",
+                accepted=int(accepted_rays[j]),
+                measured=int(rays[j]),
+                needed=int(needed[j]),
+            )
+        out.append(LeftOutPoint(name, int(rays[j]), reason))
+    return tuple(out)
+
+
+def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) -> int:
+    """Return how many image points are of photographs (m,) or points (n,) that are not in the result."""
+    seen = whole.image_points
+    return int((~(images[seen.image] & points[seen.point])).sum())
+
+
+def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tuple[Remark, ...]:
+    """Return which of so many measured points are not in the result: contradicted, or just not determined."""
+    groups = {
+        "points_contradicted": [one.point for one in left_out if one.reason.severity != "note"],
+        "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
+    }
+    return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)
+
+
+def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
+    """Return a remark for each principal distance that lies far from the one that the survey gives.
+
+    One that was held there has been found by trial, and nothing has tested it.
+
+    Args:
+        survey: whose cameras state `c_mm`; those by EXIF data are not looked at, nor those that photograph a
+            plate of known coordinates: no distance runs away from it.
+        estimate: adjusted cameras.
+        sigma: standard deviation of the principal distance of each, in its unit.
+    """
+    if _calibrates(survey):
+        return ()
+    given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
+    remarks = []
+    for camera, s in zip(estimate.cameras, sigma, strict=True):
+        start = given.get(camera.name)
+        if start is None:
+            continue
+        found = camera.c_px * float(np.mean(camera.pixel_mm))
+        if abs(found / start - 1) <= FAR:
+            continue
+        if not camera.free[0]:
+            held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(found, "mm"))
+            remarks.append(held)
+        else:
+            remarks.append(
+                remark(
+                    "c_far_from_given",
+                    camera=camera.name,
+                    given=(start, "mm"),
+                    found=(found, "mm"),
+                    change=(100 * (found / start - 1), "%"),
+                    share=s / abs(float(camera.parameters[0])),
+                )
+            )
+    return tuple(remarks)
+
+
+def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
+    """Return a remark where the residuals have a cause and c was held at a value that nobody measured."""
+    if not held or not causes:
+        return ()
+    return (remark("c_held_contradicted", cameras=held),)
+
+
+def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
+    """Return a remark for each camera that photographs of a plate should calibrate, with c held after all.
+
+    Args:
+        survey: says what is free of its cameras, or leaves it to the photographs.
+        estimate: adjusted cameras; those of single photographs are named by these behind that of the survey.
+    """
+    if not _calibrates(survey):
+        return ()
+    remarks, names = [], [one.name for one in survey.cameras]
+    for one in survey.cameras:
+        name = MODELS[one.model].names[0]
+        own = [camera for camera in estimate.cameras if base_name(camera.name, names) == one.name]
+        held = next((camera for camera in own if not camera.free[0]), None)
+        if name in one.may_be_free and held is not None:
+            value = held.c_px * float(np.mean(held.pixel_mm))
+            remarks.append(remark("calibration_failed", camera=one.name, held=(value, "mm")))
+    return tuple(remarks)
+
+
+def _calibrates(survey: Survey) -> bool:
+    """Return whether the points of a survey are those of a plate of known coordinates."""
+    return plate_family(survey.targets) is not None and survey.datum.kind == "control"
+
+
+def unlike_squares(settings: Sequence[CameraSettings], cameras: Sequence[Camera]) -> tuple[Remark, ...]:
+    """Return a remark on each camera whose nominal sensor size makes pixels that are not square.
+
+    Args:
+        settings: what the survey says of its cameras. A pixel size that is stated is not judged; nor is one
+            with b1, or fx and fy, among the free parameters: the photographs determine the ratio.
+        cameras: of its solution; those of single photographs are named by these behind that of the survey.
+    """
+    names = [one.name for one in settings]
+    first = {base_name(camera.name, names): camera for camera in reversed(cameras)}
+    remarks = []
+    for one in settings:
+        known = "b1" in one.adjusted or {"fx", "fy"} <= set(one.adjusted)
+        if one.name not in first or one.pixel_mm is not None or known:
+            continue
+        width, height = first[one.name].pixel_mm.tolist()
+        ratio = width / height - 1
+        if abs(ratio) >= UNLIKE_SQUARES:
+            remarks.append(
+                remark(
+                    "pixels_not_square",
+                    camera=one.name,
+                    where="sensor_mm" if one.sensor_mm is not None else "EXIF data",
+                    width=(1000 * width, "µm"),
+                    height=(1000 * height, "µm"),
+                    off=(100 * abs(ratio), "%"),
+                    side=((width * height) ** 0.5, "mm"),
+                )
+            )
+    return tuple(remarks)
