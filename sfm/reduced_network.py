@@ -113,9 +113,9 @@ def determined(
     return images, points
 
 
-def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
-    """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
-    position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
-    xyz = np.full_like(estimate.points, np.nan)
+def merge_estimate(part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the estimate of all photographs (m,) and points (n,); NaN but for those of a part."""
+    position, rotation = np.full((len(images), 3), np.nan), np.full((len(images), 3, 3), np.nan)
+    xyz = np.full((len(points), 3), np.nan)
     position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
-    return Estimate(part.cameras, position, rotation, xyz, part.mounts)
+    return replace(part, position=position, rotation=rotation, points=xyz)

@@ -223,7 +223,7 @@ def merge_held(
         points: points in it, (n,).
         tolerance_px: that the residuals were within before, px.
     """
-    estimate = merge_estimate(before, adjusted.estimate, images, points)
+    estimate = merge_estimate(adjusted.estimate, images, points)
     length = np.nan_to_num(np.linalg.norm(adjusted.residuals, axis=1), nan=np.inf)
     of_photograph = rows_of(adjusted.network.image_points.image, int(images.sum()))
     median = np.array([np.median(length[rows]) if len(rows) else 0.0 for rows in of_photograph])

@@ -68,6 +68,7 @@ class Task:
 class Settled:
     """An adjustment after which no point or photograph leaves."""
 
+    task: Task
     adjustment: Adjustment  # without covariance
     images: BoolArray  # photographs in it, (m,)
     points: BoolArray  # points in it, (n,)
@@ -76,6 +77,21 @@ class Settled:
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
     start_sigma0: float  # at the start values
     held: tuple[Remark, ...]  # parameters that were held because it did not converge with them
+    treated: Treated | None = None  # photographs with cameras of their own, or left out; None without
+
+    def after(self, before: Settled) -> Settled:
+        """Return it as what followed an earlier one."""
+        return replace(
+            self,
+            iterations=before.iterations + self.iterations,
+            start_sigma0=before.start_sigma0,
+            treated=self.treated or before.treated,
+        )
+
+    @property
+    def whole(self) -> Estimate:
+        """Adjusted values among those of all photographs and points; NaN elsewhere."""
+        return merge_estimate(self.estimate, self.images, self.points)
 
     @property
     def part(self) -> Network:
@@ -118,7 +134,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         if not adjustment.converged:
             adjustment, held = _converged(task, part, start, adjustment)
             iterations += adjustment.iterations
-        estimate = merge_estimate(estimate, adjustment.estimate, images, points)
+        estimate = merge_estimate(adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         if wrong is None:  # once: each round would find more, as errors of windows are not quite normal
             wrong = np.zeros(len(points), dtype=bool)
@@ -129,30 +145,38 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
         if (left_images == images).all() and (left_points == points).all():
-            return Settled(adjustment, images, points, accepted, iterations, rays, start_sigma0, held)
+            return Settled(task, adjustment, images, points, accepted, iterations, rays, start_sigma0, held)
         images, points = left_images, left_points
 
 
-def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) -> Treated | None:
-    """Return the network with cameras of their own for the photographs that fit with them, others left out.
+def settle_treated(task: Task, estimate: Estimate) -> Settled:
+    """Adjust, then again with cameras of their own for the photographs that fit with them, others left out.
 
     Args:
-        task: what was adjusted; without tests nothing shows a photograph that does not fit.
-        settled: the adjustment.
-        start: approximate values, which what has left the adjustment starts from again.
-        oriented: photographs that had an exterior orientation, (m,).
+        task: what to adjust; without tests nothing shows a photograph that does not fit.
+        estimate: approximate values, from which what has left the first adjustment starts again.
     """
+    settled = settle(task, estimate)
     if task.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
-        return None
-    adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
-    found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented, suspected=task.suspected)
-    if found is None:
-        return None
-    one, again = found.estimate, ~found.estimate.oriented & ~found.without
-    position = np.where(again[:, None], start.position, one.position)
-    rotation = np.where(again[:, None, None], start.rotation, one.rotation)
-    points = np.where(one.determined[:, None], one.points, start.points)
-    return replace(found, estimate=replace(one, position=position, rotation=rotation, points=points))
+        return settled
+    treated = treat_lost(
+        task.network,
+        settled.whole,
+        settled.accepted,
+        oriented=estimate.oriented,
+        suspected=task.suspected,
+    )
+    if treated is None:
+        return settled
+    one, again = treated.estimate, ~treated.estimate.oriented & ~treated.without
+    start = replace(
+        one,
+        position=np.where(again[:, None], estimate.position, one.position),
+        rotation=np.where(again[:, None, None], estimate.rotation, one.rotation),
+        points=np.where(one.determined[:, None], one.points, estimate.points),
+    )
+    found = settle(replace(task, network=treated.network), start)
+    return replace(found, treated=treated, iterations=settled.iterations + found.iterations)
 
 
 def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:

@@ -19,10 +19,9 @@ from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import base_name
-from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
+from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -32,7 +31,7 @@ from sfm.result import (
 )
 from sfm.runtime.progress import report_step
 from sfm.solution import NO_SCALE
-from sfm.survey.adjusting.settling import Settled, Task, adjust_finally, on_points, settle, treat
+from sfm.survey.adjusting.settling import Settled, Task, adjust_finally, on_points, settle, settle_treated
 from sfm.survey.adjusting.solution_remarks import (
     contradicted,
     handedness_unchecked,
@@ -43,7 +42,6 @@ from sfm.survey.adjusting.solution_remarks import (
     windows_elsewhere,
 )
 from sfm.survey.correspondences import Correspondences
-from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.interior import split_cameras
@@ -130,8 +128,12 @@ def _solution(
 ) -> SolvedSurvey:
     """Return the solution of a survey, with c of each photograph of some cameras."""
     start = _prepared(survey, matched, varying)
-    solved = _solved(start, _plates(survey, matched.naming, matched.network))
-    final, settled, whole = solved.final, solved.settled, start.whole
+    free = _free_network(start)
+    task, given = _judged(start, free, _plates(survey, matched.naming, matched.network))
+    settled, gross = _settled(start, free, task, given)
+    report_step("adjusting all observations")
+    found, better = _best(start, settled)
+    final, settled, whole = found.adjustment, found.settled, matched.network
     if survey.tie_points is not None:
         report_step("estimating the errors that neighbours have in common")
         final = with_neighbours(final)
@@ -140,39 +142,43 @@ def _solution(
         final.network.points,
         reasons=matched.point_failures,
         accepted_rays=settled.rays,
-        needed=start.needed,
+        needed=matched.min_rays,
     )
-    known = set(np.array(whole.points, dtype=object)[start.known])
+    known = set(np.array(whole.points, dtype=object)[start.estimate.determined])
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
-    told = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
+    listed = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     report_step("testing the assumptions")
     plates = _plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)
     return SolvedSurvey(
         final,
-        solved.check,
-        _dropped(start, solved),
+        found.check,
+        _dropped(start, settled),
         (
             *start.remarks,
-            *solved.remarks,
+            *(() if settled.treated is None else settled.treated.remarks),
+            *given.remarks,
+            *gross,
+            *better,
+            *settled.held,
             *(
                 remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit))
                 for name, c, unit in _own_c(varying, final.estimate)
             ),
-            *remarks_on_solution(start.task.survey, told, len(whole.points), final),
+            *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
             *not_calibrated(survey, final.estimate),
-            *handedness_unchecked(survey, checked=solved.given.checks_handedness),
+            *handedness_unchecked(survey, checked=given.checks_handedness),
             *windows_elsewhere(survey, judged.causes),
             *judged.unchecked,
             *bump_remarks(final, unit),
             *windows_elsewhere(survey, explain_rejections(final, unit=unit, bodies=plates)),
-            *contradicted(solved.c_held, judged.causes),
+            *contradicted(found.c_held, judged.causes),
         ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
-        solved.given.tests,
-        solved.others,
+        given.tests,
+        found.others,
     )
 
 
@@ -191,25 +197,18 @@ class _Prepared:
     task: Task  # with all that was given, which is not judged yet
     estimate: Estimate
     frame: Estimate | None  # given coordinates, which carry a free datum; None without
-    whole: Network  # with all that was measured
-    known: BoolArray  # points with approximate values, (n,)
-    oriented: BoolArray  # photographs with an exterior orientation, (m,)
-    needed: IntArray  # rays that each point needs, (n,)
     remarks: tuple[Remark, ...]  # on observed exterior orientation, and which parameters were freed
 
 
 @dataclass(frozen=True)
-class _Solved:
-    """The final adjustment and what it was settled from."""
+class _Final:
+    """A last adjustment and what it was settled from."""
 
-    final: Adjustment  # with the iterations of all adjustments on the way
     settled: Settled
+    adjustment: Adjustment  # with the iterations of all adjustments on the way
     check: ControlCheck | None
-    others: tuple[OtherSolution, ...]
-    treated: Treated | None
-    given: JudgedGiven
-    remarks: tuple[Remark, ...]
     c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
+    others: tuple[OtherSolution, ...]
 
 
 def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
@@ -230,7 +229,6 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     report_step("choosing the free parameters of the cameras")
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
-    known, oriented = estimate.determined, estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
         given = given_values(survey, network)
         held = np.where(given.determined[:, None], given.points, estimate.points)
@@ -251,10 +249,6 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         Task(survey, datum, network, matched.min_rays, least, survey.reject, matched.suspected),
         estimate,
         frame,
-        matched.network,
-        known,
-        oriented,
-        matched.min_rays,
         (*unused, *chosen.remarks),
     )
 
@@ -267,42 +261,31 @@ def _with_own_c(settings: CameraSettings) -> CameraSettings:
     return settings.model_copy(update={"per_photograph": focal})
 
 
-@dataclass(frozen=True)
-class _Free:
-    """The image points of a survey adjusted alone."""
-
-    task: Task
-    settled: Settled
-    treated: Treated | None
-    iterations: int
-
-
-def _free_network(start: _Prepared) -> _Free | None:
+def _free_network(start: _Prepared) -> Settled | None:
     """Adjust the image points alone: nothing that was given bends their network, or costs one of them.
 
     Returns:
-        The network; None for a plate that looks alike turned, whose points have no identity without it.
+        The network; None for a plate that looks alike turned, whose points have no identity without it, and
+        for image points that control may connect and calibrate, as they do not by themselves.
 
     Raises:
-        GeometryError: they do not make a network by themselves.
+        GeometryError: they do not make a network by themselves, and there is no control.
     """
     task, estimate = start.task, start.estimate
     if _has_no_identity(task.survey):
         return None
     report_step("adjusting the image points alone")
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=())
-    task = replace(task, network=network)
+    alone = replace(task, network=network)
     if task.datum.kind == "control":
         free = replace(task.survey, datum=DatumSettings(kind="free"))
-        task = replace(task, datum=Datum("free"), survey=free)
-    settled = settle(task, estimate)
-    iterations = settled.iterations
-    treated = treat(task, settled, estimate, start.oriented)
-    if treated is not None:
-        task, estimate = replace(task, network=treated.network), treated.estimate
-        settled = settle(task, estimate)
-        iterations += settled.iterations
-    return _Free(task, settled, treated, iterations)
+        alone = replace(alone, datum=Datum("free"), survey=free)
+    try:
+        return settle_treated(alone, estimate)
+    except GeometryError:
+        if task.datum.kind != "control":
+            raise
+        return None
 
 
 def _has_no_identity(survey: Survey) -> bool:
@@ -312,7 +295,7 @@ def _has_no_identity(survey: Survey) -> bool:
 
 
 def _judged(
-    start: _Prepared, free: _Free | None, plates: tuple[tuple[str, ...], ...]
+    start: _Prepared, free: Settled | None, plates: tuple[tuple[str, ...], ...]
 ) -> tuple[Task, JudgedGiven]:
     """Return the task with what was given, as on plates, as far as the image points confirm it."""
     task = start.task
@@ -329,7 +312,7 @@ def _judged(
         return task, JudgedGiven(network, task.datum)
     report_step("testing the given values")
     # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
-    adjustment = None if free is None or free.settled.held else free.settled.adjustment
+    adjustment = None if free is None or free.held else free.adjustment
     given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
     if adjustment is not None and task.survey.tie_points is not None and given_any:
         adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
@@ -350,85 +333,78 @@ def _judged(
     return replace(task, survey=survey, datum=given.datum, network=given.network, needed=needed), given
 
 
-def _solved(start: _Prepared, plates: tuple[tuple[str, ...], ...]) -> _Solved:
-    """Adjust the image points, judge what was given by them, and adjust all that is left together."""
-    try:
-        free = _free_network(start)
-    except GeometryError:
-        if start.task.datum.kind != "control":
-            raise
-        free = None  # control may connect and calibrate what the photographs alone do not
-    task, given = _judged(start, free, plates)
+def _settled(
+    start: _Prepared, free: Settled | None, task: Task, given: JudgedGiven
+) -> tuple[Settled, tuple[Remark, ...]]:
+    """Adjust the image points and what was given together.
+
+    Args:
+        start: network and approximate values.
+        free: the image points adjusted alone.
+        task: with what was given, as far as the image points confirm it.
+        given: judged.
+
+    Returns:
+        The adjustment, and remarks on observations of tables that were left out.
+    """
     if free is not None and task.survey.adjust.weights == "components":
-        alone = free.settled.adjustment
+        alone = free.adjustment
         if alone.redundancy > 0:  # else there is only what was stated
             factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
         free = None  # what they give alone is no start either, nor are the cameras that it gave photographs
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
-    estimate, ready, accepted = start.estimate, None, None
-    gross: tuple[Remark, ...] = ()
-    iterations, treated = 0, None
+    estimate = start.estimate
     if free is not None:
-        settled, iterations, treated = free.settled, free.iterations, free.treated
-        accepted = settled.accepted
-        estimate = merge_estimate(estimate, settled.estimate, settled.images, settled.points)
-        estimate = _completed(start.estimate, estimate, task, given)
-        beside = len(task.network.scale_bars) + len(task.network.observations)
-        if task.datum.kind != "control" and not beside:
-            ready = _with_given(settled, task.network)
+        estimate = _completed(estimate, free.whole, task, given)
     estimate = scale_to_bars(task.network, estimate, task.datum)
-    if task.network.observations and accepted is not None:
-        task, gross = _without_gross(task, settled, estimate)
+    gross: tuple[Remark, ...] = ()
+    if task.network.observations and free is not None:
+        task, gross = _without_gross(task, free, estimate)
         if gross and task.datum.kind != "control":
             estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
-    if ready is None:
-        settled = settle(task, estimate, accepted)
-        iterations += settled.iterations
-        ready = settled
-        if free is None:
-            treated = treat(task, settled, estimate, start.oriented)
-            if treated is not None:
-                task, estimate, ready = replace(task, network=treated.network), treated.estimate, None
-    start_sigma0 = settled.start_sigma0 if free is None else free.settled.start_sigma0
-    first_held = settled.held if free is None else free.settled.held
-    asked = {one.name for one in start.estimate.cameras if one.free[0]}
-    first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
-    better: tuple[Remark, ...] = ()
-    while True:
-        report_step("adjusting all observations")
-        settled = settle(task, estimate) if ready is None else ready
-        iterations += settled.iterations if ready is None else 0
-        ready = None
-        final, check = _placed(start, task, settled)
-        # c that had to be held is nobody's calibration: what its other values give is another solution
-        c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
-        starts = (*_of_pair(final), *(() if first is None else _left(final, first[1])))
-        report_step("looking for other solutions")
-        others = other_solutions(final, starts=starts, had_to_be_held=c_held)
-        if first is not None and not final.converged:  # what seemed better is none: as it was
-            (settled, final, check, others), better = first, ()
-            break
-        if first is not None or not others or not others[0].converges:
-            break
-        first = settled, final, check, others
-        better = (_better_taken(final, others[0]),)
-        estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
-    own = () if treated is None else treated.remarks
-    held = settled.held or (() if first is not None else first_held)
-    return _Solved(
-        replace(final, iterations=iterations + final.iterations, start_sigma0=start_sigma0),
-        settled,
-        check,
-        others,
-        treated,
-        given,
-        (*own, *given.remarks, *gross, *better, *held),
-        c_held,
+    if free is None:
+        return settle_treated(task, estimate), gross
+    if task.datum.kind != "control" and not len(task.network.scale_bars) and not task.network.observations:
+        return _with_given(replace(free, task=task)), gross
+    settled = settle(task, estimate, free.accepted).after(free)
+    return replace(settled, held=settled.held or free.held), gross
+
+
+def _best(start: _Prepared, settled: Settled) -> tuple[_Final, tuple[Remark, ...]]:
+    """Return the last adjustment, and a remark where it starts from a solution of smaller v'Pv."""
+    found = _final(start, settled)
+    if not found.others or not found.others[0].converges:
+        return found, ()
+    other = found.others[0]
+    estimate = merge_estimate(other.estimate, settled.images, settled.points)
+    again = _final(start, settle(settled.task, estimate).after(settled), before=found.adjustment)
+    if not again.adjustment.converged:  # what seemed better is no solution
+        return found, ()
+    return again, (_better_taken(found.adjustment, other),)
+
+
+def _final(start: _Prepared, settled: Settled, *, before: Adjustment | None = None) -> _Final:
+    """Return the last adjustment of a settled network, and the other solutions that its image points allow.
+
+    Args:
+        start: network, frame and approximate values.
+        settled: adjusted so that nothing leaves it any more.
+        before: solution that was left for this one.
+    """
+    final, check = _placed(start, settled)
+    final = replace(
+        final, iterations=settled.iterations + final.iterations, start_sigma0=settled.start_sigma0
     )
+    # c that had to be held was not estimated: what its other values give is another solution
+    asked = {one.name for one in start.estimate.cameras if one.free[0]}
+    c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
+    report_step("looking for other solutions")
+    starts = (*_of_pair(final), *(() if before is None else _left(final, before)))
+    return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
 def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Task, tuple[Remark, ...]]:
@@ -463,13 +439,11 @@ def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven
     return replace(found, points=points)
 
 
-def _with_given(settled: Settled, network: Network) -> Settled:
-    """Return an adjustment with a network that has what was given beside it."""
+def _with_given(settled: Settled) -> Settled:
+    """Return an adjustment with the network of its task, which has what was given beside the image points."""
+    network = settled.task.network
     every = np.ones(len(network.image_points), dtype=bool)
-    whole = merge_estimate(
-        empty_estimate(network, settled.estimate.cameras), settled.estimate, settled.images, settled.points
-    )
-    part, _ = reduce_network(network, whole, settled.images, settled.points, every)
+    part, _ = reduce_network(network, settled.whole, settled.images, settled.points, every)
     return replace(settled, adjustment=replace(settled.adjustment, network=part))
 
 
@@ -488,9 +462,9 @@ def _left(final: Adjustment, before: Adjustment) -> tuple[Estimate, ...]:
     return (before.estimate,) if len(before.network.points) == len(final.network.points) else ()
 
 
-def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment, ControlCheck | None]:
+def _placed(start: _Prepared, settled: Settled) -> tuple[Adjustment, ControlCheck | None]:
     """Return the final adjustment of a settled network, placed on control or on the frame of its datum."""
-    last, check = settled.estimate, None
+    task, last, check = settled.task, settled.estimate, None
     if task.datum.kind != "control" and len(settled.part.control.complete) >= MIN_CONTROL:
         last, check = place_on_control(settled.part, last)
     elif task.datum.kind == "free":
@@ -504,14 +478,14 @@ def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment,
     return adjust_finally(task, settled.part, last, settled.rejected), check
 
 
-def _dropped(start: _Prepared, solved: _Solved) -> tuple[tuple[str, Remark], ...]:
+def _dropped(start: _Prepared, settled: Settled) -> tuple[tuple[str, Remark], ...]:
     """Return the photographs that had an orientation and are not in the result, with the reason."""
-    reasons = {} if solved.treated is None else dict(solved.treated.left_out)
+    reasons = {} if settled.treated is None else dict(settled.treated.left_out)
     task = start.task
     return tuple(
         (name, reasons.get(name, remark("photograph_with_few_accepted", needed=int(fewest))))
         for name, was, is_in, fewest in zip(
-            task.network.images, start.oriented, solved.settled.images, task.least, strict=True
+            task.network.images, start.estimate.oriented, settled.images, task.least, strict=True
         )
         if was and not is_in
     )

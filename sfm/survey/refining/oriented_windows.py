@@ -94,7 +94,7 @@ def orient(
             fits[own] = (v[own] <= TOLERANCE_FACTOR * spread).all(axis=1)
     accepted = images[anew.image_points.image] & points[anew.image_points.point]
     accepted[accepted] = fits
-    solved = merge_estimate(estimate, adjusted.estimate, images, points)
+    solved = merge_estimate(adjusted.estimate, images, points)
     of_model = points[: len(network.points)]
     whole, _ = whole_model(
         network, came, adjusted.estimate, windows, images, of_model, TOLERANCE_FACTOR * spread
