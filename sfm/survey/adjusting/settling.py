@@ -35,6 +35,7 @@ from sfm.reduced_network import determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.diagnosis.own_camera import Treated, treat_lost
 from sfm.survey.inputs.interior import without_idle_cameras
+from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.survey import Survey
 
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
@@ -53,15 +54,25 @@ class Task:
     """An adjustment to be made, and its settings."""
 
     survey: Survey
-    datum: Datum
     network: Network
     needed: IntArray  # rays that each point needs to stay, (n,)
     least: IntArray  # image points that each photograph needs to stay, (m,)
-    reject: str  # how gross errors are treated
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
     # On the stated standard deviations of the image points. Where these are far too large, control and bars
     # bend the network by more than its noise, and their points seem to be gross errors.
     factor: float = 1.0
+
+    @property
+    def datum(self) -> Datum:
+        """The kind of datum that the survey asks for."""
+        return Datum(self.survey.datum.kind)
+
+    @property
+    def in_free_datum(self) -> Task:
+        """The task in a free datum, where it was that of control."""
+        if self.survey.datum.kind != "control":
+            return self
+        return replace(self, survey=replace(self.survey, datum=DatumSettings(kind="free")))
 
 
 @dataclass(frozen=True)
@@ -138,7 +149,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         accepted = _accepted(network, adjustment, images, points)
         if wrong is None:  # once: each round would find more, as errors of windows are not quite normal
             wrong = np.zeros(len(points), dtype=bool)
-            if task.survey.tie_points is not None and task.reject != "none":
+            if task.survey.tie_points is not None and task.survey.reject != "none":
                 wrong[points] = _wrong_windows(adjustment)
         accepted &= ~wrong[network.image_points.point]
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))
@@ -157,7 +168,7 @@ def settle_treated(task: Task, estimate: Estimate) -> Settled:
         estimate: approximate values, from which what has left the first adjustment starts again.
     """
     settled = settle(task, estimate)
-    if task.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
+    if task.survey.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
         return settled
     treated = treat_lost(
         task.network,
@@ -205,7 +216,7 @@ def _converged(
 
     As it ended, where it does not converge from there either.
     """
-    datum = on_points(task.survey, part, start, task.datum)
+    datum = on_points(task, part, start)
     nearer = nearer_start(part, start, ended.estimate, datum)
     if nearer is None:
         return ended, ()
@@ -238,10 +249,10 @@ def _tested(
     return adjust(
         network,
         estimate,
-        datum=on_points(task.survey, network, estimate, task.datum),
+        datum=on_points(task, network, estimate),
         sigma_px=task.survey.adjust.sigma_px,
         image_sigma_factor=task.factor if factor is None else factor,
-        reject=task.reject,
+        reject=task.survey.reject,
         alpha=level_of_single(FALSE_ALARM, tests),
         rejected=rejected,
         method=method,
@@ -250,13 +261,13 @@ def _tested(
     )
 
 
-def on_points(survey: Survey, network: Network, estimate: Estimate, datum: Datum) -> Datum:
+def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
     """Return the datum on the points that the survey names, else on all but those at very small angles.
 
     Raises:
         GeometryError: fewer than three of the named ones are in the network.
     """
-    named = survey.datum.points
+    datum, named = task.datum, task.survey.datum.points
     if not named and datum.kind == "control":
         return datum
     if not named:

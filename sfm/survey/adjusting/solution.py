@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.rig_bumps import bump_remarks
@@ -47,7 +46,7 @@ from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
-from sfm.survey.inputs.settings import CameraSettings, DatumSettings
+from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
@@ -220,22 +219,22 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         varying: names of the cameras of which every photograph has c by itself, where it is adjusted.
     """
     network, estimate = matched.network, matched.estimate
-    datum = Datum(survey.datum.kind)
+    datum = survey.datum.kind
     unused: tuple[Remark, ...] = ()
-    if survey.exterior is not None and datum.kind == "control":
+    if survey.exterior is not None and datum == "control":
         estimate = place_on_exterior(network, estimate)
     elif survey.exterior is not None:
-        unused = (remark("exterior_unused", datum=datum.kind),)
+        unused = (remark("exterior_unused", datum=datum),)
     report_step("choosing the free parameters of the cameras")
-    if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
+    if datum == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
-    if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
+    if datum == "minimal" and matched.given:  # what it holds are the given coordinates
         given = given_values(survey, network)
         held = np.where(given.determined[:, None], given.points, estimate.points)
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     frame = given_values(survey, network) if matched.given else None
     chosen = choose_free_parameters(
-        survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum.kind
+        survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum
     )
     cameras = tuple(_with_own_c(one) if one.name in varying else one for one in chosen.cameras)
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
@@ -246,7 +245,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
         least = np.where(shared, 1, least)
     return _Prepared(
-        Task(survey, datum, network, matched.min_rays, least, survey.reject, matched.suspected),
+        Task(survey, network, matched.min_rays, least, matched.suspected),
         estimate,
         frame,
         (*unused, *chosen.remarks),
@@ -276,12 +275,8 @@ def _free_network(start: _Prepared) -> Settled | None:
         return None
     report_step("adjusting the image points alone")
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=())
-    alone = replace(task, network=network)
-    if task.datum.kind == "control":
-        free = replace(task.survey, datum=DatumSettings(kind="free"))
-        alone = replace(alone, datum=Datum("free"), survey=free)
     try:
-        return settle_treated(alone, estimate)
+        return settle_treated(replace(task.in_free_datum, network=network), estimate)
     except GeometryError:
         if task.datum.kind != "control":
             raise
@@ -325,12 +320,12 @@ def _judged(
         rescale=task.survey.adjust.weights == "components",
         plates=plates if is_plate_control(task.survey.control, plate) else (),
     )
-    survey, needed = task.survey, task.needed.copy()
+    needed = task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
-    elif task.datum.kind == "control":
-        survey = replace(survey, datum=DatumSettings(kind="free"))
-    return replace(task, survey=survey, datum=given.datum, network=given.network, needed=needed), given
+    else:
+        task = task.in_free_datum
+    return replace(task, network=given.network, needed=needed), given
 
 
 def _settled(
@@ -413,7 +408,7 @@ def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Ta
     def adjusted(part: Network) -> Adjustment:
         free = task.datum.kind != "control"
         placed = place_on_observations(part, start) if free else start  # wrong observations turn it
-        datum = on_points(task.survey, part, placed, task.datum)
+        datum = on_points(task, part, placed)
         return adjust(part, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
 
     part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
@@ -468,7 +463,7 @@ def _placed(start: _Prepared, settled: Settled) -> tuple[Adjustment, ControlChec
     if task.datum.kind != "control" and len(settled.part.control.complete) >= MIN_CONTROL:
         last, check = place_on_control(settled.part, last)
     elif task.datum.kind == "free":
-        carriers = on_points(task.survey, settled.part, last, task.datum).resolve(settled.part).points
+        carriers = on_points(task, settled.part, last).resolve(settled.part).points
         every = np.ones(len(start.task.network.image_points), dtype=bool)
         values = start.frame
         if values is None:
