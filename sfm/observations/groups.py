@@ -94,15 +94,10 @@ class Group(TableKind):
         d = fit.difference.size
         Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
         HW = H.T * self.weights
-        flat = Jx.reshape(d, -1)
-        Jx = (flat - H @ (_inverse(HW @ H) @ (HW @ flat))).reshape(Jx.shape)
-        return Linear(fit.difference.reshape(1, d), tuple(Jx[None, :, k] for k in range(Jx.shape[1])))
-
-    def own_cofactor(self, values: Values) -> FloatArray:
-        """Return H (H'W H)^-1 H', what the own parameters take of the redundancy, (1, r c, r c)."""
-        H = self.fit(values.points[self.point]).H.reshape(self.sigma.size, -1)
-        inverse = _inverse(H.T @ (self.weights[:, None] * H))
-        return np.asarray(H @ inverse @ H.T)[None]
+        flat, HQ = Jx.reshape(d, -1), H @ _inverse(HW @ H)
+        J = (flat - HQ @ (HW @ flat)).reshape(1, *Jx.shape)
+        blocks = tuple(J[:, :, k] for k in range(J.shape[2]))
+        return Linear(fit.difference.reshape(1, d), blocks, (HQ @ H.T)[None])
 
     def own_parameters(self, values: Values) -> OwnParameters:
         """Return the parameters named `reported`: h = -(H'W H)^-1 H'W Jx dX about these values."""

@@ -72,6 +72,7 @@ class Linear(NamedTuple):
 
     difference: FloatArray  # computed minus observed, (n, d)
     J: tuple[FloatArray, ...]  # derivatives by the unknowns of each block, (n, d, 1, 3 or 6)
+    taken: FloatArray | None = None  # of cofactors by parameters that are not among the unknowns, (n, d, d)
 
 
 class Kind(ABC):
@@ -155,10 +156,6 @@ class Kind(ABC):
         have its errors determine the scale.
         """
         return values.points
-
-    def own_cofactor(self, values: Values) -> FloatArray | None:
-        """Return what parameters of their own take of the cofactors, (n, d, d); None without such."""
-        return None
 
     def labels(self, network: Network) -> tuple[str, ...]:
         """Return what the components are called in tables, (d,)."""

@@ -82,7 +82,7 @@ def observed_of(
         together = some.weight_of_all()
         weight = inverse_of_observed(some.covariances()) if together is None else together[None]
         if weight.any():
-            taken = some.own_cofactor(state)
+            taken = some.linearise(state).taken
             own = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
             found.append(Observed(index, some, rows, weight, own))
     return tuple(found)

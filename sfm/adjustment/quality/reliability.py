@@ -108,9 +108,8 @@ def residuals_of_observed(
             Q = linear.J[0] @ cofactors.points[one.point] @ np.swapaxes(linear.J[0], 1, 2)
         else:
             Q = _cofactors_of(reduced_rows(one, layout, optimum.state), optimum, cofactors)
-        own = one.kind.own_cofactor(optimum.state)
-        if own is not None:
-            Q = Q + own
+        if linear.taken is not None:
+            Q = Q + linear.taken
         w, r = (part.reshape(shape) for part in standardised_of_given(l, one.weight, Q))
         redundancy = float(one.components.sum() - np.einsum("nab,nba->", one.weight, Q))
     return ObservedResiduals(one.index, one.rows, linear.difference, r, w, one.count, vPv, redundancy)
