@@ -10,10 +10,11 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.quality import given_names, given_points, given_values
-from sfm.adjustment.quality.given_points import GivenPoints, judge_points, scale_model, scale_of_length
+from sfm.adjustment.quality.given_points import GivenPoints, judge_points
 from sfm.adjustment.quality.given_values import GivenModel, Judgement, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.similarity import Similarity, fit_similarity
+from sfm.survey.hypotheses.given_scales import GivenScale, scale_model, scale_of_length
 from tests.synthetic import seed_of
 
 FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
@@ -410,7 +411,7 @@ def test_the_start_minimises_the_distance_of_more_than_half(n: int, h: int) -> N
 
 
 def test_centre_and_size() -> None:
-    centre, size = given_points._centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
+    centre, size = given_points.centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
     assert centre.tolist() == [1, 0, 4] and size == 4
 
 
@@ -430,7 +431,7 @@ def test_scales_of_lengths_are_compared_with_their_covariance() -> None:
 @pytest.mark.parametrize("factor", [1e-3, 0.5, 1.0, 30.0])
 def test_a_mistyped_length_is_as_many_standard_deviations_off_as_its_logarithm(factor: float) -> None:
     """By the length that the others predict; by itself, a short bar would have little weight."""
-    scales = tuple(given_points.GivenScale(scale, np.zeros(3), 1e-4) for scale in (2.0, 2.0 * factor, 2.0))
+    scales = tuple(GivenScale(scale, np.zeros(3), 1e-4) for scale in (2.0, 2.0 * factor, 2.0))
     model = scale_model(scales, np.zeros((3, 3)), 77)
     sigma = np.sqrt(np.diagonal(model.stated))
     np.testing.assert_allclose(sigma[[0, 2]], 1e-4 / 2)

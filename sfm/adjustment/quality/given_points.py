@@ -1,14 +1,14 @@
-"""Given points and lengths as differences from the free network.
+"""Given points as differences from the free network.
 
-Points place the free network by a similarity, which most of them agree upon; lengths and placed points each
-give its scale. Where points do not fit, they may also be stretched, left-handed or have one another's names.
+Points place the free network by a similarity, which most of them agree upon. Where points do not fit, they
+may also be stretched, left-handed or have one another's names.
 
 Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984), J. Am. Stat. Assoc. 79(388).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
@@ -123,7 +123,7 @@ class GivenPoints:
         """Return the differences from the free network as a similarity places it."""
         rows = np.flatnonzero(self.known.ravel())
         X = placing.apply(self.free)
-        centre, size = _centre_and_size(X)
+        centre, size = centre_and_size(X)
         A = similarity_motions(X, centre=centre, size=size).reshape(-1, 3, 7)
         n, R = len(X), placing.rotation
         if self.strain is not None:
@@ -157,7 +157,7 @@ class GivenPoints:
         kept = ~np.isin(model.item, without)
         dx = parameters_of(model, kept) @ model.v[kept]
         X = placing.apply(self.free)
-        centre, size = _centre_and_size(X)
+        centre, size = centre_and_size(X)
         R, scale = rotation_from_vector(dx[3:6] / size), float(np.exp(dx[6] / size))
         rotation = R @ placing.rotation
         shift = centre + dx[:3] + scale * R @ (placing.translation - centre)
@@ -175,7 +175,7 @@ def decimal_step(numbers: FloatArray) -> float:
     )
 
 
-def _centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
+def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
     """Return the centre of points and their farthest coordinate from it."""
     centre = X.mean(axis=0)
     return centre, max(float(np.abs(X - centre).max()), np.finfo(float).tiny)
@@ -342,7 +342,7 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
             except np.linalg.LinAlgError:  # a strain that flattens the points explains nothing
                 model = None
                 break
-            size = _centre_and_size(placing.apply(points.free))[1]
+            size = centre_and_size(placing.apply(points.free))[1]
             step = parameters_of(model, np.ones(len(model.v), dtype=bool))[7:] @ model.v / size
             F = strain.F + np.einsum("u,uab->ab", step, derivatives)
             if not np.linalg.det(F) > 0 or np.abs(step).max() <= RANK:
@@ -429,7 +429,7 @@ def _converged(
             if not np.isfinite((Y / ROUNDING) ** 2).all():  # nor would its weights be
                 break
         placing, model = moved, points.model(moved, estimated=estimated)
-        if np.abs(Y - X).max() <= RANK * _centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
+        if np.abs(Y - X).max() <= RANK * centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
             return placing, model
     return start
 
@@ -473,74 +473,3 @@ def _triples(n: int, most: int) -> IntArray:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(n)
     return np.array([rng.choice(n, 3, replace=False) for _ in range(most)])
-
-
-@dataclass(frozen=True)
-class GivenScale:
-    """Object units per unit of the free network, by one bar or by all given points together."""
-
-    scale: float
-    rows: FloatArray  # derivative of its logarithm by the points of the free network, (3 n,)
-    sigma: float  # of the scale, by what was stated
-
-
-def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, end: int) -> GivenScale:
-    """Return the scale by a length between two points of the free network, (n, 3)."""
-    apart = free[end] - free[start]
-    found = float(np.linalg.norm(apart))
-    rows = np.zeros(free.shape)
-    rows[end], rows[start] = -apart / found**2, apart / found**2
-    return GivenScale(length / found, rows.ravel(), sigma / found)
-
-
-def mean_scale(scales: Sequence[GivenScale]) -> GivenScale:
-    """Return the geometric mean of scales by independent lengths."""
-    scale = float(np.exp(np.mean([np.log(one.scale) for one in scales])))
-    relative = np.array([one.sigma / one.scale for one in scales])
-    rows = np.mean([one.rows for one in scales], axis=0)
-    return GivenScale(scale, rows, scale * float(np.linalg.norm(relative)) / len(scales))
-
-
-def scale_of_points(
-    points: GivenPoints, placed: PlacedPoints, without: tuple[int, ...], at: IntArray, count: int
-) -> GivenScale:
-    """Return the scale by given points, some left out.
-
-    Args:
-        points: given, and of the free network.
-        placed: the same, judged.
-        without: those left out.
-        at: which points of the free network they are, (k,).
-        count: how many points the free network has, n.
-    """
-    model, placing = placed.model, placed.placing
-    kept = ~np.isin(model.item, without)
-    G = parameters_of(model, kept)[6] / _centre_and_size(placing.apply(points.free))[1]
-    axis = (np.flatnonzero(points.known.ravel()) % 3)[kept]
-    rows = np.zeros((count, 3))
-    np.subtract.at(rows, at[model.item[kept]], G[:, None] * placing.scale * placing.rotation[axis])
-    variance = float(G @ model.stated[np.ix_(kept, kept)] @ G)
-    return GivenScale(placing.scale, rows.ravel(), placing.scale * float(np.sqrt(variance)))
-
-
-def scale_model(scales: tuple[GivenScale, ...], joint: FloatArray, redundancy: int) -> GivenModel:
-    """Return the differences of scales, with the covariance of the points of the free network, (3 n, 3 n).
-
-    A standard deviation of a length is that of its logarithm over the logarithmic mean of the length and of
-    what the median of the scales predicts: a difference has as many of them in both, however large it is.
-
-    Source: Stolarsky (1975), Generalizations of the logarithmic mean, Math. Mag. 48(2), 87-92.
-    """
-    H = np.stack([one.rows for one in scales])
-    v = np.log([one.scale for one in scales])
-    off = v - np.median(v)
-    # (e^x - 1) / x of a difference x in logarithms
-    mean = np.exp(v - off) * np.where(off == 0, 1.0, np.expm1(off) / np.where(off == 0, 1.0, off))
-    return GivenModel(
-        v,
-        H @ joint @ H.T,
-        np.diag((np.array([one.sigma for one in scales]) / mean) ** 2),
-        np.ones((len(scales), 1)),
-        np.arange(len(scales)),
-        redundancy,
-    )

@@ -8,13 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.given_points import (
-    GivenScale,
-    mean_scale,
-    scale_model,
-    scale_of_length,
-    scale_of_points,
-)
+from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints, centre_and_size, parameters_of
 from sfm.adjustment.quality.given_values import (
     LEVEL,
     UNSTATED_FRACTION,
@@ -23,7 +17,7 @@ from sfm.adjustment.quality.given_values import (
     Judgement,
     judge_values,
 )
-from sfm.conventions import BoolArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import ScaleBars
 from sfm.remarks.kind import significant
@@ -222,3 +216,74 @@ def _by(log: float, sigma: float) -> dict[str, Any]:
         finer, coarser = unit.units
         found |= {"unit_factor": unit.factor, "finer": finer, "coarser": coarser}
     return found
+
+
+@dataclass(frozen=True)
+class GivenScale:
+    """Object units per unit of the free network, by one bar or by all given points together."""
+
+    scale: float
+    rows: FloatArray  # derivative of its logarithm by the points of the free network, (3 n,)
+    sigma: float  # of the scale, by what was stated
+
+
+def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, end: int) -> GivenScale:
+    """Return the scale by a length between two points of the free network, (n, 3)."""
+    apart = free[end] - free[start]
+    found = float(np.linalg.norm(apart))
+    rows = np.zeros(free.shape)
+    rows[end], rows[start] = -apart / found**2, apart / found**2
+    return GivenScale(length / found, rows.ravel(), sigma / found)
+
+
+def mean_scale(scales: Sequence[GivenScale]) -> GivenScale:
+    """Return the geometric mean of scales by independent lengths."""
+    scale = float(np.exp(np.mean([np.log(one.scale) for one in scales])))
+    relative = np.array([one.sigma / one.scale for one in scales])
+    rows = np.mean([one.rows for one in scales], axis=0)
+    return GivenScale(scale, rows, scale * float(np.linalg.norm(relative)) / len(scales))
+
+
+def scale_of_points(
+    points: GivenPoints, placed: PlacedPoints, without: tuple[int, ...], at: IntArray, count: int
+) -> GivenScale:
+    """Return the scale by given points, some left out.
+
+    Args:
+        points: given, and of the free network.
+        placed: the same, judged.
+        without: those left out.
+        at: which points of the free network they are, (k,).
+        count: how many points the free network has, n.
+    """
+    model, placing = placed.model, placed.placing
+    kept = ~np.isin(model.item, without)
+    G = parameters_of(model, kept)[6] / centre_and_size(placing.apply(points.free))[1]
+    axis = (np.flatnonzero(points.known.ravel()) % 3)[kept]
+    rows = np.zeros((count, 3))
+    np.subtract.at(rows, at[model.item[kept]], G[:, None] * placing.scale * placing.rotation[axis])
+    variance = float(G @ model.stated[np.ix_(kept, kept)] @ G)
+    return GivenScale(placing.scale, rows.ravel(), placing.scale * float(np.sqrt(variance)))
+
+
+def scale_model(scales: tuple[GivenScale, ...], joint: FloatArray, redundancy: int) -> GivenModel:
+    """Return the differences of scales, with the covariance of the points of the free network, (3 n, 3 n).
+
+    A standard deviation of a length is that of its logarithm over the logarithmic mean of the length and of
+    what the median of the scales predicts: a difference has as many of them in both, however large it is.
+
+    Source: Stolarsky (1975), Generalizations of the logarithmic mean, Math. Mag. 48(2), 87-92.
+    """
+    H = np.stack([one.rows for one in scales])
+    v = np.log([one.scale for one in scales])
+    off = v - np.median(v)
+    # (e^x - 1) / x of a difference x in logarithms
+    mean = np.exp(v - off) * np.where(off == 0, 1.0, np.expm1(off) / np.where(off == 0, 1.0, off))
+    return GivenModel(
+        v,
+        H @ joint @ H.T,
+        np.diag((np.array([one.sigma for one in scales]) / mean) ** 2),
+        np.ones((len(scales), 1)),
+        np.arange(len(scales)),
+        redundancy,
+    )
