@@ -29,7 +29,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
 from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
-from sfm.survey.refining.windows import Limits, Size, Windows, match_reduced
+from sfm.survey.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -464,10 +464,8 @@ def test_points_not_found_in_fine_pixels_are_looked_for_in_coarser_ones(tmp_path
     windows = Windows(np.full((len(seen), 2), np.nan), seen.covariance, np.zeros(len(seen), dtype=np.int64))
     known = seen.point < 20
     windows.xy[known] = seen.xy[known]
-    found = match_reduced(
-        tmp_path, network, estimate, windows, rows, reference,
-        size=Size(15), limits=Limits(3.0, 0.7), tolerance_px=3.0,
-    )  # fmt: skip
+    keys = KeyPoints(tmp_path, network, rows, reference, Limits(3.0, 0.7))
+    found = match_reduced(keys, estimate, windows, size=Size(15), tolerance_px=3.0)
     again = rows[~known[rows]]
     assert np.isfinite(found.xy[again]).all(axis=1).mean() > 0.9
     assert np.abs(found.xy[again] - seen.xy[again])[np.isfinite(found.xy[again])].max() < 3.0

@@ -32,7 +32,7 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.hypotheses.given import judge_given
-from sfm.survey.refining.model_photographs import Photographs, outside_masks
+from sfm.survey.refining.model_photographs import outside_masks
 from sfm.survey.refining.oriented_windows import (
     Oriented,
     by_count,
@@ -48,6 +48,7 @@ from sfm.survey.refining.windows import (
     MIN_RAYS,
     REDUCED_ALIKE,
     SHRINKS,
+    KeyPoints,
     Limits,
     Size,
     Windows,
@@ -242,35 +243,17 @@ def refine_model(
             + (f", {beyond} {BEYOND}" if beyond else "")
         )
     limits = Limits(max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread), min_correlation)
+    keys = KeyPoints(images_dir, network, rows, reference, limits)
 
     def reasons(windows: Windows) -> list[tuple[str, int]]:
         few = len(seen) - len(rows) - int(masked.sum()) - beyond
         return [*reasons_of(windows, rows, few=few, masked=int(masked.sum())), (BEYOND, beyond)]
 
     def best(orientation: Estimate, sizes: list[Size], spread_px: float, alike: float) -> Size:
-        return best_size(
-            images_dir,
-            network,
-            orientation,
-            rows,
-            reference,
-            sizes,
-            alike=alike,
-            limits=limits,
-            tolerance_px=TOLERANCE_FACTOR * spread_px,
-        )
+        return best_size(keys, orientation, sizes, alike=alike, tolerance_px=TOLERANCE_FACTOR * spread_px)
 
     def measured(orientation: Estimate, size: Size) -> Oriented:
-        windows = match_windows(
-            Photographs(network, estimate, images_dir, shrink=size.shrink),
-            network,
-            orientation,
-            rows,
-            reference,
-            window_px=size.window_px,
-            limits=limits,
-            progress=progress,
-        )
+        windows = match_windows(keys, orientation, size, progress=progress)
         progress.stage("adjustment")
         return orient(network, orientation, windows, size.side_px, targets, reasons(windows))
 
@@ -284,17 +267,7 @@ def refine_model(
             size, oriented = chosen, measured(oriented.whole, chosen)
     anew, tolerance_px = oriented.network, TOLERANCE_FACTOR * oriented.spread_px
     progress.stage("matching in reduced photographs")
-    windows = match_reduced(
-        images_dir,
-        network,
-        oriented.whole,
-        oriented.windows,
-        rows,
-        reference,
-        size=size,
-        limits=limits,
-        tolerance_px=tolerance_px,
-    )
+    windows = match_reduced(keys, oriented.whole, oriented.windows, size=size, tolerance_px=tolerance_px)
     part, start, images, points = part_of(anew, oriented.solved, oriented.accepted, oriented.rays)
     final, remarks = adjust_finally(
         part,

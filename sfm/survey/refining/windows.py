@@ -57,15 +57,23 @@ class Windows:
     flag: IntArray  # see LsmFlag, (k,)
 
 
+@dataclass(frozen=True)
+class KeyPoints:
+    """Image points of a model that can be measured anew, and where they are matched."""
+
+    folder: Path  # of the photographs
+    network: Network  # the model
+    rows: IntArray  # image points that can be measured, (k,)
+    reference: IntArray  # the row of each point that is its template, -1 for points not measured, (n,)
+    limits: Limits  # what is a match no more, in pixels of the photographs
+
+
 def match_windows(
-    photographs: Photographs,
-    network: Network,
+    keys: KeyPoints,
     estimate: Estimate,
-    rows: IntArray,
-    reference: IntArray,
+    size: Size,
     *,
-    window_px: int,
-    limits: Limits,
+    rows: IntArray | None = None,
     progress: Progress = SILENT,
 ) -> Windows:
     """Measure image points by least squares matching from the reference photograph of their point.
@@ -76,13 +84,10 @@ def match_windows(
     px of the model.
 
     Args:
-        photographs: of the model, reduced or not.
-        network: the model.
+        keys: key points of the model.
         estimate: its solution.
-        rows: image points to measure, (k,).
-        reference: the row of each point that is its template, -1 for points that are not measured, (n,).
-        window_px: odd side of the windows, in pixels of the photographs.
-        limits: what is a match no more, in pixels of the photographs.
+        size: of the windows.
+        rows: image points to measure, all of the key points if not given.
         progress: receives reference photographs.
 
     Raises:
@@ -90,8 +95,11 @@ def match_windows(
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
-    shrink = photographs.shrink
-    network, estimate = _reduced(network, estimate, shrink)
+    photographs = Photographs(keys.network, estimate, keys.folder, shrink=size.shrink)
+    rows, reference, limits = keys.rows if rows is None else rows, keys.reference, keys.limits
+    window_px = size.window_px
+    shrink = size.shrink
+    network, estimate = _reduced(keys.network, estimate, shrink)
     seen, camera = network.image_points, network.camera
     xy, covariance = np.full((len(seen), 2), np.nan), np.full((len(seen), 2, 2), np.nan)
     flag = np.zeros(len(seen), dtype=np.int64)
@@ -144,43 +152,28 @@ def _reduced(network: Network, estimate: Estimate, shrink: int) -> tuple[Network
 
 
 def best_size(
-    folder: Path,
-    network: Network,
-    estimate: Estimate,
-    rows: IntArray,
-    reference: IntArray,
-    sizes: Sequence[Size],
-    *,
-    alike: float = ALIKE,
-    limits: Limits,
-    tolerance_px: float,
+    keys: KeyPoints, estimate: Estimate, sizes: Sequence[Size], *, alike: float = ALIKE, tolerance_px: float
 ) -> Size:
-    """Return the windows that tell the most together.
+    """Return the windows that determine the most together.
 
     By the spread of the rays that meet over the root of their number, of windows that do not overlap: where
-    small windows are too small to be found, there are few. A few photographs tell.
+    small windows are too small to be found, there are few. A few photographs show it.
 
     Args:
-        folder: of the photographs.
-        network: the model.
+        keys: key points of the model.
         estimate: its solution.
-        rows: image points that can be measured, (k,).
-        reference: as in `match_windows`.
         sizes: that are tried.
         alike: ratio of precisions up to which the first size is taken in place of the best.
-        limits: likewise.
         tolerance_px: largest residual of a ray that counts.
     """
+    network, rows = keys.network, keys.rows
     seen = network.image_points
-    template = seen.image[reference[seen.point[rows]]]
+    template = seen.image[keys.reference[seen.point[rows]]]
     most = np.argsort(-np.bincount(template, minlength=len(network.images)), kind="stable")
     some = rows[np.isin(template, most[:TRIAL_PHOTOGRAPHS])]
     costs = []
     for size in sizes:
-        photographs = Photographs(network, estimate, folder, shrink=size.shrink)
-        found = match_windows(
-            photographs, network, estimate, some, reference, window_px=size.window_px, limits=limits
-        )
+        found = match_windows(keys, estimate, size, rows=some)
         used, v = _meeting(network, estimate, found, tolerance_px)
         apart = points_apart(replace(seen, xy=found.xy), used, size.side_px, n_points=len(network.points))
         number = int((used & apart[seen.point]).sum())
@@ -190,16 +183,7 @@ def best_size(
 
 
 def match_reduced(
-    folder: Path,
-    network: Network,
-    estimate: Estimate,
-    windows: Windows,
-    rows: IntArray,
-    reference: IntArray,
-    *,
-    size: Size,
-    limits: Limits,
-    tolerance_px: float,
+    keys: KeyPoints, estimate: Estimate, windows: Windows, *, size: Size, tolerance_px: float
 ) -> Windows:
     """Measure the points that are not found in all of their photographs again, in reduced photographs.
 
@@ -207,16 +191,13 @@ def match_reduced(
     and matching diverges. Each point takes the finest pixels in which most of its rays meet.
 
     Args:
-        folder: of the photographs.
-        network: the model.
+        keys: key points of the model.
         estimate: adjusted with what was measured so far.
         windows: this.
-        rows: image points to measure, (k,).
-        reference: as in `match_windows`.
         size: of the windows so far; the coarser ones have as many pixels.
-        limits: likewise.
         tolerance_px: largest residual of a ray that counts.
     """
+    network, rows = keys.network, keys.rows
     seen, n = network.image_points, len(network.points)
     xy, covariance, flag = windows.xy.copy(), windows.covariance.copy(), windows.flag.copy()
     asked = np.bincount(seen.point[rows], minlength=n)
@@ -225,10 +206,7 @@ def match_reduced(
         some = rows[(rays < asked)[seen.point[rows]]]
         if not len(some):
             break
-        photographs = Photographs(network, estimate, folder, shrink=shrink)
-        found = match_windows(
-            photographs, network, estimate, some, reference, window_px=size.window_px, limits=limits
-        )
+        found = match_windows(keys, estimate, size._replace(shrink=shrink), rows=some)
         used, _ = _meeting(network, estimate, found, tolerance_px)
         now = np.bincount(seen.point[used], minlength=n)
         taken = np.flatnonzero((now > rays)[seen.point])
