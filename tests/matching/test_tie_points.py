@@ -409,12 +409,12 @@ def test_matches_that_do_not_come_back_are_refused() -> None:
     there = project(truth.cameras[0], truth.position[1], truth.rotation[1], truth.points)
     match = match_lsm(left, right, at, there, window_px=15, blur=True)
     assert match.good.sum() > 15
-    good = _returning(left, right, at, match, Windows(15), 0.7)
+    good = _returning(left, right, at, match, Windows(15))
     assert good.sum() >= match.good.sum() - 2
     first, *_ = np.flatnonzero(good).tolist()
     moved = match.xy.copy()
     moved[first] += [1.0, 0.0]
-    again = _returning(left, right, at, replace(match, xy=moved), Windows(15), 0.7)
+    again = _returning(left, right, at, replace(match, xy=moved), Windows(15))
     assert not again[first] and again.sum() == good.sum() - 1
 
 

@@ -250,10 +250,10 @@ def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_b
     across /= np.linalg.norm(across)
     # normals that look at the second photograph, hardly look at it, and look away
     normal = np.stack([to_second, across + 0.2 * to_second, -to_second])
-    places = _Places(np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
+    places = _Places(0, np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
     covered_pixels = Covered([(360, 480)] * 3)
-    assert _visible(truth, camera, 0, places, covered_pixels, 11, 15)[1][1].tolist() == [True, False, False]
-    assert not _visible(truth, camera, 0, places, covered_pixels, 181, 15)[0][1].any()  # of 360 rows
+    assert _visible(truth, camera, places, covered_pixels, 11, 15)[1][1].tolist() == [True, False, False]
+    assert not _visible(truth, camera, places, covered_pixels, 181, 15)[0][1].any()  # of 360 rows
     covered_pixels.cover(np.array([1]), np.array([[240.0, 180.0]]), np.array([1000.0]))
-    seen, free = _visible(truth, camera, 0, places, covered_pixels, 11, 15)
+    seen, free = _visible(truth, camera, places, covered_pixels, 11, 15)
     assert free[0].all() and not free[1].any() and seen[1].any()

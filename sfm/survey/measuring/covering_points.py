@@ -38,6 +38,8 @@ MIN_COSINE = 0.35  # between a ray and the normal of the plane: below it windows
 SCALES = (0.4, 2.5)  # of a window in another photograph relative to the reference
 BORDER_PX = 4  # between a window and the border of a photograph
 RETURN_FACTOR = 3.0  # of the usual distance, in sigmas, at which a match comes back that is matched back
+MIN_CORRELATION = 0.7  # smallest coefficient r of a match
+MIN_RAYS = 3  # of a point where so many photographs see the surface; where two do, it has two
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -55,6 +57,7 @@ class CoveringPoints:
 class _Places:
     """Points of one reference photograph."""
 
+    image: int  # the photograph
     xy: FloatArray  # whole pixels, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
@@ -64,7 +67,7 @@ class _Places:
 
     def select(self, rows: BoolArray) -> _Places:
         """Return some of them."""
-        return _Places(self.xy[rows], self.normal[rows], self.points[rows])
+        return _Places(self.image, self.xy[rows], self.normal[rows], self.points[rows])
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,6 @@ def find_covering_points(
     windows: Windows,
     side_px: int,
     references: Sequence[int] | None = None,
-    min_rays: int = 3,
-    min_correlation: float = 0.7,
     threads: int = 1,
 ) -> CoveringPoints:
     """Measure points in all photographs that see them, until the texture of these is covered.
@@ -108,8 +109,6 @@ def find_covering_points(
         side_px: of the squares that the windows are in the middle of; no two of them share pixels.
         references: photographs that points are taken from; all, those with the most tie points first, if not
             given.
-        min_rays: fewest photographs of a point where so many see the surface; where two do, it has two.
-        min_correlation: smallest coefficient r of a match.
         threads: photographs worked on at a time.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
@@ -127,16 +126,15 @@ def find_covering_points(
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
-        places = _Places(xy, normal, points).select(known)
-        visible, free = _visible(estimate, camera, i, places, covered, margin, side_px)
+        places = _Places(i, xy, normal, points).select(known)
+        visible, free = _visible(estimate, camera, places, covered, margin, side_px)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
         if not of.any():
             return
         measured = _followed(
-            *(grey, estimate, camera, i, places.select(of), free[:, of], windows, min_correlation, threads),
-            both_ways=not more,
+            *(grey, estimate, camera, places.select(of), free[:, of], windows, threads), both_ways=not more
         )
         new, used = _agreeing(measured.image_points, estimate, camera, rays)
         found.append(new)
@@ -144,7 +142,7 @@ def find_covering_points(
 
     in_order = [i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(own[i]) >= NEIGHBOURS]
     for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
-        cover(i, min_rays, more=True)
+        cover(i, MIN_RAYS, more=True)
         give_back_memory()
     for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
         cover(i, 2, more=False)
@@ -155,7 +153,6 @@ def find_covering_points(
 def _visible(
     estimate: Estimate,
     camera: IntArray,
-    i: int,
     places: _Places,
     covered: Covered,
     margin: int,
@@ -177,7 +174,7 @@ def _visible(
         rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
         visible[j, rows] = True
         free[j, rows] = covered.is_free(j, at[rows], side_px)
-    visible[i] = free[i] = True
+    visible[places.image] = free[places.image] = True
     return visible, free
 
 
@@ -185,11 +182,9 @@ def _followed(
     photographs: GreyPhotographs,
     estimate: Estimate,
     camera: IntArray,
-    i: int,
     places: _Places,
     visible: BoolArray,
     windows: Windows,
-    min_correlation: float,
     threads: int,
     *,
     both_ways: bool,
@@ -199,7 +194,7 @@ def _followed(
     Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`. Where
     no third ray checks a match, it is matched back, too.
     """
-    k = len(places.xy)
+    i, k = places.image, len(places.xy)
     ray = estimate.position[:, None] - places.points[None]
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
     cosine = np.where(visible, np.einsum("mkc,kc->mk", ray, ray[i]), -np.inf)
@@ -230,13 +225,13 @@ def _followed(
             window_px=windows.side_px,
             start=warp[fits],
             max_shift_px=max_shift_px,
-            min_correlation=min_correlation,
+            min_correlation=MIN_CORRELATION,
             blur=True,
         )
         good = match.good
         if both_ways:
             at = places.xy[rows[fits]]
-            good &= _returning(template, photographs[j], at, match, windows, min_correlation)
+            good &= _returning(template, photographs[j], at, match, windows)
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
         seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
@@ -266,9 +261,7 @@ def _followed(
     return _Rays(seen.select(some), np.concatenate(scales)[some])
 
 
-def _returning(
-    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows, min_correlation: float
-) -> BoolArray:
+def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows) -> BoolArray:
     """Return which matches come back to where they are from, as the others do, when matched back, (k,)."""
     rows = np.flatnonzero(match.good)
     back = match_lsm(
@@ -279,7 +272,7 @@ def _returning(
         model=windows.model,
         window_px=windows.side_px,
         start=np.asarray(np.linalg.inv(linear_part(match.warp[rows]))),
-        min_correlation=min_correlation,
+        min_correlation=MIN_CORRELATION,
         blur=True,
     )
     off = back.xy - xy[rows]

@@ -103,7 +103,6 @@ def cover_photographs(
         surface,
         windows=windows,
         side_px=_side(estimate, windows.side_px, settings.max_points),
-        min_rays=MIN_RAYS,
         threads=jobs,
     )
     found = without_far_points(found, estimate, network.camera)
