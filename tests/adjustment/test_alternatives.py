@@ -572,10 +572,8 @@ def made(gain: Gain, spread: Spread = NONE, *, points: IntArray = NO_POINTS) -> 
     """Return an alternative of 4 photographs with 10 image points each, at a redundancy of 60."""
     image = np.repeat(np.arange(4), 10)
     reduced = stub(redundancy=60, image=image, point=np.tile(np.arange(10), 4))
-    return alternatives._made(
-        *(reduced, families.CAMERA_FAMILIES[0], "split", np.array([0.0, 0.0, 1.0, 1.0]), gain, 0.7, spread),
-        points=points,
-    )
+    pattern = alternatives._Pattern("split", np.array([0.0, 0.0, 1.0, 1.0]), 0.7)
+    return alternatives._made(reduced, families.CAMERA_FAMILIES[0], pattern, gain, spread, points=points)
 
 
 def test_the_price_is_by_the_image_points_that_are_touched() -> None:
@@ -650,7 +648,7 @@ def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pyt
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), np.arange(m))
     made: dict[str, Spread] = {}
     monkeypatch.setattr(
-        alternatives, "_made", lambda *given, parts: made.update({given[1].name: given[6]}) or given[1]
+        alternatives, "_made", lambda *given: made.update({given[1].name: given[4]}) or given[1]
     )
     list(alternatives._each(reduced, H, g, squares, np.arange(m)))
     size = g.size

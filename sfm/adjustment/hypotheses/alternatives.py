@@ -149,22 +149,30 @@ def price_of(rank: int, touched: int, search: float) -> float:
     return float(rank / 2 * np.log(2 * max(touched, 2)) + search)
 
 
+@dataclass(frozen=True)
+class _Pattern:
+    """Photographs in which a family is freed."""
+
+    name: str
+    factor: FloatArray  # of each photograph, (m,)
+    search: float = 0.0  # ln of the number of patterns, or of sets of points, from which it was taken
+    among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
+    parts: int = 1  # each of which has parameters by itself
+
+
 def _made(
     reduced: Reduced,
     family: Family,
-    pattern: str,
-    factor: FloatArray,
+    pattern: _Pattern,
     gain: Gain,
-    search: float,
     spread: Spread = NONE,
+    *,
     points: IntArray | None = None,
     parameters: tuple[tuple[int, int], ...] = (),
-    parts: int = 1,
-    among: BoolArray | None = None,
 ) -> Alternative:
-    """Return an alternative with its test; of that many parts each has parameters of its own."""
-    r = reduced.redundancy
-    on = factor[reduced.image] != 0 if parts == 1 else np.ones(len(reduced.image), dtype=bool)
+    """Return an alternative with its test."""
+    r, parts, search = reduced.redundancy, pattern.parts, pattern.search
+    on = pattern.factor[reduced.image] != 0 if parts == 1 else np.ones(len(reduced.image), dtype=bool)
     some = np.zeros(0, dtype=np.int64) if points is None else points
     if len(some):
         on &= np.isin(reduced.point, some)
@@ -176,7 +184,10 @@ def _made(
     price = price_of(gain.rank, touched, search)
     evidence = spread.evidence(gain.value, gain.rank, r) - price
     return Alternative(
-        *(family, pattern, factor, gain, spread, log_p, price, search, evidence), some, parameters, among
+        *(family, pattern.name, pattern.factor, gain, spread, log_p, price, search, evidence),
+        points=some,
+        parameters=parameters,
+        among=pattern.among,
     )
 
 
@@ -201,7 +212,7 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
 
 def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
     """Return an alternative for each held or given interior parameter, and one for all of a camera."""
-    everywhere = np.ones(len(a.network.images))
+    everywhere = _Pattern("all", np.ones(len(a.network.images)))
     for sets in interior_parameters(a, family):
         whole = tuple(pair for one in sets for pair in one)
         D = reduced.whiten(shared_columns(a, list(whole))[0])
@@ -223,7 +234,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
                     ),
                     key=lambda one: one.factor,
                 )
-                yield _made(*(reduced, family, "all", everywhere, gain, 0.0, spread), parameters=parameters)
+                yield _made(reduced, family, everywhere, gain, spread, parameters=parameters)
 
 
 def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
@@ -239,7 +250,7 @@ def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[A
     if gain.rank:
         step = D @ gain.beta
         spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
-        yield _made(reduced, family, "all", np.ones(reduced.photographs), gain, 0.0, spread)
+        yield _made(reduced, family, _Pattern("all", np.ones(reduced.photographs)), gain, spread)
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
@@ -281,13 +292,13 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                     alone = among if pattern == "pair" else factor > 0
                     own = _variance_of(reduced, alone, gains[best])
                     spread = replace(spread, factor=max(spread.factor, own))
-                yield _made(reduced, family, pattern, factor, gains[best], search, spread, among=among)
+                yield _made(reduced, family, _Pattern(pattern, factor, search, among), gains[best], spread)
             if len(runs) > 2 * MIN_GROUP:
                 members, gain = part.group()
                 if MIN_GROUP <= members.sum() <= len(runs) - MIN_GROUP:
-                    spread, search = part.spread(members, gain), (len(runs) - 1) * np.log(2)
-                    factor = _of_photographs(members, runs, run, m)
-                    yield _made(reduced, family, "group", factor, gain, search, spread, among=among)
+                    factor, search = _of_photographs(members, runs, run, m), (len(runs) - 1) * np.log(2)
+                    grown = _Pattern("group", factor, search, among)
+                    yield _made(reduced, family, grown, gain, part.spread(members, gain))
 
 
 def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
@@ -372,7 +383,7 @@ def _each(
             squares[:, rest].ravel(),
         )
         spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
-        yield _made(reduced, family, "each", run.astype(float), gain, 0.0, spread, parts=m)
+        yield _made(reduced, family, _Pattern("each", run.astype(float), parts=m), gain, spread)
 
 
 def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
@@ -511,10 +522,8 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
         sets = _log_sets(total, count)
         others = ordered[count:]
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
-        one = _made(
-            *(reduced, MOVED, "split", factor, gain, search + sets, spread),
-            points=movable[order[:count]],
-        )
+        pattern = _Pattern("split", factor, search + sets)
+        one = _made(reduced, MOVED, pattern, gain, spread, points=movable[order[:count]])
         if best is None or one.evidence > best.evidence:
             best = one
         elif count > 2 * len(best.points) + 4:
@@ -541,11 +550,9 @@ def _moved_bodies(
         part = _Part(*reduced.project_by_run(reduced.whiten(columns.point @ field), run))
         gains = [part.gain(factor) for factor in splits]
         best = max(range(len(gains)), key=lambda k: gains[k].value)
+        pattern = _Pattern("split", splits[best][run], np.log(m - 1))
         spread = part.spread(splits[best], gains[best])
-        yield _made(
-            *(reduced, BODY, "split", splits[best][run], gains[best], float(np.log(m - 1)), spread),
-            points=points,
-        )
+        yield _made(reduced, BODY, pattern, gains[best], spread, points=points)
 
 
 def _log_sets(total: int, count: int) -> float:
@@ -592,7 +599,8 @@ def _shifted(
         values, ranks = gains_of(blocks, left, squares)
         redundancy = int(ranks.sum()) - gain.rank
         spread = Spread(float(values.sum()) / redundancy, redundancy)
-        one = _made(reduced, SHIFTED, "split", factor, gain, search + sets, spread, points=points)
+        pattern = _Pattern("split", factor, search + sets)
+        one = _made(reduced, SHIFTED, pattern, gain, spread, points=points)
         if best is None or one.evidence > best.evidence:
             best = one
     if best is not None:
