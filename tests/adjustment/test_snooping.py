@@ -42,14 +42,11 @@ def spoiled_network(k, of_points=1.0):
     return replace(network, image_points=replace(seen, xy=xy)), truth, wrong
 
 
-def one_by_one(observations, state, v, complement, limiting, used, *, vPv, redundancy, alpha):
+def one_by_one(observations, state, v, complement, limiting, used, *, sigma0, critical):
     """Take out the image point of the largest tau of all, as Baarda and Pope did."""
     w = np.abs(standardised_residuals(v, complement, observations.whitening)).max(axis=1)
-    tau = np.where(np.isfinite(w), w, np.inf) / np.sqrt(vPv / redundancy)
-    critical = tau_critical(alpha, redundancy)
-    largest = tau[used].max()
-    back = would_pass(observations, v, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha)
-    return used & (tau > critical) & (tau == largest), back
+    tau = np.where(np.isfinite(w), w, np.inf) / sigma0
+    return used & (tau > critical) & (tau == tau[used].max())
 
 
 def rejected(network, truth, snoop=None):

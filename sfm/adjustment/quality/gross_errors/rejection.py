@@ -23,10 +23,13 @@ from sfm.adjustment.quality.gross_errors.robust import (
     least_sigma,
     residual_lengths,
     robust_scale,
+    rounding_of,
     snoop,
     sum_of_squares,
     tukey_weights,
+    would_pass,
 )
+from sfm.adjustment.quality.reliability import tau_critical
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, remark
@@ -250,17 +253,13 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         if run.problem.observed:
             vPv, own = sum_of_squares(layout.observations, v, complement, weight > 0)
             redundancy = min(max(own, 1.0), redundancy)
-        out, back = snoop(
-            layout.observations,
-            optimum.state,
-            v,
-            complement,
-            Q.limiting,
-            weight > 0,
-            vPv=vPv,
-            redundancy=redundancy,
-            alpha=alpha,
+        seen, used = layout.observations, weight > 0
+        out = snoop(
+            *(seen, optimum.state, v, complement, Q.limiting, used),
+            sigma0=max(np.sqrt(vPv / max(redundancy, 1)), rounding_of(seen)),
+            critical=tau_critical(alpha, redundancy),
         )
+        back = would_pass(seen, v, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha)
         back &= layout.active & ~returned & ~loose
         if not (out.any() or back.any()):
             break

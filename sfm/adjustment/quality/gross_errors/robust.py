@@ -63,11 +63,10 @@ def snoop(
     limiting: FloatArray,
     used: BoolArray,
     *,
-    vPv: float,
-    redundancy: float,
-    alpha: float,
-) -> tuple[BoolArray, BoolArray]:
-    """Return which image points to take out and which to take back in one round.
+    sigma0: float,
+    critical: float,
+) -> BoolArray:
+    """Return which image points to take out in one round, (k,).
 
     Args:
         observations: image points.
@@ -76,15 +75,12 @@ def snoop(
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
         limiting: cofactors of each object point with the cameras fixed, shape (n, 3, 3).
         used: image points in the adjustment, shape (k,).
-        vPv: weighted sum of squares of the image points in the adjustment, see `sum_of_squares`.
-        redundancy: of the same.
-        alpha: probability with which the test of one image coordinate rejects a good one.
+        sigma0: of the adjustment, at least the rounding of image points.
+        critical: value of tau that the test of one image coordinate does not let pass.
     """
     w = np.abs(standardised_residuals(residuals, complement, observations.whitening)).max(axis=1)
     w = np.where(np.isfinite(w), w, np.inf)
-    sigma0 = max(np.sqrt(vPv / max(redundancy, 1)), rounding_of(observations))
     tau = w / sigma0
-    critical = tau_critical(alpha, redundancy)
     suspect = used & (tau > critical)
     worst_image = np.zeros(len(observations.camera))
     np.maximum.at(worst_image, observations.image[suspect], tau[suspect])
@@ -94,10 +90,7 @@ def snoop(
     np.maximum.at(worst_point, observations.point[suspect], tau[suspect])
     out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])
     least = np.where(crowded, np.maximum(worst_image, critical), np.inf) * sigma0
-    out |= further_rays(observations, state, residuals, complement, limiting, used, out, least=least)
-    return out, would_pass(
-        observations, residuals, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha
-    )
+    return out | further_rays(observations, state, residuals, complement, limiting, used, out, least=least)
 
 
 def sum_of_squares(
