@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +16,14 @@ from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.survey.inputs.checks.contradictions import SurveySettings
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey_file import inside, is_own_file
+
+if TYPE_CHECKING:
+    from sfm.survey.inputs.survey import Survey
+    from sfm.survey.inputs.survey_file import SurveyFile
+
 
 MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
 
@@ -43,7 +48,7 @@ class PhotographList:
         return len(self.names)
 
 
-def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) -> PhotographList:
+def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:
     """Return the photographs that the globs of the cameras name.
 
     Args:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from sfm.display import counted, listed
 from sfm.distortion.balanced import BALANCED, from_balanced
 from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.plate import (
     plate_control,
     refuse_contradicting_plates,
@@ -24,100 +24,24 @@ from sfm.survey.inputs.settings import (
     MAX_LENGTH_PER_SIGMA,
     SMALLEST,
     CameraSettings,
-    CompareSettings,
-    DatumSettings,
     ExteriorSettings,
     RigSettings,
-    ScaleBarSettings,
     TargetSettings,
-    TiePointSettings,
 )
 from sfm.targets.codes.concentric import WIDTHS
 from sfm.targets.codes.families import FAMILIES, is_table
 from sfm.targets.codes.plates import PLATES, TAGGED
 from sfm.targets.codes.tags import DICTIONARIES
 
+if TYPE_CHECKING:
+    from sfm.survey.inputs.survey import Survey
+    from sfm.survey.inputs.survey_file import SurveyFile
+
 MAX_REPEATS = 3  # in the expression that finds a moment; a name of 255 characters is searched in 255^3 steps
 CALIBRATION_KEYS = {"calibration", "calibration_use"}
 
 
-class SurveySettings(Protocol):
-    """The common part of a survey file and a survey with its tables."""
-
-    @property
-    def name(self) -> str:
-        """Name of the survey."""
-
-    @property
-    def source(self) -> str:
-        """Name of the survey in messages."""
-
-    @property
-    def folder(self) -> Path:
-        """Folder that the globs of the photographs are relative to."""
-
-    @property
-    def allow_outside(self) -> bool:
-        """Whether photographs may lie outside that folder."""
-
-    @property
-    def unit(self) -> str:
-        """Object unit."""
-
-    @property
-    def cameras(self) -> Sequence[CameraSettings]:
-        """Its cameras."""
-
-    @property
-    def rigs(self) -> Sequence[RigSettings]:
-        """Cameras that are mounted on one frame."""
-
-    @property
-    def targets(self) -> TargetSettings:
-        """Settings of the targets."""
-
-    @property
-    def codes(self) -> str:
-        """Code family, or the path of the table file."""
-
-    @property
-    def tie_points(self) -> TiePointSettings | None:
-        """Natural texture in place of targets."""
-
-    @property
-    def datum(self) -> DatumSettings:
-        """Definition of position, attitude and scale."""
-
-    @property
-    def compare(self) -> CompareSettings:
-        """Other programs beside the survey."""
-
-    @property
-    def control(self) -> object:
-        """Known object points, or their table."""
-
-    @property
-    def exterior(self) -> object:
-        """Observed exterior orientation, or its table."""
-
-    @property
-    def exif_sigma_m(self) -> tuple[float, float] | None:
-        """Standard deviations of positions in EXIF data, where they are observed."""
-
-    @property
-    def start_points(self) -> object:
-        """Approximate object points, or their table."""
-
-    @property
-    def observations(self) -> object:
-        """Image points in place of photographs, or their table."""
-
-    @property
-    def scale_bars(self) -> Sequence[ScaleBarSettings | ScaleBar]:
-        """Measured distances."""
-
-
-def refuse_contradictions(survey: SurveySettings) -> None:
+def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     """Raise SurveyFileError where settings that are fine one by one do not go together."""
     where = survey.source
     if survey.tie_points is not None:
@@ -193,7 +117,7 @@ def refuse_contradictions(survey: SurveySettings) -> None:
         )
 
 
-def _refuse_contradicting_exterior(survey: SurveySettings) -> None:
+def _refuse_contradicting_exterior(survey: Survey | SurveyFile) -> None:
     """Raise SurveyFileError where exterior orientation is observed in no way or in two."""
     table = survey.exterior.file if isinstance(survey.exterior, ExteriorSettings) else survey.exterior
     if survey.exterior is not None and (table is None) == (survey.exif_sigma_m is None):
