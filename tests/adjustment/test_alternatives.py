@@ -13,7 +13,16 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, columns, families, hypotheses, refit, score
+from sfm.adjustment.hypotheses import (
+    alternatives,
+    columns,
+    families,
+    hypotheses,
+    moved,
+    patterns,
+    refit,
+    score,
+)
 from sfm.adjustment.hypotheses.alternatives import (
     alternatives_of,
     is_significant,
@@ -44,9 +53,9 @@ NO_POINTS = np.zeros(0, dtype=np.int64)
 
 def test_thresholds_of_search_and_rounding() -> None:
     """Limits of effort: a larger one finds the same or more at more cost."""
-    assert (alternatives.MAX_SPLITS, alternatives.MAX_MOVED, families.CELLS) == (12, 60, 5)
-    assert (alternatives.MAX_RUNS, alternatives.MAX_PRODUCTS) == (60, 2e11)
-    assert (alternatives.ROUNDS, alternatives.STARTS, refit.ROUNDS) == (20, 8, 6)
+    assert (moved.MAX_SPLITS, moved.MAX_MOVED, families.CELLS) == (12, 60, 5)
+    assert (patterns.MAX_RUNS, moved.MAX_PRODUCTS) == (60, 2e11)
+    assert (patterns.ROUNDS, patterns.STARTS, refit.ROUNDS) == (20, 8, 6)
     assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
     assert score.SMALLEST_LOG == -600.0  # a float ends at -745
     assert columns.SMALL_MOVE_PX == 0.01  # where distortion of 40 px is linear to 1e-4 of it
@@ -170,7 +179,7 @@ def dense() -> Dense:
     U, d, _ = np.linalg.svd(np.concatenate([flat, prior]), full_matrices=False)
     assert int((d < 1e-9 * d[0]).sum()) == 7
     spreads: dict[int, Spread] = {}
-    judge = alternatives._made
+    judge = patterns.score_alternative
 
     def recorded(*given: Any, **parts: Any) -> Alternative:
         one = judge(*given, **parts)
@@ -182,7 +191,8 @@ def dense() -> Dense:
     with pytest.MonkeyPatch.context() as patch:
         one_camera = np.zeros(7, dtype=np.int64)  # all photographs in every pattern
         patch.setattr(alternatives, "cameras_of_photographs", lambda a: one_camera)
-        patch.setattr(alternatives, "_made", recorded)
+        for module in (alternatives, moved):
+            patch.setattr(module, "score_alternative", recorded)
         found = alternatives_of(a, reduced, every)
     residual = (float(a.estimate.cameras[0].parameters[0]) - 10.0) / 2e-3 / a.sigma0
     return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]], residual, found, spreads)
@@ -334,7 +344,7 @@ def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
             assert one.search == pytest.approx(np.log(m)) and one.factor.sum() == 1
         normals = dense.normals(_by_photograph(D, dense.reduced.image, m))
         q = D.shape[2]
-        part = alternatives._Part(
+        part = patterns.Part(
             normals[0].reshape(m, q, m, q), normals[1].reshape(m, q), normals[2].reshape(m, q)
         )
         for pattern in ("split", "linear", "alternating", "single"):
@@ -449,12 +459,12 @@ def test_alternatives_are_counted_by_cameras() -> None:
 
 def test_runs_are_of_one_camera_and_in_the_order_of_the_sequence() -> None:
     camera = np.arange(150) % 2
-    run = alternatives._runs(camera)
+    run = patterns.runs_of(camera)
     assert run.max() + 1 == 60 and all(len(set(camera[run == k])) == 1 for k in range(60))
     middle = [np.flatnonzero(run == k).mean() for k in range(60)]
     assert middle == sorted(middle)
-    assert alternatives._runs(np.zeros(150, dtype=np.int64)).tolist() == (np.arange(150) * 60 // 150).tolist()
-    assert alternatives._runs(np.zeros(7, dtype=np.int64)).tolist() == list(range(7))
+    assert patterns.runs_of(np.zeros(150, dtype=np.int64)).tolist() == (np.arange(150) * 60 // 150).tolist()
+    assert patterns.runs_of(np.zeros(7, dtype=np.int64)).tolist() == list(range(7))
 
 
 def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense) -> None:
@@ -531,11 +541,11 @@ def test_of_few_photographs_there_are_fewer_patterns(images: int, patterns: set[
 # ---- small enough to do by hand ----
 
 
-def part(g: list[float], coupling: float = 0.0) -> alternatives._Part:
+def part(g: list[float], coupling: float = 0.0) -> patterns.Part:
     """Return normal equations of one parameter in each photograph, with a diagonal of 1."""
     m = len(g)
     H = ((1 - coupling) * np.eye(m) + coupling)[:, None, :, None]
-    return alternatives._Part(H, np.array(g)[:, None], np.ones((m, 1)))
+    return patterns.Part(H, np.array(g)[:, None], np.ones((m, 1)))
 
 
 def test_the_spread_is_of_what_a_pattern_leaves() -> None:
@@ -572,8 +582,10 @@ def made(gain: Gain, spread: Spread = NONE, *, points: IntArray = NO_POINTS) -> 
     """Return an alternative of 4 photographs with 10 image points each, at a redundancy of 60."""
     image = np.repeat(np.arange(4), 10)
     reduced = stub(redundancy=60, image=image, point=np.tile(np.arange(10), 4))
-    pattern = alternatives._Pattern("split", np.array([0.0, 0.0, 1.0, 1.0]), 0.7)
-    return alternatives._made(reduced, families.CAMERA_FAMILIES[0], pattern, gain, spread, points=points)
+    pattern = patterns.Pattern("split", np.array([0.0, 0.0, 1.0, 1.0]), 0.7)
+    return patterns.score_alternative(
+        reduced, families.CAMERA_FAMILIES[0], pattern, gain, spread, points=points
+    )
 
 
 def test_the_price_is_by_the_image_points_that_are_touched() -> None:
@@ -627,15 +639,15 @@ def test_variance_that_is_left_in_a_photograph() -> None:
 
 def test_points_of_three_photographs_have_no_place_to_move_at() -> None:
     few: Any = SimpleNamespace(photographs=3)
-    assert list(alternatives._moved_points(few)) == []
+    assert list(moved.moved_points(few)) == []
 
 
 def test_as_many_places_are_tried_as_can_be_afforded(monkeypatch: pytest.MonkeyPatch) -> None:
     tried: list[float] = []
-    monkeypatch.setattr(alternatives, "_moved_at", lambda _, factor, __: tried.append(factor.sum()) or ())
-    monkeypatch.setattr(alternatives, "MAX_PRODUCTS", 3.5 * 6 * 100 * 126**2)
+    monkeypatch.setattr(moved, "_moved_at", lambda _, factor, __: tried.append(factor.sum()) or ())
+    monkeypatch.setattr(moved, "MAX_PRODUCTS", 3.5 * 6 * 100 * 126**2)
     large: Any = SimpleNamespace(photographs=20, L=np.zeros((100, 3, 3)), t=np.zeros(126))
-    assert list(alternatives._moved_points(large)) == [] and len(tried) == 3
+    assert list(moved.moved_points(large)) == [] and len(tried) == 3
 
 
 def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -648,7 +660,7 @@ def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pyt
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), np.arange(m))
     made: dict[str, Spread] = {}
     monkeypatch.setattr(
-        alternatives, "_made", lambda *given: made.update({given[1].name: given[4]}) or given[1]
+        alternatives, "score_alternative", lambda *given: made.update({given[1].name: given[4]}) or given[1]
     )
     list(alternatives._each(reduced, H, g, squares, np.arange(m)))
     size = g.size
@@ -664,7 +676,7 @@ def test_a_camera_of_each_photograph_must_exceed_what_it_leaves(monkeypatch: pyt
 
 
 def test_patterns_have_two_photographs_on_each_side() -> None:
-    found = {name: (factors.tolist(), search) for name, factors, search in alternatives._patterns(5)}
+    found = {name: (factors.tolist(), search) for name, factors, search in patterns.patterns_of(5)}
     assert found["single"] == (np.eye(5).tolist(), pytest.approx(np.log(5)))
     assert found["split"] == ([[0, 0, 1, 1, 1], [0, 0, 0, 1, 1]], pytest.approx(np.log(2)))
     assert found["linear"] == ([[-1, -0.5, 0, 0.5, 1]], 0.0)

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, families, unchecked
+from sfm.adjustment.hypotheses import alternatives, families, patterns, unchecked
 from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
 from sfm.adjustment.hypotheses.score import reduce_adjustment
@@ -159,8 +159,8 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
 
 def test_cameras_too_many_to_test_are_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, more than 60 cameras counted as one, of which some photographs might have another one."""
-    assert alternatives.MAX_RUNS == 60
-    monkeypatch.setattr(alternatives, "MAX_RUNS", 4)
+    assert patterns.MAX_RUNS == 60
+    monkeypatch.setattr(patterns, "MAX_RUNS", 4)
     network, truth = make_network(seed_of("61"), images=10, points=30, cameras=5, free=("c",))
     for cameras, untested in ((5, True), (4, False)):
         camera = np.minimum(np.arange(10) % 5, cameras - 1)

@@ -1,7 +1,7 @@
 """The alternatives: what is freed (family) in which photographs (pattern), each with its gain.
 
-A family is a set of columns; a pattern gives each photograph a factor on them. The level of the test is
-shared out among all alternatives, and lowered by what was searched inside each of them: the number of
+A family is a set of columns; a pattern gives each photograph a factor on them, see `patterns`. The level of
+the test is shared out among all alternatives, and lowered by what was searched inside each: the number of
 patterns, or of sets of points, from which the best one was taken.
 
 Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level.
@@ -10,14 +10,12 @@ Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import gammaln
 
 from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.hypotheses.families import (
-    BODY,
     FORMAT,
     GIVEN,
     HELD,
@@ -32,6 +30,17 @@ from sfm.adjustment.hypotheses.families import (
     ObjectFamily,
     format_columns,
 )
+from sfm.adjustment.hypotheses.moved import moved_bodies, moved_points
+from sfm.adjustment.hypotheses.patterns import (
+    MIN_GROUP,
+    Part,
+    Pattern,
+    patterns_of,
+    price_of,
+    runs_of,
+    score_alternative,
+    too_many_cameras,
+)
 from sfm.adjustment.hypotheses.score import (
     NONE,
     Gain,
@@ -39,12 +48,9 @@ from sfm.adjustment.hypotheses.score import (
     Spread,
     determined_inverse,
     gain_of,
-    gains_of,
     least_share,
-    log_f_sf,
     log_likelihood_gain,
     log_probability,
-    points_by_cameras,
 )
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -52,14 +58,7 @@ from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 
 ALPHA = 0.01  # probability of naming any alternative where none holds
-MIN_GROUP = 2  # photographs on each side of a split
-MAX_RUNS = 60  # photographs, or runs of them, that have freedoms by themselves
-MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten seconds
-MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
-MAX_MOVED = 60  # points that are tried together
-ROUNDS = 20  # of two means
 OF_ONE = ("single", "pair")  # patterns of one photograph
-STARTS = 8  # photographs from which a group is grown
 
 
 def alternatives_of(
@@ -82,8 +81,8 @@ def alternatives_of(
         *interiors(a, reduced, GIVEN),
         *_format(a, reduced),
         *_by_photographs(a, reduced, columns),
-        *_moved_points(reduced),
-        *_moved_bodies(a, reduced, columns, bodies),
+        *moved_points(reduced),
+        *moved_bodies(a, reduced, columns, bodies),
     ]
     return _by_evidence(a, reduced, columns, found)
 
@@ -114,11 +113,11 @@ def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
     if len(a.network.images) < MIN_GROUP:
         return held + 1
     camera = cameras_of_photographs(a)
-    run, patterns = _runs(camera), 0
+    run, patterns = runs_of(camera), 0
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
             m = len(np.unique(run[among]))
-            names = [name for name, _, _ in _patterns(m) if family.of_camera or name not in OF_ONE]
+            names = [name for name, _, _ in patterns_of(m) if family.of_camera or name not in OF_ONE]
             patterns += len(names) + (m > 2 * MIN_GROUP)
     return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, SHIFTED)) + bodies
 
@@ -139,56 +138,6 @@ def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
     """
     level = np.exp(np.log(ALPHA / rows) - search)
     return float(max(chi2_isf(level, rank), 2 * (price_of(rank, touched, search) + np.log(1 / ALPHA))))
-
-
-def price_of(rank: int, touched: int, search: float) -> float:
-    """Return what parameters must gain in ln likelihood, by the number of image points that they move.
-
-    Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90, on the n of the Bayesian information criterion.
-    """
-    return float(rank / 2 * np.log(2 * max(touched, 2)) + search)
-
-
-@dataclass(frozen=True)
-class _Pattern:
-    """Photographs in which a family is freed."""
-
-    name: str
-    factor: FloatArray  # of each photograph, (m,)
-    search: float = 0.0  # ln of the number of patterns, or of sets of points, from which it was taken
-    among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
-    parts: int = 1  # each of which has parameters by itself
-
-
-def _made(
-    reduced: Reduced,
-    family: Family,
-    pattern: _Pattern,
-    gain: Gain,
-    spread: Spread = NONE,
-    *,
-    points: IntArray | None = None,
-    parameters: tuple[tuple[int, int], ...] = (),
-) -> Alternative:
-    """Return an alternative with its test."""
-    r, parts, search = reduced.redundancy, pattern.parts, pattern.search
-    on = pattern.factor[reduced.image] != 0 if parts == 1 else np.ones(len(reduced.image), dtype=bool)
-    some = np.zeros(0, dtype=np.int64) if points is None else points
-    if len(some):
-        on &= np.isin(reduced.point, some)
-    touched = int(on.sum()) // parts
-    log_p = log_probability(gain.value, gain.rank, r)
-    if spread.factor > 1:
-        f = spread.ratio(gain.value, gain.rank, r)
-        log_p = max(log_p, log_f_sf(f, gain.rank, spread.redundancy)) if gain.rank else 0.0
-    price = price_of(gain.rank, touched, search)
-    evidence = spread.evidence(gain.value, gain.rank, r) - price
-    return Alternative(
-        *(family, pattern.name, pattern.factor, gain, spread, log_p, price, search, evidence),
-        points=some,
-        parameters=parameters,
-        among=pattern.among,
-    )
 
 
 def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tuple[tuple[int, int], ...]]]:
@@ -212,7 +161,7 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
 
 def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
     """Return an alternative for each held or given interior parameter, and one for all of a camera."""
-    everywhere = _Pattern("all", np.ones(len(a.network.images)))
+    everywhere = Pattern("all", np.ones(len(a.network.images)))
     for sets in interior_parameters(a, family):
         whole = tuple(pair for one in sets for pair in one)
         D = reduced.whiten(shared_columns(a, list(whole))[0])
@@ -234,7 +183,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
                     ),
                     key=lambda one: one.factor,
                 )
-                yield _made(reduced, family, everywhere, gain, spread, parameters=parameters)
+                yield score_alternative(reduced, family, everywhere, gain, spread, parameters=parameters)
 
 
 def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
@@ -250,7 +199,7 @@ def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[A
     if gain.rank:
         step = D @ gain.beta
         spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
-        yield _made(reduced, family, _Pattern("all", np.ones(reduced.photographs)), gain, spread)
+        yield score_alternative(reduced, family, Pattern("all", np.ones(reduced.photographs)), gain, spread)
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
@@ -269,7 +218,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     changes in some of its own photographs, an object in some of all.
     """
     camera = cameras_of_photographs(a)
-    run = _runs(camera)
+    run = runs_of(camera)
     m = int(run.max()) + 1
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
     if m >= 2 * MIN_GROUP and not too_many_cameras(camera):
@@ -278,10 +227,8 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
         some = np.array(family.places)
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
-            part = _Part(
-                H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)]
-            )
-            for pattern, factors, search in _patterns(len(runs)):
+            part = Part(H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)])
+            for pattern, factors, search in patterns_of(len(runs)):
                 if pattern in OF_ONE and not family.of_camera:
                     continue  # an object that one photograph shows otherwise is that photograph's fault
                 gains = [part.gain(factor) for factor in factors]
@@ -292,13 +239,15 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                     alone = among if pattern == "pair" else factor > 0
                     own = _variance_of(reduced, alone, gains[best])
                     spread = replace(spread, factor=max(spread.factor, own))
-                yield _made(reduced, family, _Pattern(pattern, factor, search, among), gains[best], spread)
+                yield score_alternative(
+                    reduced, family, Pattern(pattern, factor, search, among), gains[best], spread
+                )
             if len(runs) > 2 * MIN_GROUP:
                 members, gain = part.group()
                 if MIN_GROUP <= members.sum() <= len(runs) - MIN_GROUP:
                     factor, search = _of_photographs(members, runs, run, m), (len(runs) - 1) * np.log(2)
-                    grown = _Pattern("group", factor, search, among)
-                    yield _made(reduced, family, grown, gain, part.spread(members, gain))
+                    grown = Pattern("group", factor, search, among)
+                    yield score_alternative(reduced, family, grown, gain, part.spread(members, gain))
 
 
 def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
@@ -327,28 +276,6 @@ def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> 
     if not family.of_camera:
         return [np.ones(len(camera), dtype=bool)]
     return [] if too_many_cameras(camera) else [camera == k for k in range(int(camera.max()) + 1)]
-
-
-def too_many_cameras(camera: IntArray) -> bool:
-    """Return whether there are more cameras, by `cameras_of_photographs`, than are tested."""
-    return int(camera.max()) >= MAX_RUNS
-
-
-def _runs(camera: IntArray) -> IntArray:
-    """Return the run of each photograph, (m,): those of one camera that follow one another.
-
-    Of more cameras than are tested a run has several.
-    """
-    m = len(camera)
-    if m <= MAX_RUNS:
-        return np.arange(m)
-    if too_many_cameras(camera):
-        camera = np.zeros_like(camera)
-    piece = np.empty(m, dtype=np.int64)
-    piece[np.argsort(camera, kind="stable")] = np.arange(m) * MAX_RUNS // m
-    _, run = np.unique([camera, piece], axis=1, return_inverse=True)
-    middle = np.bincount(run, weights=np.arange(m)) / np.bincount(run)
-    return np.asarray(np.argsort(np.argsort(middle, kind="stable"))[run])
 
 
 def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: int) -> FloatArray:
@@ -383,7 +310,7 @@ def _each(
             squares[:, rest].ravel(),
         )
         spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
-        yield _made(reduced, family, _Pattern("each", run.astype(float), parts=m), gain, spread)
+        yield score_alternative(reduced, family, Pattern("each", run.astype(float), parts=m), gain, spread)
 
 
 def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
@@ -391,217 +318,3 @@ def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
     v = reduced.v[some[reduced.image]]
     expected = v.size * reduced.redundancy / reduced.count
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
-
-
-def _patterns(m: int) -> Iterator[tuple[str, FloatArray, float]]:
-    """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
-    if m == MIN_GROUP:
-        yield "pair", np.eye(m)[1:], 0.0  # that the other one differs says the same
-    elif m > MIN_GROUP:
-        yield "single", np.eye(m), np.log(m)
-    if m < 2 * MIN_GROUP:
-        return
-    splits = np.array([np.arange(m) >= k for k in range(MIN_GROUP, m - MIN_GROUP + 1)], dtype=float)
-    yield "split", splits, np.log(len(splits))
-    yield "linear", np.linspace(-1, 1, m)[None], 0.0
-    yield "alternating", (np.arange(m) % 2)[None].astype(float), 0.0
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Normal equations of a family in each photograph."""
-
-    H: FloatArray  # (m, f, m, f)
-    g: FloatArray  # (m, f)
-    squares: FloatArray  # (m, f)
-
-    def gain(self, factor: FloatArray) -> Gain:
-        """Return the gain where the photographs have the family with these factors."""
-        return gain_of(
-            np.tensordot(np.tensordot(factor, self.H, (0, 0)), factor, (1, 0)),
-            factor @ self.g,
-            factor**2 @ self.squares,
-            least_share(self.g.shape[1]),
-        )
-
-    def spread(self, factor: FloatArray, gain: Gain) -> Spread:
-        """Return how much the photographs differ in the family beyond what a pattern explains."""
-        m = len(self.g)
-        left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
-        some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
-        values, ranks = gains_of(self.blocks[some], left[some], self.squares[some])
-        redundancy = int(ranks.sum()) - gain.rank
-        return NONE if redundancy < 1 else Spread(float(values.sum()) / redundancy, redundancy)
-
-    @property
-    def blocks(self) -> FloatArray:
-        """Normal equations of each photograph by itself, (m, f, f)."""
-        return np.asarray(np.einsum("iaib->iab", self.H))
-
-    def group(self) -> tuple[FloatArray, Gain]:
-        """Return the photographs that together have the largest gain, as factors 0 and 1, by two means."""
-        m = len(self.g)
-        single, _ = gains_of(self.blocks, self.g, self.squares)
-        best, most = np.zeros(m), None
-        for first in np.argsort(-single)[:STARTS]:
-            factor = (np.arange(m) == first).astype(float)
-            for _ in range(ROUNDS):
-                beta = self.gain(factor).beta
-                # v'Pv as a function of the factors: s'Qs + 2 l's with beta held, one photograph after another
-                Q = np.tensordot(beta, self.H, (0, 1)) @ beta
-                linear = self.g @ beta
-                again = factor.copy()
-                for i in range(m):
-                    others = Q[i] @ again - Q[i, i] * again[i]
-                    again[i] = float(Q[i, i] + 2 * (linear[i] + others) < 0)
-                if (again == factor).all() or not again.any():
-                    break
-                factor = again
-            gain = self.gain(factor)
-            if most is None or gain.value > most.value:
-                best, most = factor, gain
-        assert most is not None
-        return best, most
-
-
-def _moved_points(reduced: Reduced) -> Iterator[Alternative]:
-    """Return for each place in the sequence the set of points that moved there with the best evidence."""
-    m = reduced.photographs
-    if m < 2 * MIN_GROUP:
-        return
-    splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
-    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # of one place
-    affordable = max(1, min(MAX_SPLITS, int(MAX_PRODUCTS / products)))
-    splits = splits[:: -(-len(splits) // affordable)]
-    best: dict[str, Alternative] = {}
-    for k in splits:
-        for one in _moved_at(reduced, (np.arange(m) >= k).astype(float), np.log(len(splits))):
-            if one.family.name not in best or one.evidence > best[one.family.name].evidence:
-                best[one.family.name] = one
-    yield from best.values()
-
-
-def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[Alternative]:
-    """Return the set of points that moved between the photographs of factor 0 and those of factor 1."""
-    n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
-    on = factor[reduced.image] > 0
-    D = np.where(on[:, None, None], reduced.B, 0.0)
-    V = np.zeros((n, 3, 3))
-    np.add.at(V, reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on])
-    C = reduced.L @ V  # L^-1 B'D, as B'D = V here
-    before = np.bincount(reduced.point[~on], minlength=n)
-    after = np.bincount(reduced.point[on], minlength=n)
-    movable = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
-    if not len(movable):
-        return
-    # A'D of each point, reduced by the point itself
-    by = np.swapaxes(reduced.B[on], 1, 2) @ reduced.A[on]
-    K = points_by_cameras(by, reduced.point[on], reduced.image[on], n, m)
-    K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
-    g = np.zeros((n, 3))
-    np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))
-    g = g[movable] - np.einsum("nab,na->nb", C[movable], reduced.y[movable])
-    g = g - K @ (reduced.Sinv @ reduced.t)
-    own = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]
-    KS = K @ reduced.Sinv
-    blocks = own - np.einsum("nas,nbs->nab", KS, K)
-    squares = np.einsum("nii->ni", V[movable])
-    single, _ = gains_of(blocks, g, squares)
-    order = np.argsort(-single)[: min(MAX_MOVED, len(movable) // 2 or 1)]
-    flat = (K[order].reshape(-1, size), KS[order].reshape(-1, size))
-    H = -flat[1] @ flat[0].T
-    for place, k in enumerate(order):
-        block = slice(3 * place, 3 * place + 3)
-        H[block, block] += own[k]
-    best: Alternative | None = None
-    total = len(movable)
-    ordered = np.sort(single)[::-1]
-    for count in range(1, len(order) + 1):
-        part = slice(0, 3 * count)
-        gain = gain_of(H[part, part], g[order].ravel()[part], squares[order].ravel()[part])
-        sets = _log_sets(total, count)
-        others = ordered[count:]
-        spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
-        pattern = _Pattern("split", factor, search + sets)
-        one = _made(reduced, MOVED, pattern, gain, spread, points=movable[order[:count]])
-        if best is None or one.evidence > best.evidence:
-            best = one
-        elif count > 2 * len(best.points) + 4:
-            break
-    if best is not None:
-        yield best
-    yield from _shifted(reduced, factor, search, (movable, blocks, g))
-
-
-def _moved_bodies(
-    a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray]
-) -> Iterator[Alternative]:
-    """Return for each body that it moved, at the best place in the sequence.
-
-    One photograph gives the place of a body, so that it may move behind the first and before the last.
-    """
-    if reduced.photographs < 2 * MIN_GROUP:
-        return
-    run = _runs(np.zeros(reduced.photographs, dtype=np.int64))
-    m = int(run.max()) + 1
-    splits = (np.arange(m) >= np.arange(1, m)[:, None]).astype(float)
-    for points in bodies:
-        field = BODY.field(a.estimate.points, points)[a.network.image_points.point]
-        part = _Part(*reduced.project_by_run(reduced.whiten(columns.point @ field), run))
-        gains = [part.gain(factor) for factor in splits]
-        best = max(range(len(gains)), key=lambda k: gains[k].value)
-        pattern = _Pattern("split", splits[best][run], np.log(m - 1))
-        spread = part.spread(splits[best], gains[best])
-        yield _made(reduced, BODY, pattern, gains[best], spread, points=points)
-
-
-def _log_sets(total: int, count: int) -> float:
-    """Return ln of the number of sets of so many points."""
-    return float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
-
-
-def _shifted(
-    reduced: Reduced,
-    factor: FloatArray,
-    search: float,
-    parts: tuple[IntArray, FloatArray, FloatArray],
-) -> Iterator[Alternative]:
-    """Return the set of points that moved by one and the same vector, as a part of the object that shifted.
-
-    By two means over the points, from those that moved most; parts are the points that can have moved, their
-    normal equations (n, 3, 3) and right sides (n, 3).
-    """
-    movable, blocks, g = parts
-    total = len(movable)
-    squares = np.einsum("nii->ni", blocks)
-    own, _ = gains_of(blocks, g, squares)
-    best: Alternative | None = None
-    for first in np.argsort(-own)[:STARTS]:
-        members = np.arange(total) == first
-        for _ in range(ROUNDS):
-            N = blocks[members].sum(axis=0)
-            d = -np.linalg.lstsq(N, g[members].sum(axis=0), rcond=None)[0]
-            again = np.einsum("a,nab,b->n", d, blocks, d) + 2 * g @ d < 0
-            if (again == members).all() or not again.any():
-                break
-            members = again
-        if 2 * members.sum() > total:
-            members = ~members  # that the others moved the other way says the same
-        count = int(members.sum())  # not more than half
-        if count < MIN_GROUP:
-            continue
-        points = movable[members]
-        on = (factor[reduced.image] > 0) & np.isin(reduced.point, points)
-        D = np.where(on[:, None, None], reduced.B, 0.0)
-        gain = gain_of(*reduced.project(D))
-        sets = _log_sets(total, count)
-        left = g + np.where(members[:, None], blocks @ gain.beta, 0.0)
-        values, ranks = gains_of(blocks, left, squares)
-        redundancy = int(ranks.sum()) - gain.rank
-        spread = Spread(float(values.sum()) / redundancy, redundancy)
-        pattern = _Pattern("split", factor, search + sets)
-        one = _made(reduced, SHIFTED, pattern, gain, spread, points=points)
-        if best is None or one.evidence > best.evidence:
-            best = one
-    if best is not None:
-        yield best

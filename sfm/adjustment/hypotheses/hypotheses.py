@@ -19,7 +19,6 @@ from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import (
     ALPHA,
-    MIN_GROUP,
     alternatives_of,
     cameras_of_photographs,
     interiors,
@@ -27,6 +26,7 @@ from sfm.adjustment.hypotheses.alternatives import (
 )
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
+from sfm.adjustment.hypotheses.patterns import MIN_GROUP
 from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
 from sfm.adjustment.hypotheses.score import (
     Reduced,

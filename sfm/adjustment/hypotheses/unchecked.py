@@ -17,13 +17,11 @@ import numpy as np
 from scipy.special import chndtrinc
 
 from sfm.adjustment.hypotheses.alternatives import (
-    MIN_GROUP,
     cameras_of_photographs,
     count_alternatives,
     interior_parameters,
     needed_gain,
     photographs_among,
-    too_many_cameras,
 )
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import (
@@ -33,6 +31,7 @@ from sfm.adjustment.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
+from sfm.adjustment.hypotheses.patterns import MIN_GROUP, too_many_cameras
 from sfm.adjustment.hypotheses.score import DETERMINED, NONE, Gain, Reduced, directions_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.kind import WRONG_SIGMAS

@@ -1,0 +1,186 @@
+"""Alternatives of an object that did not stay as it was: points, bodies or a part of it moved in between.
+
+They moved at a place in the sequence of photographs. Points that move by vectors of their own are tried by
+their single gains, those that shift by one vector by two means, and bodies as they are known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.special import gammaln
+
+from sfm.adjustment.hypotheses.columns import Columns
+from sfm.adjustment.hypotheses.families import (
+    BODY,
+    MOVED,
+    SHIFTED,
+    Alternative,
+)
+from sfm.adjustment.hypotheses.patterns import (
+    MIN_GROUP,
+    ROUNDS,
+    STARTS,
+    Part,
+    Pattern,
+    runs_of,
+    score_alternative,
+)
+from sfm.adjustment.hypotheses.score import (
+    NONE,
+    Reduced,
+    Spread,
+    gain_of,
+    gains_of,
+    points_by_cameras,
+)
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+
+MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten seconds
+MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
+MAX_MOVED = 60  # points that are tried together
+
+
+def moved_points(reduced: Reduced) -> Iterator[Alternative]:
+    """Return for each place in the sequence the set of points that moved there with the best evidence."""
+    m = reduced.photographs
+    if m < 2 * MIN_GROUP:
+        return
+    splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
+    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # of one place
+    affordable = max(1, min(MAX_SPLITS, int(MAX_PRODUCTS / products)))
+    splits = splits[:: -(-len(splits) // affordable)]
+    best: dict[str, Alternative] = {}
+    for k in splits:
+        for one in _moved_at(reduced, (np.arange(m) >= k).astype(float), np.log(len(splits))):
+            if one.family.name not in best or one.evidence > best[one.family.name].evidence:
+                best[one.family.name] = one
+    yield from best.values()
+
+
+def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[Alternative]:
+    """Return the set of points that moved between the photographs of factor 0 and those of factor 1."""
+    n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
+    on = factor[reduced.image] > 0
+    D = np.where(on[:, None, None], reduced.B, 0.0)
+    V = np.zeros((n, 3, 3))
+    np.add.at(V, reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on])
+    C = reduced.L @ V  # L^-1 B'D, as B'D = V here
+    before = np.bincount(reduced.point[~on], minlength=n)
+    after = np.bincount(reduced.point[on], minlength=n)
+    movable = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
+    if not len(movable):
+        return
+    # A'D of each point, reduced by the point itself
+    by = np.swapaxes(reduced.B[on], 1, 2) @ reduced.A[on]
+    K = points_by_cameras(by, reduced.point[on], reduced.image[on], n, m)
+    K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
+    g = np.zeros((n, 3))
+    np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))
+    g = g[movable] - np.einsum("nab,na->nb", C[movable], reduced.y[movable])
+    g = g - K @ (reduced.Sinv @ reduced.t)
+    own = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]
+    KS = K @ reduced.Sinv
+    blocks = own - np.einsum("nas,nbs->nab", KS, K)
+    squares = np.einsum("nii->ni", V[movable])
+    single, _ = gains_of(blocks, g, squares)
+    order = np.argsort(-single)[: min(MAX_MOVED, len(movable) // 2 or 1)]
+    flat = (K[order].reshape(-1, size), KS[order].reshape(-1, size))
+    H = -flat[1] @ flat[0].T
+    for place, k in enumerate(order):
+        block = slice(3 * place, 3 * place + 3)
+        H[block, block] += own[k]
+    best: Alternative | None = None
+    total = len(movable)
+    ordered = np.sort(single)[::-1]
+    for count in range(1, len(order) + 1):
+        part = slice(0, 3 * count)
+        gain = gain_of(H[part, part], g[order].ravel()[part], squares[order].ravel()[part])
+        sets = _log_sets(total, count)
+        others = ordered[count:]
+        spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
+        pattern = Pattern("split", factor, search + sets)
+        one = score_alternative(reduced, MOVED, pattern, gain, spread, points=movable[order[:count]])
+        if best is None or one.evidence > best.evidence:
+            best = one
+        elif count > 2 * len(best.points) + 4:
+            break
+    if best is not None:
+        yield best
+    yield from _shifted(reduced, factor, search, (movable, blocks, g))
+
+
+def moved_bodies(
+    a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray]
+) -> Iterator[Alternative]:
+    """Return for each body that it moved, at the best place in the sequence.
+
+    One photograph gives the place of a body, so that it may move behind the first and before the last.
+    """
+    if reduced.photographs < 2 * MIN_GROUP:
+        return
+    run = runs_of(np.zeros(reduced.photographs, dtype=np.int64))
+    m = int(run.max()) + 1
+    splits = (np.arange(m) >= np.arange(1, m)[:, None]).astype(float)
+    for points in bodies:
+        field = BODY.field(a.estimate.points, points)[a.network.image_points.point]
+        part = Part(*reduced.project_by_run(reduced.whiten(columns.point @ field), run))
+        gains = [part.gain(factor) for factor in splits]
+        best = max(range(len(gains)), key=lambda k: gains[k].value)
+        pattern = Pattern("split", splits[best][run], np.log(m - 1))
+        spread = part.spread(splits[best], gains[best])
+        yield score_alternative(reduced, BODY, pattern, gains[best], spread, points=points)
+
+
+def _log_sets(total: int, count: int) -> float:
+    """Return ln of the number of sets of so many points."""
+    return float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
+
+
+def _shifted(
+    reduced: Reduced,
+    factor: FloatArray,
+    search: float,
+    parts: tuple[IntArray, FloatArray, FloatArray],
+) -> Iterator[Alternative]:
+    """Return the set of points that moved by one and the same vector, as a part of the object that shifted.
+
+    By two means over the points, from those that moved most; parts are the points that can have moved, their
+    normal equations (n, 3, 3) and right sides (n, 3).
+    """
+    movable, blocks, g = parts
+    total = len(movable)
+    squares = np.einsum("nii->ni", blocks)
+    own, _ = gains_of(blocks, g, squares)
+    best: Alternative | None = None
+    for first in np.argsort(-own)[:STARTS]:
+        members = np.arange(total) == first
+        for _ in range(ROUNDS):
+            N = blocks[members].sum(axis=0)
+            d = -np.linalg.lstsq(N, g[members].sum(axis=0), rcond=None)[0]
+            again = np.einsum("a,nab,b->n", d, blocks, d) + 2 * g @ d < 0
+            if (again == members).all() or not again.any():
+                break
+            members = again
+        if 2 * members.sum() > total:
+            members = ~members  # that the others moved the other way says the same
+        count = int(members.sum())  # not more than half
+        if count < MIN_GROUP:
+            continue
+        points = movable[members]
+        on = (factor[reduced.image] > 0) & np.isin(reduced.point, points)
+        D = np.where(on[:, None, None], reduced.B, 0.0)
+        gain = gain_of(*reduced.project(D))
+        sets = _log_sets(total, count)
+        left = g + np.where(members[:, None], blocks @ gain.beta, 0.0)
+        values, ranks = gains_of(blocks, left, squares)
+        redundancy = int(ranks.sum()) - gain.rank
+        spread = Spread(float(values.sum()) / redundancy, redundancy)
+        pattern = Pattern("split", factor, search + sets)
+        one = score_alternative(reduced, SHIFTED, pattern, gain, spread, points=points)
+        if best is None or one.evidence > best.evidence:
+            best = one
+    if best is not None:
+        yield best
