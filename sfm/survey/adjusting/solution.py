@@ -398,7 +398,9 @@ def _final(start: _Prepared, settled: Settled, *, before: Adjustment | None = No
     asked = {one.name for one in start.estimate.cameras if one.free[0]}
     c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
     report_step("looking for other solutions")
-    starts = (*_of_pair(final), *(() if before is None else _left(final, before)))
+    starts = _of_pair(final)
+    if before is not None and len(before.network.points) == len(final.network.points):
+        starts = (*starts, before.estimate)
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
@@ -450,11 +452,6 @@ def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     return pair_solutions(
         accepted, final.estimate, tolerance_px=PAIR_TOLERANCE * max(final.sigma0, 1.0) * final.sigma_px
     )
-
-
-def _left(final: Adjustment, before: Adjustment) -> tuple[Estimate, ...]:
-    """Return the solution that was left for a better one, where it has the same points."""
-    return (before.estimate,) if len(before.network.points) == len(final.network.points) else ()
 
 
 def _placed(start: _Prepared, settled: Settled) -> tuple[Adjustment, ControlCheck | None]:
