@@ -29,7 +29,7 @@ REASONS = (
     "sfm/survey/measuring/other_sizes.py",
     "sfm/survey/measuring/photographs.py",
     "sfm/survey/orientation.py",
-    "sfm/survey/inputs/photograph_list.py",
+    "sfm/survey/adjusting/settling.py",
     "sfm/survey/inputs/checks/settings_errors.py",
     "sfm/orientation/incremental",
     "sfm/pipeline.py",

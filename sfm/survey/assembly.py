@@ -16,7 +16,7 @@ from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResu
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.correspondences import Correspondences
-from sfm.survey.diagnosis.missing_plates import plates_not_in_result
+from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey

@@ -11,8 +11,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.diagnosis.codes_found import small_codes
-from sfm.survey.diagnosis.missing_plates import missing_plates, sides_not_found
+from sfm.survey.diagnosis.codes_found import missing_plates, sides_not_found, small_codes
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList

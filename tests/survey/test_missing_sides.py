@@ -11,7 +11,7 @@ import pytest
 
 from sfm.conventions import BoolArray
 from sfm.remarks.remark import Remark
-from sfm.survey.diagnosis.missing_plates import sides_not_found
+from sfm.survey.diagnosis.codes_found import sides_not_found
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets

@@ -17,7 +17,7 @@ from sfm.network import ObjectPoints
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.findings.survey_remarks import ray_remarks
 from sfm.survey.adjusting.solution_remarks import datum_remarks
-from sfm.survey.diagnosis.missing_plates import missing_plates
+from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.plate import plate_control
 from sfm.survey.inputs.survey import Survey, read_survey

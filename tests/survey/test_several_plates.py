@@ -20,7 +20,7 @@ from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import settings_by_table
-from sfm.survey.diagnosis.missing_plates import plates_not_in_result
+from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import Survey, read_survey
