@@ -175,10 +175,10 @@ def read_plan(folder: Path) -> PlannedSurvey:
     v = table.values
     normals = v[:, 3:6].copy()
     known = {*points, *stations.names}
-    for kind, lines in plan.survey_observations.items():
-        for name in (str(cell) for line in lines for cell in line[: len(TABLES[kind].texts)]):
-            if name not in known and TABLES[kind].texts[0] != "group":
-                raise SurveyFileError(f"{where}: {kind}: '{name}' is not in the plan")
+    tables = tuple(_table(where, kind, lines) for kind, lines in plan.survey_observations.items())
+    for one in tables:
+        for name in (name for column in one.named for name in column if name not in known):
+            raise SurveyFileError(f"{where}: {one.kind}: '{name}' is not in the plan")
     return PlannedSurvey(
         plan.name,
         plan.unit,
@@ -196,7 +196,7 @@ def read_plan(folder: Path) -> PlannedSurvey:
         plan.target.blur_px,
         plan.sigma_px,
         plan.scale_bars,
-        tuple(_table(where, kind, rows) for kind, rows in plan.survey_observations.items()),
+        tables,
         _given_mounts(plan.mounts),
     )
 
