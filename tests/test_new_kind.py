@@ -19,7 +19,7 @@ from sfm.observations.point_pairs import PointPairs
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
-from sfm.report.text.text_report import text_report
+from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
 from tests.survey.test_rigs import written

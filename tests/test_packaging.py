@@ -48,8 +48,7 @@ def test_every_file_of_a_package_is_in_the_wheel(package: str) -> None:
 def test_the_wheel_has_what_runs_at_run_time() -> None:
     needed = (
         *("py.typed", "__init__.pyi", "report/viewer/viewer.js", "report/viewer/viewer.css"),
-        *("report/viewer/LICENSES.txt", "report/html/tables.js", "report/html/templates/base.html"),
-        *("report/html/templates/report/cameras.html", "report/text/templates/report.txt"),
+        *("report/viewer/LICENSES.txt", "report/templates/tables.js", "report/templates/page.html"),
     )
     files = packed("sfm")
     assert not [name for name in needed if ROOT / "sfm" / name not in files]

@@ -1,20 +1,31 @@
-"""Parts of pages on what was given beside the photographs: control, scale bars, exterior orientation."""
+"""Parts of pages on what was given beside the photographs: control, scale bars, orientation, further."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.display import counted
 from sfm.report.findings.checks import CheckedControl
-from sfm.report.findings.given_residuals import Given, GivenResiduals
-from sfm.report.numbers import finer_unit_of, general, signed, significant, with_exponent
+from sfm.report.findings.given_residuals import CENTRE, ROTATION, Given, GivenResiduals
+from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant
 from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes
-from sfm.report.phrases import words_of_w
+from sfm.report.phrases import words_of_check
 
+HEADINGS = {
+    "control point": "Control",
+    "scale bar": "Scale bars",
+    "interior orientation": "Observed interior orientation",
+    CENTRE: "Observed exterior orientation: projection centres",
+    ROTATION: "Observed exterior orientation: rotations",
+}
 R_AND_W = (
-    "r: redundancy number (0 no check, 1 full check). w: the difference over its own standard deviation, "
-    "that which was given times the root of r; by chance 1 of 1000 is beyond 3.3."
+    "r: redundancy number (0 no check, 1 full check). w: the difference over its standard deviation, that of "
+    "the given value times the root of r; by chance 1 of 1000 is beyond 3.3. Largest w first."
 )
-MAX_OPEN = 30  # photographs whose observed orientation is shown without a click
+MAX_OPEN = 90  # values that are shown without a click
 
 
 def given_parts(
@@ -28,18 +39,9 @@ def given_parts(
         unit: object unit.
         check: control that took no part, if there is any.
     """
-    parts: list[Part] = []
-    if check is not None:
-        parts += _check(check, adjustment, unit)
-    if given.control is not None:
-        parts += _control(given.control, unit)
-    if given.bars is not None:
-        parts += _bars(given.bars, adjustment, unit)
-    for kind in given.further:
-        parts += _further(kind)
-    if given.exterior:
-        note = Note(f"d: adjusted minus given, s: given standard deviation. {R_AND_W}")
-        parts += [Heading("Observed exterior orientation"), note, *map(_exterior, given.exterior)]
+    parts = list(_check(check, adjustment, unit)) if check is not None else []
+    for kind in given.kinds:
+        parts += _kind(kind, adjustment, unit)
     return tuple(parts)
 
 
@@ -63,90 +65,53 @@ def _check(found: CheckedControl, adjustment: Adjustment, unit: str) -> tuple[Pa
     )
     rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, found.length, strict=True)]
     rms = ("RMS", *(significant(factor * one) for one in check.rms), found.rms_length)
-    return Heading("Check at the control"), note, Table(columns, rows, total=rms)
+    words = Paragraph(words_of_check(found, unit))
+    return Heading("Check at the control"), words, note, Table(columns, rows, total=rms)
 
 
-def _control(found: GivenResiduals, unit: str) -> tuple[Part, ...]:
-    factor, finer = finer_unit_of(unit, found.difference)
-    if not found.checked:
-        points = counted(len(found.names), "control point")
-        words = f"{points} held fixed: adjusted coordinates are those given, without residuals."
-        return Heading("Control"), Paragraph(words)
-    note = Note(f"d: adjusted minus given, s: given standard deviation [{finer}]. {R_AND_W}")
-    return Heading("Control"), note, _residuals(found, "control point", factor, unknown="not known")
+def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
+    """Yield the residuals of the values of a kind, that with the largest w first."""
+    rows = given_rows(found)
+    if not rows:
+        return
+    yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
+    what = counted(len(found.names), "photograph" if found.kind in (CENTRE, ROTATION) else found.kind)
+    if not found.checked and found.kind == "control point":
+        yield Paragraph(f"{what} held fixed: adjusted coordinates are those given, without residuals.")
+        return
+    columns, factor, unit = _columns(found, length_unit)
+    if len(found.coordinates) > 1 and unit:
+        rms = ", ".join(significant(factor * one) for one in found.rms)
+        yield Paragraph(f"{what}, RMS {rms} {unit} in {', '.join(found.coordinates)}, adjusted minus given.")
+    yield Note(R_AND_W)
+    rows.sort(key=lambda row: -abs(np.nan_to_num(row[-1])))
+    table = Table(columns, rows, all_in="given.csv")
+    yield table if len(rows) <= MAX_OPEN else Folded(counted(len(rows), "value"), table, in_text=True)
+    if found.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
+        yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
 
 
-def _bars(found: GivenResiduals, adjustment: Adjustment, unit: str) -> tuple[Part, ...]:
-    factor, finer = finer_unit_of(unit, found.difference, found.sigma)
+def given_rows(found: GivenResiduals) -> list[tuple[str | float, ...]]:
+    """Return the rows of given.csv of a kind, in the order of its columns."""
+    values = ((one, (one.given, one.difference, one.sigma, one.r, one.w)) for one in found.values)
+    return [(found.kind, one.name, one.coordinate, one.unit, *numbers) for one, numbers in values]
+
+
+def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
+    """Return the columns of `given_rows`; factor and unit of differences where all values have one unit."""
+    units = {unit for row in found.units for unit in row}
+    unit = finer = "" if len(units) > 1 else units.pop()
+    factor = 1.0
+    if unit == length_unit:
+        factor, finer = finer_unit_of(unit, found.difference, found.sigma)
     columns = (
-        *(Column("scale bar"), Column("given", "", unit, ".9g")),
-        Column("adjusted minus given", "", finer, signed, factor),
-        Column("sigma given", "", finer, significant, factor),
-        *(Column("r", format="z.3f"), Column("w", format=str)),
+        *(Column(None, "kind"), Column(found.kind, "name")),
+        Column("" if len(found.coordinates) > 1 else None, "coordinate"),
+        Column(None if unit else "unit", "unit"),
+        Column("given", "given", unit, ".9g"),
+        Column("adjusted - given", "difference", finer, signed, factor),
+        Column("sigma", "sigma", finer, or_fixed, factor),
+        Column("r", "r", format="z.3f", unknown=""),
+        Column("w", "w", format="+.2f", unknown="not checked"),
     )
-    rows = [
-        (one.name, one.given, one.difference, one.sigma, one.r, words_of_w(one.w, one.r))
-        for one in found.values
-    ]
-    parts = (Heading("Scale bars"), Note(R_AND_W), Table(columns, rows))
-    if len(rows) > 1 or adjustment.datum == "control":
-        return parts
-    return *parts, Note("A single bar gives the scale and cannot be checked; two or more check one another.")
-
-
-def _further(found: GivenResiduals) -> tuple[Part, ...]:
-    columns = (
-        *(Column(found.kind), Column(), Column("given", format=str), Column("sigma given", format=str)),
-        *(Column("adjusted minus given", format=signed), Column("unit")),
-        *(Column("r", format="z.3f"), Column("w", format=str)),
-    )
-    rows = [
-        (one.name, one.coordinate, *with_exponent(one.given, one.sigma), one.difference, one.unit, one.r,
-         words_of_w(one.w, one.r))
-        for one in found.values
-    ]  # fmt: skip
-    table = Folded(counted(len(rows), "value"), Table(columns, rows), open=len(rows) < MAX_OPEN)
-    return Heading(f"Observations: {found.kind}"), Note(R_AND_W), table
-
-
-def _exterior(found: GivenResiduals) -> Part:
-    factor, finer = finer_unit_of(found.units[0][0], found.difference)
-    count = len(found.names)
-    title = f"{', '.join(found.coordinates)} of {counted(count, 'photograph')} [{finer}]"
-    return Folded(title, _residuals(found, "photograph", factor, gap=" ", rms=True), open=count < MAX_OPEN)
-
-
-def _residuals(
-    found: GivenResiduals, what: str, factor: float, *, gap: str = "", unknown: str = "", rms: bool = False
-) -> Table:
-    """Return residuals d of given values, their given standard deviations s, r and w.
-
-    Args:
-        found: the residuals.
-        what: names of the first column, in the singular.
-        factor: from the object unit to that of the page.
-        gap: between the letter and the name of a coordinate.
-        unknown: in place of a standard deviation that is not known.
-        rms: whether a last row has the root mean squares of d.
-    """
-    letters = (
-        ("d", signed, factor, ""),
-        ("s", significant, factor, unknown),
-        ("r", "z.3f", 1.0, ""),
-        ("w", str, 1.0, None),
-    )
-    columns = [
-        Column(f"{letter}{gap}{axis}", format=write, factor=of, unknown=blank)
-        for letter, write, of, blank in letters
-        for axis in found.coordinates
-    ]
-    rows = [
-        (
-            *(name, *d, *("fixed" if one == 0 else one for one in s), *r),
-            *(words_of_w(one, its_r) for one, its_r in zip(w, r, strict=True)),
-        )
-        for name, d, s, r, w in zip(found.names, found.difference, found.sigma, found.r, found.w, strict=True)
-    ]
-    size = len(found.coordinates)
-    sums = ("RMS", *(significant(factor * one) for one in found.rms), *[""] * (3 * size)) if rms else None
-    return Table((Column(what), *columns), rows, total=sums)
+    return columns, factor, finer

@@ -19,10 +19,10 @@ from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import Findings, with_remark
-from sfm.report.html.page import report_page
+from sfm.report.pages import html_of
+from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
-from sfm.report.text.text_report import text_report
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
 from sfm.report.viewer.result_scene import scene_of_result
@@ -121,9 +121,8 @@ def write_result(
         if joint.covariance is not None:
             write_covariance(folder, joint.covariance, joint.network.points, joint.covariance_points)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
-        page = report_page(
-            timed, plots, overlays, has_model=write_colmap is not None, viewer=viewer_of(scene, pictures)
-        )
+        beside = {"plots": plots, "overlays": overlays, "has_model": write_colmap is not None}
+        page = html_of(timed, viewer=viewer_of(scene, pictures), **beside)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)

@@ -1,4 +1,4 @@
-"""Declared pages: what a page shows, and its tables as text, CSV and JSON. `html.page` renders it as HTML.
+"""Declared pages: what a page shows, and its tables as text, CSV and JSON. `html` renders it as HTML.
 
 A page is sections of tables, figures and words below a verdict. Its tables hold plain values; columns say how
 a value is named and written, so that the page, the terminal and the files beside the page share one table.
@@ -100,6 +100,11 @@ def axes(
     return tuple(Column(prefix + one, prefix + one, unit, format, factor) for one in parts)
 
 
+def columns(*titles: str) -> tuple[Column, ...]:
+    """Return columns of the page by their titles, those of numbers with ">" before them."""
+    return tuple(Column(one.removeprefix(">"), format=str if one[:1] == ">" else None) for one in titles)
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows of plain values below columns; a page shows the first ones."""
@@ -109,6 +114,8 @@ class Table:
     file: str = ""  # name of the CSV file without its ending; empty: it has none
     facts: bool = False  # names and words without a header
     total: Sequence[Any] | None = None  # a last row, of sums or means, on the page
+    most: int = MAX_ROWS  # rows on the page
+    all_in: str = ""  # the file with all rows, where that is not its own CSV file
     kind: ClassVar[str] = "table"
 
     @property
@@ -124,7 +131,11 @@ class Table:
     @property
     def cells(self) -> Iterable[tuple[str | Mark | Link, ...]]:
         """The rows as the page shows them."""
-        return self._cells(self.rows[:MAX_ROWS])
+        return self._cells(self.rows[: self.most])
+
+    def first(self, count: int) -> Iterable[tuple[str | Mark | Link, ...]]:
+        """Return the first rows and the last one, of sums, as the page shows them."""
+        return (*self._cells(self.rows[:count]), *self.sums)
 
     @property
     def sums(self) -> Iterable[tuple[str | Mark | Link, ...]]:
@@ -138,10 +149,15 @@ class Table:
     @property
     def cut(self) -> str:
         """How many of the rows the page shows; empty where all."""
-        if len(self.rows) <= MAX_ROWS:
+        if len(self.rows) <= self.most:
             return ""
-        where = f"; all are in {self.file}.csv" if self.file else ""
-        return f"The first {MAX_ROWS} of {counted(len(self.rows), 'row')}{where}."
+        where = f"; all are in {self.source}" if self.source else ""
+        return f"The first {self.most} of {counted(len(self.rows), 'row')}{where}."
+
+    @property
+    def source(self) -> str:
+        """The file with all rows; empty without one."""
+        return self.all_in or (f"{self.file}.csv" if self.file else "")
 
     @property
     def csv(self) -> str:
@@ -174,7 +190,7 @@ class Table:
         return "\n".join((*aligned(rows, [one.format is None for one in shown]), ""))
 
 
-def facts(rows: Sequence[tuple[str, str]]) -> Table:
+def facts(rows: Sequence[tuple[str | Link, str]]) -> Table:
     """Return names and what is stated of each."""
     return Table((Column(), Column()), rows, facts=True)
 
@@ -199,23 +215,65 @@ class Heading(Paragraph):
     kind = "heading"
 
 
+class Subheading(Paragraph):
+    """A heading below a heading."""
+
+    kind = "subheading"
+
+
+@dataclass(frozen=True)
+class Statement(Paragraph):
+    """Sentences with the colour of a level."""
+
+    level: str  # good, fair or bad
+    kind = "statement"
+
+
+@dataclass(frozen=True)
+class Card:
+    """A small picture that leads to a large one beside the page."""
+
+    path: str  # of the large one, from the folder of the page
+    jpeg: bytes
+    title: str
+    words: str
+    kind: ClassVar[str] = "card"
+
+
 class Folded:
-    """Parts that a click unfolds."""
+    """Parts that a click unfolds; a text has them where that is stated."""
 
     kind: ClassVar[str] = "folded"
 
-    def __init__(self, summary: str, *parts: Part, open: bool = False) -> None:
-        self.summary, self.parts, self.open = summary, parts, open
+    def __init__(self, summary: str, *parts: Part, open: bool = False, in_text: bool = False) -> None:
+        self.summary, self.parts, self.open, self.in_text = summary, parts, open, in_text
 
 
-Part = Table | Plot | Paragraph | Folded
+class Cards:
+    """Cards beside one another."""
+
+    kind: ClassVar[str] = "cards"
+
+    def __init__(self, cards: Iterable[Card]) -> None:
+        self.cards = tuple(cards)
+
+
+Part = Table | Plot | Paragraph | Folded | Cards
 
 
 class Section:
-    """A part of a page with a title; parts that are None are left out, and a section without any."""
+    """A part of a page with a title; parts that are None are left out, and a section without any.
 
-    def __init__(self, title: str, *parts: Part | None) -> None:
-        self.title, self.parts = title, tuple(part for part in parts if part is not None)
+    Args:
+        title: of the section.
+        parts: of the section.
+        key: by which addresses name the section; with one it is among the links at the head of the page.
+        in_text: whether a text has it.
+    """
+
+    def __init__(self, title: str, *parts: Part | None, key: str = "", in_text: bool = True) -> None:
+        self.title, self.key, self.in_text = title, key, in_text
+        self.parts = tuple(part for part in parts if part is not None)
 
 
 @dataclass(frozen=True)
@@ -225,6 +283,7 @@ class Tile:
     name: str
     value: object
     note: str = ""
+    wide: bool = False
 
 
 @dataclass(frozen=True)
@@ -256,6 +315,11 @@ class Page:
     def path(self) -> str:
         """Name of the file of the page."""
         return f"{self.file or self.name}.html"
+
+    @property
+    def links(self) -> tuple[Section, ...]:
+        """The sections that the head of the page leads to."""
+        return tuple(one for one in self.sections if one.key and one.parts)
 
     @property
     def tables(self) -> tuple[Table, ...]:

@@ -9,19 +9,20 @@ from typing import Any, cast
 
 from sfm.files.folder_lock import locked
 from sfm.files.whole_files import remove_leftovers, whole_folder
-from sfm.report.html.page import html
+from sfm.report.html import html
 from sfm.report.page import Page
 
 PAGES: Mapping[str, str] = {
     "Acceptance": "sfm.report.acceptance",
     "EpochSeries": "sfm.report.epochs",
+    "Findings": "sfm.report.survey_report",
     "Further": "sfm.report.further",
     "Measurement": "sfm.report.measurement",
     "Plan": "sfm.report.planning",
     "Refinement": "sfm.report.refinement",
     "ResultComparison": "sfm.report.differences",
     "Validation": "sfm.report.validation",
-    "ViewerScene": "sfm.report.html.view_page",
+    "ViewerScene": "sfm.report.view_page",
 }
 """The type of a result, and the module, imported when needed, whose function `page` declares its page."""
 
@@ -34,6 +35,11 @@ def page_of(found: Any, **beside: Any) -> Page:
         beside: what its declaration needs besides.
     """
     return cast(Page, import_module(PAGES[type(found).__name__]).page(found, **beside))
+
+
+def html_of(found: Any, **beside: Any) -> str:
+    """Return the page of a result as HTML; arguments as for `page_of`."""
+    return html(page_of(found, **beside))
 
 
 def texts_of(page: Page) -> dict[str, str]:

@@ -33,7 +33,7 @@ from sfm.files.folder_lock import Owner, locked
 from sfm.files.manifest import MANIFEST, sha256_of
 from sfm.files.whole_files import write_manifest
 from sfm.remarks.remark import kinds_of
-from sfm.report.html.page import html
+from sfm.report.html import html
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing

@@ -19,8 +19,8 @@ from sfm.cli.commands.viewing import view
 from sfm.errors import OutputError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.view_page import photographs_in
 from sfm.report.output import write_result
+from sfm.report.view_page import photographs_in
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of

@@ -128,7 +128,7 @@ def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path]
     [
         ("report.html", "How good is it?", "How precise is it?", 0),
         ("report.html", "20 object points", "21 object points", 1),
-        ("report.txt", "Network and rank", "Rank", 0),
+        ("report.txt", "Geometry of the network", "Geometry", 0),
         ("report.txt", "5 of 5", "4 of 5", 1),
     ],
 )
@@ -157,10 +157,10 @@ def test_missing_files_and_other_folders_are_told(
     assert done.returncode == 2 and "no result folder" in done.stderr
 
 
-def test_a_bar_in_a_name_is_no_column(result: SurveyResult) -> None:
-    from sfm.report.text.text_report import text_report
+def test_a_bar_in_a_name_is_written_as_it_is(result: SurveyResult) -> None:
+    from sfm.report.survey_report import text_report
 
     network = result.adjustment.network
     named = replace(network, images=("a|b", *network.images[1:]))
     text = text_report(findings_of(replace(result, adjustment=replace(result.adjustment, network=named))))
-    assert "photograph  a|b" in text
+    assert "  a|b  " in text

@@ -17,11 +17,12 @@ from sfm.network import ObjectPoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import Geometry, geometry_of, hull_area
-from sfm.report.html.page import report_page
+from sfm.report.pages import html_of
 from sfm.report.phrases import MAX_BINS, points_by_rays
+from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text.text_report import WIDTH, text_report
+from sfm.report.text import WIDTH
 from sfm.result import SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_points
 from tests.places import SHARED
@@ -131,9 +132,9 @@ def test_points_with_one_ray_each_have_no_angle() -> None:
     network = replace(network, image_points=seen.select(seen.point % 2 == seen.image), control=control)
     result = result_of(adjust(network, truth, datum=Datum("control"), reject="none"))
     assert np.isnan(geometry_of(result.adjustment).angle_deg).all()
-    assert "intersection angle    not known\n" in text_report(findings_of(result))
+    assert "intersection angle  not known\n" in text_report(findings_of(result))
     assert summary(findings_of(result))["geometry"]["intersection_angle_deg"]["max"] is None
-    assert "not known" in report_page(findings_of(result), (), ())
+    assert "not known" in html_of(findings_of(result))
 
 
 def test_many_numbers_of_rays_are_told_in_ranges() -> None:
@@ -155,7 +156,7 @@ def test_weak_points_are_named_and_all_reports_agree(tmp_path: Path) -> None:
     assert [a.network.points[j] for j in found.weak] == ["5"]
     text, page, told = (
         text_report(findings_of(result)),
-        report_page(findings_of(result), (), ()),
+        html_of(findings_of(result)),
         summary(findings_of(result))["geometry"],
     )
     words = f"below 10 deg: 1 point: 5 ({found.angle_deg[4]:.1f})"

@@ -15,7 +15,7 @@ import pytest
 from sfm.conventions import FloatArray
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
-from sfm.report.html.page import html
+from sfm.report.html import html
 from sfm.report.numbers import significant
 from sfm.report.page import (
     MAX_ROWS,

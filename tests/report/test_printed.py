@@ -16,7 +16,7 @@ ROWS = 300
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_folded_tables_are_printed_whole(tmp_path: Path) -> None:
-    style = (files("sfm.report.html") / "templates" / "report.css").read_text(encoding="utf-8")
+    style = (files("sfm.report") / "templates" / "report.css").read_text(encoding="utf-8")
     assert "counter(page)" in style
     rows = "".join(f"<tr><th>{k}</th><td>{k}</td></tr>" for k in range(ROWS))
     table = f"<div class=scroll><table><tbody>{rows}</tbody></table></div>"

@@ -10,8 +10,8 @@ import pytest
 
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.page import report_page
-from sfm.report.text.text_report import text_report
+from sfm.report.pages import html_of
+from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey
 
@@ -44,7 +44,7 @@ def said(text: str) -> set[float]:
 def test_the_page_says_what_the_text_says(write: object, tmp_path: Path) -> None:
     findings = findings_of(run_survey(read_survey(write(tmp_path / "survey", "text in page"))))  # type: ignore[operator]
     words = Words()
-    words.feed(report_page(findings, (), ()))
+    words.feed(html_of(findings))
     text = text_report(findings)
     missing = sorted(said(text) - said(words.text))
     lines = [line for line in text.splitlines() if said(line) & set(missing)]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import IntArray
-from sfm.report.html.view_page import view_page, write_view
+from sfm.report.view_page import view_page, write_view
 from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
 from sfm.report.viewer.stored_scene import scene_of_stored

@@ -18,8 +18,8 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
+from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
-from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.other_programs import OtherPrograms

@@ -18,10 +18,10 @@ from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.html.page import report_page
 from sfm.report.numbers import significant
+from sfm.report.pages import html_of
 from sfm.report.phrases import words_of_calibration
-from sfm.report.text.text_report import text_report
+from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import PlateFamily
@@ -75,7 +75,7 @@ def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.Capt
     for words in words_of_calibration(camera)[:3]:
         assert all(part in told for part in words.split()[:2])
     assert significant(camera.projection_largest_px) in told and "point precision" not in told
-    text, page = text_report(findings), report_page(findings, (), ())
+    text, page = text_report(findings), html_of(findings)
     assert "not known" not in text[text.index("Precision of the unknowns") :].split("\n\n")[0]
     for medium in (text, page):
         assert significant(camera.projection_largest_px) in medium
@@ -115,7 +115,7 @@ def test_a_zoom_while_a_plate_is_photographed_is_said(
 
 def page_of_free_points(findings: Findings) -> str:
     """Return the page of a result as if coordinates had been adjusted."""
-    return report_page(replace(findings, calibrated=()), (), ())
+    return html_of(replace(findings, calibrated=()))
 
 
 def test_photographs_without_the_plate_are_named(tmp_path: Path) -> None:

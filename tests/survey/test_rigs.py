@@ -18,7 +18,7 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
-from sfm.report.text.text_report import text_report
+from sfm.report.survey_report import text_report
 from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs

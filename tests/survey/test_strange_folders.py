@@ -271,9 +271,7 @@ def test_a_link_to_a_result_or_its_pictures_leads_no_page_out_of_the_folder(
     assert kolinear(monkeypatch, "view", given / "model", "--no-open") == 0
     assert content(home) == before and (given / "model.html").is_file()
     seen: list[Path] = []
-    monkeypatch.setattr(
-        "sfm.report.html.view_page.photographs_in", lambda folder, _: seen.append(folder) or {}
-    )
+    monkeypatch.setattr("sfm.report.view_page.photographs_in", lambda folder, _: seen.append(folder) or {})
     shutil.copytree(result, given / "other")
     (given / "other" / "pictures").symlink_to(home)
     assert kolinear(monkeypatch, "view", given / "other", "--no-open") == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.checks import Sigma0
 from sfm.report.findings.findings import findings_of
 from sfm.report.phrases import words_of_sigma0, words_of_weights
-from sfm.report.text.text_report import text_report
+from sfm.report.survey_report import text_report
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -40,8 +41,9 @@ def test_stated_weights_have_one_sigma0_for_all(weights: str) -> None:
         assert a.sigma0 == pytest.approx(1.0, rel=0.1)
     found = findings_of(result)
     assert found.sigma0.mm == pytest.approx(a.sigma0_px * 0.005)
-    text = text_report(found)
-    assert f"{a.sigma0:.4f} times the standard deviations that the weights rest on" in text
+    assert re.search(
+        rf"sigma0 over the standard deviations of the weights +{a.sigma0:.4f}\n", text_report(found)
+    )
     assert np.isfinite(a.covariance.points).all()
 
 

@@ -23,6 +23,7 @@ from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
+from sfm.report.given import given_rows
 from sfm.result import SurveyResult
 from sfm.solution import CONTROL_COVARIANCE, MEASURED
 
@@ -41,7 +42,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
     further = (list(zip(*seen, strict=True)), list(zip(*used, strict=True)), a.residuals)
     tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
     tables.LEFT_OUT.write_rows(folder, left_out_rows(findings))
-    tables.GIVEN.write_rows(folder, given_rows(findings.given, result))
+    tables.GIVEN.write_rows(folder, given_table(findings.given, result))
     tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
     tables.RESIDUALS.write_rows(folder, _residual_rows(findings))
@@ -116,15 +117,10 @@ def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
         yield ("point", one.point, one.image_points, one.reason.text)
 
 
-def given_rows(given: Given, result: SurveyResult) -> Iterable[Sequence[object]]:
-    """Return kind, name, coordinate, unit, given value, difference, sigma, r and w of every given value.
-
-    Of control with correlated coordinates their covariances follow as values.
-    """
+def given_table(given: Given, result: SurveyResult) -> Iterable[Sequence[object]]:
+    """Return every given value, and of control with correlated coordinates their covariances as values."""
     for kind in given.kinds:
-        for one in kind.values:
-            row = (one.name, one.coordinate, one.unit, one.given, one.difference, one.sigma, one.r, one.w)
-            yield (kind.kind, *row)
+        yield from given_rows(kind)
     if result.adjustment.datum == "control":
         for name, pair, value in result.network.correlated_control():
             yield (CONTROL_COVARIANCE, name, pair, f"{result.unit}^2", value, None, None, None, None)

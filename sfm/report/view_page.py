@@ -12,7 +12,7 @@ from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.files.whole_files import refuse_existing, whole_file
 from sfm.remarks.verdict import Line
-from sfm.report.html.page import html
+from sfm.report.html import html
 from sfm.report.numbers import fixed
 from sfm.report.page import Banner, Column, Folded, Page, Section, Table, axes, facts
 from sfm.report.viewer.embedded import viewer_of

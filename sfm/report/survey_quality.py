@@ -1,0 +1,384 @@
+"""How good a survey is: precision, geometry, given values, image points, cameras in its report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from sfm.adjustment.quality.statistics import STRONG, Correlation
+from sfm.adjustment.quality.variance_components import VarianceComponents
+from sfm.conventions import FloatArray
+from sfm.display import counted, listed
+from sfm.report.findings.findings import Findings
+from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
+from sfm.report.findings.interior_parameters import InteriorParameter
+from sfm.report.given import given_parts
+from sfm.report.numbers import (
+    finer_unit,
+    finer_unit_of,
+    fixed,
+    general,
+    or_unlimited,
+    probability,
+    raised,
+    significant,
+    with_exponent,
+)
+from sfm.report.page import (
+    Column,
+    Folded,
+    Heading,
+    Note,
+    Paragraph,
+    Part,
+    Subheading,
+    Table,
+    axes,
+    columns,
+    facts,
+)
+from sfm.report.phrases import (
+    NORMAL_95,
+    words_of_fixed,
+    words_of_limiting,
+    words_of_neighbours,
+    words_of_test,
+    words_of_weights,
+)
+
+MAX_BINS = 12  # numbers of rays that are listed one by one
+MAX_OPEN = 30  # parameters that are shown without a click
+WEAKEST = 5  # points
+STRONGEST = 20  # correlations of the exterior orientation; all are in summary.json
+OVER = f"{100 * STRONG:.0f} %"
+
+
+def precision_parts(f: Findings) -> Iterator[Part]:
+    """Yield the precision of points and photographs, and the weakest points."""
+    p, result = f.precision, f.result
+    a, unit = result.adjustment, result.length_unit
+    factor, finer = finer_unit(unit, p.largest[3])
+    of_centres, centre_unit = finer_unit_of(unit, p.centres)
+    adjusted = not np.isnan(p.rms[3])
+    yield Heading("Precision of the unknowns")
+    if not adjusted:
+        state = "held fixed" if p.fixed_points else "without standard deviations"
+        yield Paragraph(f"The coordinates of all points are {state}.")
+    rows = [
+        ("object points, RMS, 1 sigma", p.rms, factor, finer),
+        ("object points, RMS, 95 %", NORMAL_95 * p.rms, factor, finer),
+        ("object points, largest sigma", p.largest, factor, finer),
+        ("limiting: RMS with cameras free of error", p.limiting, factor, finer),
+        ("projection centres, RMS sigma", p.centres, of_centres, centre_unit),
+        ("omega, phi, kappa, RMS sigma", p.angles_arcsec, 1.0, "arc seconds"),
+    ]
+    shown = [
+        (name, *(significant(one) for one in values * times), of)
+        for name, values, times, of in rows
+        if not np.isnan(values[3])
+    ]
+    yield Table(columns("standard deviation", ">X, omega", ">Y, phi", ">Z, kappa", ">all", "unit"), shown)
+    if adjusted and p.fixed_points:
+        yield Paragraph(f"RMS {words_of_fixed(p)}.")
+    if words := words_of_limiting(p):
+        yield Paragraph(words)
+    yield Note(
+        f"Standard deviations are a posteriori and in the datum of the adjustment ({a.datum}); in a free "
+        "network they state how the points lie to one another, not in an outer frame."
+    )
+    if words := words_of_neighbours(a):
+        yield Paragraph(f"By the residuals, {words}.")
+    size = f"{general(f.object_size, 5)} {unit}"
+    yield Paragraph(f"The object is {size} across (diagonal of the box around its points).")
+    if adjusted:
+        weakest = sorted(f.points, key=lambda one: -one.sigma_length)[:WEAKEST]
+        heads = (Column("weakest points"), *axes("s", finer, factor=factor), *columns(">rays"))
+        yield Table(
+            (*heads, Column("angle", "", "deg", "z.1f")),
+            [(one.name, *one.sigma, one.rays, one.angle_deg) for one in weakest],
+        )
+        yield Note(
+            "kolinear plan more RESULT, with this folder as RESULT, proposes the further photographs that "
+            "help them most."
+        )
+
+
+def geometry_parts(f: Findings) -> Iterator[Part]:
+    """Yield rays, angles, residuals and coverage."""
+    network, found = f.result.adjustment.network, f.geometry
+    weak = listed(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in found.weak)
+    words = f"{counted(len(found.weak), 'point')}: {weak}" if len(found.weak) else "none"
+    points = tuple(f"point {name}" for name in network.points)
+    known = found.angle_deg[np.isfinite(found.angle_deg)]
+    mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {words}" if len(known) else ""
+    low, high = int(found.rays.min()), int(found.rays.max())
+    kinds = (
+        f"{count} {kind}: mean {rays:.1f}, fewest {fewest}"
+        for kind, count, rays, fewest in f.protocol.rays_by_kind
+    )
+    yield Heading("Geometry of the network")
+    yield facts(
+        [
+            (
+                "rays of a point",
+                f"{low} each" if low == high else f"{low} to {high}, mean {found.rays.mean():.1f}",
+            ),
+            ("rays by kind", "; ".join(kinds)),
+            ("points by rays", ", ".join(f"{rays}: {count}" for rays, count in points_by_rays(found))),
+            ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
+            ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
+            ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
+            *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
+        ]
+    )
+    yield Note(
+        "Rays are the accepted image points of a point; its intersection angle is the largest between two of "
+        "them, 90 degrees at best. Coverage is the part of a photograph within the convex hull of its image "
+        "points: the lens is known only there. Of every point and photograph: points.csv and images.csv."
+    )
+
+
+def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
+    """Return (rays, points with so many); ranges of rays where there are many different numbers."""
+    histogram = found.histogram()
+    if len(histogram) <= MAX_BINS:
+        return tuple((str(rays), n) for rays, n in histogram)
+    low, high = histogram[0][0], histogram[-1][0]
+    width = -(-(high - low + 1) // MAX_BINS)
+    bins = []
+    for first in range(low, high + 1, width):
+        last = min(first + width - 1, high)
+        count = sum(n for rays, n in histogram if first <= rays <= last)
+        bins.append((f"{first}-{last}" if last > first else str(first), count))
+    return tuple(bins)
+
+
+def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: int) -> str:
+    """Write the smallest and the largest of values, and whose they are."""
+    if not np.isfinite(values).any():
+        return "not known"
+    ends = int(np.nanargmin(values)), int(np.nanargmax(values))
+    return " to ".join(f"{values[k]:.{decimals}f} {unit} ({names[k]})" for k in ends)
+
+
+def _covered(one: Coverage) -> str:
+    hull, radius = 100 * one.hull, 100 * one.radius
+    area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
+    reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
+    return f"{area}, all together {100 * one.hull_of_all:.0f} %; from the centre {reach}"
+
+
+def given_values_parts(f: Findings) -> tuple[Part, ...]:
+    """Return how the given values fit."""
+    return given_parts(f.given, f.result.adjustment, f.result.length_unit, f.check)
+
+
+def image_point_parts(f: Findings) -> Iterator[Part]:
+    """Yield sigma0, the global tests, and the tests and reliability of image coordinates."""
+    a, s, sigma0 = f.result.adjustment, f.statistics, f.sigma0
+    yield Heading("Image coordinates")
+    rows = (
+        ("sigma0, a posteriori, of all observations", fixed(sigma0.px, 5), "px"),
+        ("sigma0 over the standard deviations of the weights", fixed(a.sigma0, 4), ""),
+        ("the same at the start values of the adjustment", significant(a.start_sigma0), ""),
+        ("sigma0 on the sensor", fixed(sigma0.mm, 6), "mm"),
+        ("standard deviation by the image points alone", fixed(sigma0.image_points_px, 5), "px"),
+        ("standard deviation stated beforehand", fixed(sigma0.stated_px, 5), "px"),
+        ("of the image points, a posteriori over that stated", fixed(sigma0.ratio, 3), ""),
+        ("RMS residual per coordinate", fixed(a.rms_px, 5), "px"),
+        ("longest residual vector among the accepted", fixed(a.max_residual_px, 4), "px"),
+    )
+    yield Table(columns("", ">value", "unit"), rows)
+    yield facts([("global test", words_of_test(test, a)) for test in s.global_tests])
+    if words := words_of_weights(f.result):
+        yield Paragraph(words)
+    yield Note(
+        "The global test asks whether the standard deviations stated beforehand are those of the residuals. "
+        "That of the image points (sigma_px) is only a rough guess: a test that is not passed states by how "
+        "much to correct it, unless sigma0 is several times too large."
+    )
+    if s.known:
+        yield Folded("Tests and reliability of single image coordinates", *_reliability(f), in_text=True)
+
+
+def _reliability(f: Findings) -> Iterator[Part]:
+    a, s = f.result.adjustment, f.statistics
+    names = ("Baarda's w (sigma of the weights)", "Pope's tau (sigma0 as found)")
+    tests = zip(names, (s.w, s.tau), (s.largest_w, s.largest_tau), strict=True)
+    yield Table(
+        (
+            *(Column("test for a gross error"), *columns(">coordinates")),
+            *(Column("critical value", format=".2f"), *columns(">beyond it")),
+            *(Column("by chance", format=".1f"), Column("largest", format=".2f")),
+        ),
+        [
+            (
+                f"{name}, {100 * one.alpha:.1f} %",
+                *(one.tested, one.critical, one.beyond, one.expected, largest),
+            )
+            for name, one, largest in tests
+        ],
+    )
+    r, bias, effect = s.redundancy, s.minimal_bias, s.external
+    rows = (
+        ("redundancy number (0 no check, 1 full check)", fixed(r.median, 3), fixed(r.smallest, 3), ""),
+        ("minimal bias", significant(bias.median), or_unlimited(bias.largest), "px"),
+        ("external reliability", significant(effect.median), or_unlimited(effect.largest), "sigmas"),
+    )
+    yield Table(columns("reliability", ">median", ">worst", "unit"), rows)
+    yield Paragraph(
+        f"The redundancy numbers add up to {fixed(s.redundancy_sum, 1)}, those of the image points alone to "
+        f"{fixed(s.redundancy_of_image_points, 1)} (mean {fixed(r.mean, 3)}); the redundancy is "
+        f"{a.redundancy}."
+    )
+    yield Paragraph(
+        "Minimal bias: the smallest gross error with which the tau test of an image coordinate exceeds its "
+        f"critical value, {fixed(s.reliability.critical, 2)}, in {fixed(100 * s.power, 0)} of 100 cases. "
+        "External reliability: its effect on an unknown if it is not found, in standard deviations of the "
+        "unknown."
+    )
+    yield Note(
+        "Where the redundancy is small, another coordinate may exceed the critical value by more and be "
+        "rejected instead. Of every image coordinate: reliability.csv."
+    )
+
+
+def largest_residual_parts(f: Findings) -> Iterator[Part]:
+    """Yield the largest standardised residuals."""
+    if f.largest:
+        yield Heading(f"The {len(f.largest)} largest residuals that were accepted")
+        heads = (*columns("photograph", "point"), *axes("v", "px", "+.3f", parts="xy"))
+        rows = [(one.image, one.point, *one.v, one.w, one.tau) for one in f.largest]
+        yield Table((*heads, Column("w (Baarda)", format="+.2f"), Column("tau (Pope)", format="+.2f")), rows)
+
+
+PARAMETERS = columns("of", "parameter", ">value", ">sigma", "unit", ">value / sigma")
+
+
+def _parameters(found: Sequence[InteriorParameter], *, of: bool = False) -> Table:
+    tests = ("" if one.t is None else fixed(one.t, 1) for one in found)
+    rows = [
+        (one.owner, one.name, *with_exponent(one.value, one.sigma), raised(one.unit), t)
+        for one, t in zip(found, tests, strict=True)
+    ]
+    return Table(PARAMETERS[0 if of else 1 :], [row[0 if of else 1 :] for row in rows], all_in="cameras.csv")
+
+
+def camera_parts(f: Findings) -> Iterator[Part]:
+    """Yield the interior orientation of all cameras."""
+    yield Heading("Cameras")
+    for family in f.interior.families:
+        camera = family.camera
+        yield Subheading(family.name)
+        size, pixel = camera.size_px, [general(1000 * one, 5) for one in camera.pixel_mm]
+        shared = f"; these parameters are common to {family.photographs} photographs"
+        yield Paragraph(
+            f"model {camera.model}, {size[0]} x {size[1]} px of {pixel[0]} x {pixel[1]} µm"
+            f"{shared if camera.shared else ''}"
+        )
+        yield _parameters(family.parameters)
+    for lens in f.protocol.lenses:
+        across, up, diagonal = (fixed(one, 1) for one in lens.field_of_view_deg)
+        yield Paragraph(
+            f"{lens.camera}: distortion up to {fixed(lens.largest_px, 1)} px; field of view {across} x {up} "
+            f"deg, diagonal {diagonal} deg."
+        )
+    if f.protocol.cumulative:
+        tests = (
+            f"{one.parameters} of {one.camera}: {probability(one.probability)}"
+            for one in f.protocol.cumulative
+        )
+        yield Paragraph(f"Radial distortion together against 0 (F test): {'; '.join(tests)}.")
+    if single := f.interior.single:
+        summary = f"{len(single)} parameters of single photographs and groups"
+        yield Folded(summary, _parameters(single, of=True), open=len(single) <= MAX_OPEN, in_text=True)
+    for rig in f.rigs:
+        yield Heading(f"Rig {rig.name}")
+        yield Paragraph(
+            f"In the image axes of camera {rig.reference}: x right, y up, z towards the camera. From "
+            f"{rig.moments} moments with photographs of two cameras at least."
+        )
+        unit = f.result.length_unit
+        rows = [
+            (mount.camera, name, *with_exponent(value, sigma), unit if is_length else "deg")
+            for mount in rig.mounts
+            for name, value, sigma, is_length in mount.values
+        ]
+        yield Table(columns("camera", "", ">value", ">sigma", "unit"), rows)
+    yield Folded("Correlations and significance of camera parameters", *_correlations(f), in_text=True)
+
+
+def _correlations(f: Findings) -> Iterator[Part]:
+    s, strong = f.statistics, f.result.orientation_correlations
+    if s.camera_correlations:
+        yield _pairs(s.camera_correlations)
+        yield Note(
+            "Parameters so strongly correlated cannot be separated: each makes up for errors of the other."
+        )
+    else:
+        yield Paragraph(f"No two parameters of a camera are correlated beyond {OVER}.")
+    others = [pair for pair in s.correlations if pair not in s.camera_correlations]
+    if others:
+        summary = f"{len(others)} strong correlations within the exterior orientation of a photograph"
+        yield Folded(summary, _pairs(others))
+    if strong:
+        heads = (Column("camera parameter"), Column("strongly correlated with"))
+        rows = [
+            (one.parameter, one.partners, 100 * one.largest, f"{one.part} of {one.image}") for one in strong
+        ]
+        yield Table((*heads, Column("largest", "", "%", "+.1f"), Column("which is with")), rows)
+        yield Note(
+            "The photographs can hardly separate these, as c from Z0 in a flat network. Photographs turned "
+            "about their axis, convergent ones, and an object with depth can."
+        )
+    else:
+        yield Paragraph(
+            f"No camera parameter is correlated with the exterior orientation of a photograph beyond {OVER}."
+        )
+    tests = ", ".join(
+        f"{one.parameter} of {one.camera} ({fixed(one.t, 1)}, p {fixed(one.probability, 2)})"
+        for one in s.not_significant
+    )
+    yield Paragraph(
+        "Not significantly different from 0 (t test, 5 %; in brackets the value over its standard "
+        f"deviation): {tests}. Held at 0, each by itself would worsen the fit by no more than chance."
+        if tests
+        else "All adjusted parameters differ significantly from 0 (t test, 5 %)."
+    )
+
+
+def _pairs(found: Iterable[Correlation]) -> Table:
+    rows = [(one.first, one.second, 100 * one.value) for one in found]
+    heads = (Column("parameter"), Column("and"), Column("correlation", "", "%", "+.1f"))
+    return Table(heads, rows, most=STRONGEST, all_in="summary.json")
+
+
+def component_parts(f: Findings) -> Iterator[Part]:
+    """Yield the variance components of kinds of observation, cameras and photographs."""
+    s = f.statistics
+    several = (s.kinds,) if len(s.kinds.names) > 1 else ()
+    yield Note(
+        "Variance components: sigma0 of a group over that stated beforehand; a group far above the others "
+        "was measured worse, or does not fit."
+    )
+    for name, found in (("kind of observation", several), ("camera", (s.cameras,))):
+        for one in found:
+            yield Folded(f"Variance components by {name}", _components(one, name), in_text=True)
+    yield Folded(
+        f"Variance components of {counted(len(s.photographs.names), 'photograph')}",
+        _components(s.photographs, "photograph"),
+        in_text=True,
+    )
+
+
+def _components(found: VarianceComponents, group: str) -> Table:
+    heads = (
+        Column(group),
+        Column("sigma0", format=".3f", unknown="not known"),
+        Column("redundancy", format="z.1f"),
+        Column("observations", format=str),
+    )
+    order = np.argsort(-np.nan_to_num(found.sigma0), kind="stable")
+    rows = [(found.names[k], found.sigma0[k], found.redundancy[k], int(found.count[k])) for k in order]
+    return Table(heads, rows, all_in="variance_components.csv")

@@ -1,1 +1,0 @@
-"""report.txt: `report.text_report` fills the template `report.txt`; `lines` sets its columns."""
