@@ -136,8 +136,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         rows.append(("correlation", words_of_neighbours(a)))
     if not findings.calibrated:
         rows.append(("point precision", told))
-    if findings.check is not None:
-        rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
+    if result.control_check is not None:
+        rows.append(("check at control", words_of_check(result.control_check, result.length_unit)))
     both = result.comparison
     if both is not None:
         word: str = "stopped early, same optimum" if both.stopped_early else both.outcome

@@ -8,11 +8,11 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.display import counted
-from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import CENTRE, ROTATION, Given, GivenResiduals
 from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant
 from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes
 from sfm.report.phrases import words_of_check
+from sfm.result import ControlCheck
 
 HEADINGS = {
     "control point": "Control",
@@ -29,7 +29,7 @@ MAX_OPEN = 90  # values that are shown without a click
 
 
 def given_parts(
-    given: Given, adjustment: Adjustment, unit: str, check: CheckedControl | None = None
+    given: Given, adjustment: Adjustment, unit: str, check: ControlCheck | None = None
 ) -> tuple[Part, ...]:
     """Return how the given values fit.
 
@@ -45,9 +45,8 @@ def given_parts(
     return tuple(parts)
 
 
-def _check(found: CheckedControl, adjustment: Adjustment, unit: str) -> tuple[Part, ...]:
+def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part, ...]:
     """Return the differences at control that took no part."""
-    check = found.check
     factor, finer = finer_unit_of(unit, check.differences)
     placed = "shift, rotation and scale; the scale was taken from the control."
     if adjustment.network.scale_bars:
@@ -63,9 +62,10 @@ def _check(found: CheckedControl, adjustment: Adjustment, unit: str) -> tuple[Pa
         *(Column("control point"), *axes("d", "", signed, factor=factor)),
         Column("length", format=significant, factor=factor),
     )
-    rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, found.length, strict=True)]
-    rms = ("RMS", *(significant(factor * one) for one in check.rms), found.rms_length)
-    words = Paragraph(words_of_check(found, unit))
+    length = np.linalg.norm(check.differences, axis=1)
+    rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, length, strict=True)]
+    rms = ("RMS", *(significant(factor * one) for one in check.rms), float(np.linalg.norm(check.rms)))
+    words = Paragraph(words_of_check(check, unit))
     return Heading("Check at the control"), words, note, Table(columns, rows, total=rms)
 
 

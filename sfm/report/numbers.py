@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.display import agreeing, bound, counted
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
 from sfm.units import SUPERSCRIPTS
@@ -133,24 +132,3 @@ def finer_unit_of(unit: str, *values: FloatArray) -> tuple[float, str]:
 def is_number(text: str) -> bool:
     """Whether a cell of a table is a number, which is set to the right."""
     return text.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in text.replace("e", ""))
-
-
-FILTERS = {
-    one.__name__: one
-    for one in (
-        agreeing,
-        bound,
-        counted,
-        fixed,
-        probability,
-        plus,
-        scientific,
-        general,
-        significant,
-        signed,
-        or_unlimited,
-        or_fixed,
-        with_exponent,
-    )
-} | {one.__name__: one for one in (to_precision, raised)}
-"""what the templates call"""

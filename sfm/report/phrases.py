@@ -8,21 +8,17 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
 from sfm.display import NO_BREAK, counted, listed
 from sfm.distributions import normal_ppf
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
-from sfm.report.findings.checks import CheckedControl, Sigma0
+from sfm.report.findings.checks import Sigma0
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.precision import Precision
 from sfm.report.findings.rigs import Rig
 from sfm.report.numbers import NOT_DETERMINED, alike, finer_unit, significant, with_exponent
-from sfm.result import SurveyResult
+from sfm.result import ControlCheck, SurveyResult
 
-NOT_CHECKED = "not checked"
 NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that 95 % of its errors are within
-MAX_BINS = 12  # numbers of rays that are listed one by one
 
 
 def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
@@ -95,25 +91,22 @@ def words_of_weights(result: SurveyResult) -> str:
     )
 
 
-def words_of_check(found: CheckedControl, unit: str) -> str:
+def words_of_check(found: ControlCheck, unit: str) -> str:
     """Return how far the placed points are from control that took no part.
 
     Args:
         found: the differences.
         unit: object unit.
     """
-    longest, points = float(found.length[found.worst]), found.check.points
+    length = np.linalg.norm(found.differences, axis=1)
+    worst, points = int(np.argmax(length)), found.points
+    longest = float(length[worst])
     factor, finer = finer_unit(unit, longest)
-    *rms, most = alike([*(found.check.rms * factor), longest * factor])
+    *rms, most = alike([*(found.rms * factor), longest * factor])
     return (
         f"RMS {', '.join(rms)} {finer} in X, Y, Z at {counted(len(points), 'point')}; largest "
-        f"{most} {finer} at {points[found.worst]}"
+        f"{most} {finer} at {points[worst]}"
     )
-
-
-def words_of_w(w: float, r: float) -> str:
-    """Return w of a given value; that it is not checked where r is 0, nothing where it was not observed."""
-    return f"{w:+.2f}" if np.isfinite(w) else "" if np.isnan(r) else NOT_CHECKED
 
 
 def words_of_limiting(precision: Precision) -> str:
@@ -190,97 +183,6 @@ def words_left_out(findings: Findings) -> str:
         ),
     ]
     return f"without {listed(left_out)}" if left_out else ""
-
-
-def words_of_datum(adjustment: Adjustment) -> str:
-    """Return what carries the datum: its kind, and how many points where they were chosen."""
-    points = adjustment.datum_points
-    return (
-        adjustment.datum
-        if points is None
-        else f"{adjustment.datum} on {counted(int(points.sum()), 'chosen point')}"
-    )
-
-
-def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:
-    """Return what is told of the geometry of the network, and the words for it."""
-    network, found = findings.result.adjustment.network, findings.geometry
-    weak = found.weak
-    names = listed(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak)
-    told = f"{counted(len(weak), 'point')}: {names}" if len(weak) else "none"
-    points = tuple(f"point {name}" for name in network.points)
-    known = found.angle_deg[np.isfinite(found.angle_deg)]
-    mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""
-    return (
-        ("rays of a point", _words_of_rays(found.rays)),
-        ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
-        ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
-        ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
-        *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
-    )
-
-
-def _words_of_rays(rays: IntArray) -> str:
-    low, high = int(rays.min()), int(rays.max())
-    return f"{low} each" if low == high else f"{low} to {high}, mean {rays.mean():.1f}"
-
-
-def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
-    """Return (rays, points with so many); ranges of rays where there are many different numbers."""
-    histogram = found.histogram()
-    if len(histogram) <= MAX_BINS:
-        return tuple((str(rays), n) for rays, n in histogram)
-    low, high = histogram[0][0], histogram[-1][0]
-    width = -(-(high - low + 1) // MAX_BINS)
-    bins = []
-    for first in range(low, high + 1, width):
-        last = min(first + width - 1, high)
-        count = sum(n for rays, n in histogram if first <= rays <= last)
-        bins.append((f"{first}-{last}" if last > first else str(first), count))
-    return tuple(bins)
-
-
-def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: int) -> str:
-    """Write the smallest and the largest of values, and whose they are."""
-    if not np.isfinite(values).any():
-        return "not known"
-    low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
-    return (
-        f"{values[low]:.{decimals}f} {unit} ({names[low]}) to {values[high]:.{decimals}f} {unit} "
-        f"({names[high]})"
-    )
-
-
-def _covered(one: Coverage) -> str:
-    hull, radius = 100 * one.hull, 100 * one.radius
-    area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
-    reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
-    return f"{area}, all together {100 * one.hull_of_all:.0f} %; from the centre {reach}"
-
-
-PHRASES = {
-    one.__name__: one
-    for one in (
-        *(
-            words_of_sigma0,
-            words_of_neighbours,
-            words_of_test,
-            words_of_weights,
-            words_of_check,
-            words_of_w,
-            words_of_limiting,
-        ),
-        *(
-            words_of_calibration,
-            words_of_fixed,
-            words_of_datum,
-            words_left_out,
-            words_of_geometry,
-            points_by_rays,
-        ),
-    )
-}
-"""what the templates call"""
 
 
 def words_of_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:

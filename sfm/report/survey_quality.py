@@ -92,11 +92,14 @@ def precision_parts(f: Findings) -> Iterator[Part]:
     size = f"{general(f.object_size, 5)} {unit}"
     yield Paragraph(f"The object is {size} across (diagonal of the box around its points).")
     if adjusted:
-        weakest = sorted(f.points, key=lambda one: -one.sigma_length)[:WEAKEST]
+        weakest = np.argsort(-np.linalg.norm(np.nan_to_num(p.points), axis=1), kind="stable")[:WEAKEST]
         heads = (Column("weakest points"), *axes("s", finer, factor=factor), *columns(">rays"))
         yield Table(
             (*heads, Column("angle", "", "deg", "z.1f")),
-            [(one.name, *one.sigma, one.rays, one.angle_deg) for one in weakest],
+            [
+                (a.network.points[j], *p.points[j], f.geometry.rays[j], f.geometry.angle_deg[j])
+                for j in weakest
+            ],
         )
         yield Note(
             "kolinear plan more RESULT, with this folder as RESULT, proposes the further photographs that "
@@ -171,7 +174,7 @@ def _covered(one: Coverage) -> str:
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:
     """Return how the given values fit."""
-    return given_parts(f.given, f.result.adjustment, f.result.length_unit, f.check)
+    return given_parts(f.given, f.result.adjustment, f.result.length_unit, f.result.control_check)
 
 
 def image_point_parts(f: Findings) -> Iterator[Part]:
@@ -249,8 +252,8 @@ def largest_residual_parts(f: Findings) -> Iterator[Part]:
     if f.largest:
         yield Heading(f"The {len(f.largest)} largest residuals that were accepted")
         heads = (*columns("photograph", "point"), *axes("v", "px", "+.3f", parts="xy"))
-        rows = [(one.image, one.point, *one.v, one.w, one.tau) for one in f.largest]
-        yield Table((*heads, Column("w (Baarda)", format="+.2f"), Column("tau (Pope)", format="+.2f")), rows)
+        tests = (Column("w (Baarda)", format="+.2f"), Column("tau (Pope)", format="+.2f"))
+        yield Table((*heads, *tests), f.largest)
 
 
 PARAMETERS = columns("of", "parameter", ">value", ">sigma", "unit", ">value / sigma")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -10,13 +11,13 @@ from importlib.metadata import version
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
+from sfm.conventions import angles_from_rotation
 from sfm.display import agreeing, counted, program_name
-from sfm.remarks.remark import of_kind
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
-from sfm.report.findings.findings import ComparisonFindings, Findings
-from sfm.report.numbers import finer_unit, fixed, general, or_fixed, scientific, significant, to_precision
+from sfm.report.findings.findings import Findings
+from sfm.report.numbers import finer_unit, fixed, or_fixed, significant, to_precision
 from sfm.report.page import (
     Card,
     Cards,
@@ -29,7 +30,6 @@ from sfm.report.page import (
     Paragraph,
     Part,
     Section,
-    Statement,
     Table,
     Tile,
     axes,
@@ -43,8 +43,10 @@ from sfm.report.phrases import (
     words_of_fixed,
     words_of_sigma0,
 )
+from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.text import text, wrapped
 from sfm.report.viewer.embedded import Viewer
+from sfm.result import likest_first
 
 MAX_LISTED = 60  # rejected points and small pictures on the page
 MAX_OPEN = 60  # object points that are shown without a click
@@ -125,9 +127,8 @@ def _tiles(f: Findings) -> Iterator[Tile]:
     yield Tile("RMS residual", f"{fixed(a.rms_px, 4)} px", "per image coordinate")
     sigma0, times = words_of_sigma0(f.sigma0)
     yield Tile("Sigma0", sigma0, f"{times}, redundancy {a.redundancy}")
-    if f.comparison:
-        both, left_out = f.comparison.both, words_left_out(f)
-        better = both.better
+    if both := result.comparison:
+        left_out, better = words_left_out(f), both.better
         note = f"with {', '.join(better.free)} free" if better else "image points alone"
         if left_out and not better:
             note += f", {left_out}"
@@ -236,32 +237,19 @@ def rejected(report: Report) -> Section:
     """Return what was rejected or left out, and why."""
     f, a, result = report.f, report.a, report.f.result
     parts: list[Part] = []
-    found, total = f.rejected.points, len(a.rejected)
-    if found:
+    limits, rows = f"Rejection: {f.protocol.limits}.", np.flatnonzero(a.rejected)
+    if len(rows):
         parts.append(
             Paragraph(
-                f"{len(found)} of {total} image points were rejected in the adjustment "
-                f"({fixed(100 * f.rejected.share, 1)} %). Their residuals are too long for their standard "
-                f"deviations; they took no part in the result. Rejection: {f.protocol.limits}."
+                f"{len(rows)} of {len(a.rejected)} image points were rejected in the adjustment "
+                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Their residuals are too long for their "
+                f"standard deviations; they took no part in the result. {limits}"
             )
         )
-        heads = (
-            *columns("photograph", "point"),
-            *axes("", "px", ".2f", parts="xy"),
-            *axes("v", "px", "+.3f", parts="xy"),
-            Column("length", "", "px", ".3f"),
-        )
-        rows = [(one.image, one.point, *one.xy, *one.v, one.length) for one in found]
-        parts.append(Table(heads, rows, most=MAX_LISTED, all_in="image_points.csv"))
-        rays = [
-            (one.point, f"{len(one.images)} of {one.rays}", ", ".join(one.images))
-            for one in f.protocol.rejected
-        ]
-        by_point = Table(columns("point", "rays", "photographs"), rows=rays, all_in="image_points.csv")
-        parts.append(Folded("Rejected rays by point", by_point, in_text=True))
+        parts += [_rejected_points(a), Folded("Rejected rays by point", _rejected_rays(f), in_text=True)]
     else:
-        words = f"None of the {total} image points was rejected in the adjustment."
-        parts.append(Paragraph(f"{words} Rejection: {f.protocol.limits}."))
+        words = f"None of the {len(a.rejected)} image points was rejected in the adjustment."
+        parts.append(Paragraph(f"{words} {limits}"))
     if result.left_out:
         seen = sum(one.image_points for one in result.left_out)
         lost = [(one.point, one.image_points, one.reason.text) for one in result.left_out]
@@ -274,170 +262,62 @@ def rejected(report: Report) -> Section:
         why = "uncoded points were left out, their outlines are not the images of a circle in space:"
         words = f"{len(result.no_circles)} {why} {', '.join(result.no_circles)}"
         parts += [Heading("Points that are not circles"), Paragraph(words)]
-    if f.rejected.candidates:
+    if result.photographs:
         parts.append(_candidates(f))
     return Section("What was rejected, and why?", *parts, key="rejected")
 
 
+def _rejected_points(a: Adjustment) -> Table:
+    """Return the rejected image points, the longest residual first."""
+    seen, length = a.network.image_points, np.linalg.norm(a.residuals, axis=1)
+    rows = np.flatnonzero(a.rejected)
+    shown = [
+        (
+            a.network.images[seen.image[k]],
+            a.network.points[seen.point[k]],
+            *seen.xy[k],
+            *a.residuals[k],
+            length[k],
+        )
+        for k in rows[np.argsort(-np.nan_to_num(length[rows], nan=np.inf))]
+    ]
+    heads = (
+        *(*columns("photograph", "point"), *axes("", "px", ".2f", parts="xy")),
+        *(*axes("v", "px", "+.3f", parts="xy"), Column("length", "", "px", ".3f")),
+    )
+    return Table(heads, shown, most=MAX_LISTED, all_in="image_points.csv")
+
+
+def _rejected_rays(f: Findings) -> Table:
+    rows = [
+        (name, f"{len(images)} of {rays}", ", ".join(images)) for name, images, rays in f.protocol.rejected
+    ]
+    return Table(columns("point", "rays", "photographs"), rows, all_in="image_points.csv")
+
+
 def _candidates(f: Findings) -> Folded:
-    reasons = f.rejected.reasons
+    """Return what was measured in each photograph, and why other candidates were not."""
+    result = f.result
+    used = dict(zip(f.result.adjustment.network.images, f.geometry.image_points.tolist(), strict=True))
+    counts = {one.image: Counter(dict(one.reasons())) for one in result.photographs}
+    every = sum(counts.values(), Counter[str]())
+    reasons = likest_first(every)
+    rows = [
+        (one.image, len(one.xy), used.get(one.image, 0), *(counts[one.image][why] or "" for why in reasons))
+        for one in result.photographs
+    ]
+    total = (
+        "all",
+        sum(len(one.xy) for one in result.photographs),
+        sum(used.values()),
+        *map(every.get, reasons),
+    )
     note = Note(
         "Blobs that might have been targets and were not measured, by reason, those most like targets first. "
         "Clutter in view makes many of them; the overlays show each."
     )
     heads = columns("photograph", ">measured", ">accepted in the result", *(f">{one}" for one in reasons))
-    *rows, total = (
-        (one.image, one.measured, one.accepted, *(one.reasons[reason] or "" for reason in reasons))
-        for one in (*f.rejected.candidates, f.rejected.total)
-    )
     return Folded("Candidates in the photographs", note, Table(heads, rows, total=total), open=True)
-
-
-def comparison(report: Report) -> Section:
-    """Return whether the other adjuster agrees."""
-    found = report.f.comparison
-    parts = (Paragraph("The survey asked for no comparison."),) if found is None else _compared(report, found)
-    return Section("Does the other adjuster agree?", *parts, key="comparison", in_text=found is not None)
-
-
-def _compared(report: Report, found: ComparisonFindings) -> Iterator[Part]:
-    f, both, unit = report.f, found.both, report.f.result.length_unit
-    d, name = both.comparison, program_name(both.backend)
-    alike = " ".join(one.text for one in of_kind(f.verdict.remarks, "adjuster_fits_alike"))
-    better = " ".join(one.text for one in of_kind(f.verdict.remarks, "adjuster_fits_better"))
-    if both.stopped_early:
-        short = significant(d.max_sigmas)
-        words = f"find the same optimum; {name} stopped {short} standard deviations short."
-        yield Statement(f"Yes: Kolinear and {name} {words}", "good")
-    elif both.better and both.agree:
-        yield Statement(f"{better} Kolinear and {name} agree on that camera.", "fair")
-    elif both.agree:
-        yield Statement(f"Yes: Kolinear and {name} end at the same optimum.", "good")
-    elif both.outcome == "fits alike":
-        yield Statement(alike, "good")
-    else:
-        yield Statement(f"No: Kolinear and {name} do not end at the same optimum.", "bad")
-        yield facts([("because", reason) for reason in found.reasons])
-    left_out, models = words_left_out(f), " and ".join(found.survey_models)
-    unchecked = f", and {name} does not check what is left out here" if left_out else ""
-    yield Paragraph(
-        f"Both adjusters had the {len(both.network.image_points)} accepted image points alone, with equal "
-        "weights, in a free datum and in the camera model "
-        f"{both.model}{f', {left_out}' if left_out else ''}. The survey itself is another adjustment: its "
-        f"RMS residual is {fixed(report.a.rms_px, 4)} px with its weights in {models}{unchecked}. One "
-        "solution is brought onto the other by shift, rotation and scale before anything is compared."
-    )
-    rms, cost = ([write(one) for one in pair] for write, pair in ((_nine, d.rms_px), (_general, d.cost)))
-    ends = [(one and "yes") or "no" for one in (both.adjustment.converged, both.backend_converged)]
-    rows = (
-        ("RMS residual per coordinate", *rms, "px"),
-        ("cost (half the sum of squares)", *cost, "px²"),
-        ("converged", *ends, ""),
-        ("iterations", both.adjustment.iterations, both.backend_iterations, ""),
-    )
-    yield Table(columns("", ">Kolinear", f">{name}", "unit"), rows)
-    size = d.object_size
-    largest = (
-        ("projection centre", scientific(d.max_position, 2), unit, scientific(d.max_position / size, 1)),
-        ("object point", scientific(d.max_point, 2), unit, scientific(d.max_point / size, 1)),
-        ("rotation", scientific(d.max_rotation_deg, 2), "deg", ""),
-        ("any parameter, in its standard deviations", scientific(d.max_sigmas, 1), "", ""),
-        ("interior orientation, in the photograph", scientific(found.max_interior_px, 2), "px", ""),
-    )
-    yield Table(columns("largest difference", ">value", "unit", ">of the object size"), largest)
-    yield Heading("Precision of the points")
-    factor, finer = finer_unit(unit, found.marginal.largest)
-    sigmas = (
-        ("Kolinear: everything adjusted is uncertain (marginal)", found.marginal),
-        ("Kolinear: photographs and cameras held (conditional)", found.conditional),
-        (f"{name}: photographs, cameras held (conditional)", found.backend_conditional),
-    )
-    precision = [
-        (words, *(significant(factor * value, 4) for value in (one.rms, one.largest)), finer)
-        for words, one in sigmas
-        if one
-    ]
-    yield Table(columns("standard deviation of a coordinate", ">RMS", ">largest", "unit"), precision)
-    yield Note(
-        "With photographs and cameras held, what is uncertain of them is missing: only the marginal standard "
-        f"deviations are those of the whole adjustment. {name} gives the conditional ones alone. They are of "
-        "the compared adjustment, with its sigma0."
-    )
-    if found.converted:
-        yield Heading("Cameras written in another model")
-        heads = (Column("misfit RMS", "", "px", ".4f"), Column("largest", "", "px", ".4f"))
-        converted = [
-            (one.camera.name, one.source_model, one.camera.model, one.rms_px, one.max_px)
-            for one in found.converted
-        ]
-        yield Table((*columns("camera", "from", "to"), *heads), converted)
-        yield Note(
-            "The misfit is the part of the survey's model that the other model cannot reproduce. It is the "
-            "same for both adjusters and does not affect the result of the survey."
-        )
-    if both.held:
-        yield Note(
-            "The distortion was held at the survey's result in both adjusters, since the image points do not "
-            f"determine all of it in this model: {', '.join(both.held)}."
-        )
-    if both.unshared:
-        yield Note(
-            f"{name} shares all parameters of a camera among photographs or none. Held at the survey's "
-            f"result in both adjusters were therefore: {'; '.join(both.unshared)}."
-        )
-    if both.freed:
-        yield Note(f"Free in the comparison besides the survey's parameters: {'; '.join(both.freed)}.")
-
-
-def _nine(value: float) -> str:
-    return fixed(value, 9)
-
-
-def _general(value: float) -> str:
-    return general(value, 9)
-
-
-def baseline(report: Report) -> Section:
-    """Return how another pipeline does on the photographs alone; nothing where the survey does not ask."""
-    found, unit = report.f.result.baseline, report.f.result.length_unit
-    if found is None:
-        return Section("")
-    name = found.name
-    factor, finer = finer_unit(unit, found.point_rms)
-    point, most, centre, most_centre, sigma = (
-        significant(factor * one)
-        for one in (
-            *(found.point_rms, found.max_point, found.position_rms, found.max_position),
-            float(report.f.precision.rms[3]),
-        )
-    )
-    words = Paragraph(
-        f"{name} oriented {found.photographs[1]} of {found.total} photographs from their natural texture "
-        f"alone, Kolinear {found.photographs[0]} from the survey's points. Brought onto the survey by "
-        f"shift, rotation and scale, its orientations put {found.targets} points of the survey {point} "
-        f"{finer} (RMS of a coordinate) from where the survey has them; the survey's standard deviation is "
-        f"{sigma} {finer}."
-    )
-    oriented = (f"{one} of {found.total}" for one in found.photographs)
-    rms, seconds = [significant(one) for one in found.rms_px], [fixed(one, 1) for one in found.seconds]
-    rows = (
-        ("photographs oriented", *oriented, ""),
-        ("RMS residual of each program's image points, per coordinate", *rms, "px"),
-        ("RMS residual of the survey's image points", rms[0], significant(found.target_rms_px), "px"),
-        ("time from photographs to orientation", *seconds, "s"),
-    )
-    apart = (
-        ("object point", point, most, finer),
-        ("projection centre", centre, most_centre, finer),
-        ("rotation", "", significant(found.max_rotation_deg), "deg"),
-    )
-    heads = columns("difference after the similarity", ">RMS of a coordinate", ">largest", "unit")
-    note = Note(
-        f"The survey's accepted image points were intersected with the orientations and camera of {name}, so "
-        "that the same points are compared. It knows no scale."
-    )
-    both = Table(columns("", ">Kolinear", f">{name}", "unit"), rows)
-    return Section(f"And {name} by itself?", words, both, Table(heads, apart), note, key="baseline")
 
 
 def coordinates(report: Report) -> Section:
@@ -488,21 +368,22 @@ def coordinates(report: Report) -> Section:
             Paragraph("In the folder of this report:"),
             facts([(Link(name, name), words) for name, words in files]),
         ),
-        Folded(counted(len(f.points), "object point"), points, open=len(f.points) <= MAX_OPEN),
-        Folded(f"Exterior orientation of {counted(len(f.photographs), 'photograph')}", photographs),
+        Folded(counted(len(points.rows), "object point"), points, open=len(points.rows) <= MAX_OPEN),
+        Folded(f"Exterior orientation of {counted(len(photographs.rows), 'photograph')}", photographs),
         key="coordinates",
         in_text=False,
     )
 
 
 def _object_points(f: Findings) -> Table:
-    unit = f.result.length_unit
+    a, unit, g = f.result.adjustment, f.result.length_unit, f.geometry
     rows = [
-        (
-            *(one.name, *map(to_precision, one.xyz, one.sigma), *one.sigma, one.rays),
-            *("" if one.code is None else one.code, one.angle_deg, one.rms_px),
+        (name, *map(to_precision, xyz, sigma), *sigma, rays, "" if code < 0 else code, angle, rms)
+        for name, xyz, sigma, rays, code, angle, rms in zip(
+            *(a.network.points, a.estimate.points, f.precision.points, g.rays),
+            *(f.result.code, g.angle_deg, g.point_rms_px),
+            strict=True,
         )
-        for one in f.points
     ]
     heads = (
         *(Column("point"), *axes("", unit, str), *axes("s", unit, or_fixed), *columns(">rays", ">code")),
@@ -512,22 +393,18 @@ def _object_points(f: Findings) -> Table:
 
 
 def _exterior(f: Findings) -> Table:
-    unit, angles = f.result.length_unit, ("omega", "phi", "kappa")
-    rows = [
-        (
-            one.name,
-            *map(to_precision, one.values, one.sigma),
-            *one.sigma,
-            one.points,
-            one.rms_px,
-            one.coverage,
-        )
-        for one in f.photographs
-    ]
+    a, unit, g = f.result.adjustment, f.result.length_unit, f.geometry
+    angles = np.degrees(angles_from_rotation(a.estimate.rotation))
+    of_photographs = zip(
+        *(a.network.images, np.hstack([a.estimate.position, angles]), f.precision.exterior_deg),
+        *(g.image_points, g.image_rms_px, g.hull),
+        strict=True,
+    )
+    rows = [(n, *map(to_precision, values, s), *s, *others) for n, values, s, *others in of_photographs]
+    names = ("omega", "phi", "kappa")
     heads = (
-        *(Column("photograph"), *axes("", unit, str), *(Column(name, "", "deg", str) for name in angles)),
-        *axes("s", unit),
-        *(Column(f"s {name}", "", "deg", significant) for name in angles),
+        *(Column("photograph"), *axes("", unit, str), *(Column(one, "", "deg", str) for one in names)),
+        *(*axes("s", unit), *(Column(f"s {one}", "", "deg", significant) for one in names)),
         *(*columns(">points"), Column("RMS", "", "px", "z.4f"), Column("coverage", "", "%", "z.0f", 100.0)),
     )
     return Table(heads, rows, all_in="images.csv")
@@ -586,6 +463,17 @@ def process(report: Report) -> Section:
         )
     parts = (settings, seconds, eccentricity, Note(CONVENTIONS))
     return Section("How it was done", *parts, key="process", in_text=False)
+
+
+def comparison(report: Report) -> Section:
+    """Return whether the other adjuster agrees."""
+    return Section("Does the other adjuster agree?", *adjuster_parts(report.f), key="comparison")
+
+
+def baseline(report: Report) -> Section:
+    """Return how another pipeline does on the photographs alone; nothing where the survey asks for none."""
+    found = report.f.result.baseline
+    return Section(f"And {found.name if found else ''} by itself?", *pipeline_parts(report.f), key="baseline")
 
 
 SECTIONS: tuple[Callable[[Report], Section], ...] = (

@@ -38,7 +38,7 @@ COMPUTED = (
         (findings_module, name)
         for name in ("statistics_of", "geometry_of", "given_of", "interior_of", "judge")
     ),
-    *((findings_module, name) for name in ("precision_of", "sigma0_of", "longest_residual", "rejected_of")),
+    *((findings_module, name) for name in ("precision_of", "sigma0_of", "longest_residual")),
 )
 
 

@@ -18,7 +18,7 @@ from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import Geometry, geometry_of, hull_area
 from sfm.report.pages import html_of
-from sfm.report.phrases import MAX_BINS, points_by_rays
+from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary

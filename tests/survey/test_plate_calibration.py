@@ -79,7 +79,7 @@ def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.Capt
     assert "not known" not in text[text.index("Precision of the unknowns") :].split("\n\n")[0]
     for medium in (text, page):
         assert significant(camera.projection_largest_px) in medium
-    assert page.count("<td>fixed</td>") == 3 * len(findings.points)
+    assert page.count("<td>fixed</td>") == 3 * len(findings.result.adjustment.network.points)
     assert "Precision of a point" not in page and "Precision of a point" in page_of_free_points(findings)
     assert np.abs(off(result)).max() < 4
 

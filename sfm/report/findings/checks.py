@@ -7,6 +7,7 @@ much they were wrong, and must not hide it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_co
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.observations.kind import is_observed
-from sfm.result import ControlCheck, SurveyResult
+from sfm.result import SurveyResult
 
 LISTED = 10  # largest residuals
 TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is stated beside that of all
@@ -61,17 +62,6 @@ class Sigma0:
 
 
 @dataclass(frozen=True)
-class LargeResidual:
-    """An accepted image point and its standardised residuals."""
-
-    image: str
-    point: str
-    v: FloatArray  # residual, px, (2,)
-    w: float  # Baarda's w of the worse coordinate
-    tau: float  # Pope's tau of the same coordinate
-
-
-@dataclass(frozen=True)
 class LongestResidual:
     """The accepted image point whose residual is the longest in standard deviations."""
 
@@ -80,20 +70,6 @@ class LongestResidual:
     length_px: float
     over_sigma: float  # its length in standard deviations, times the factor on its weight
     weight: float  # factor on its weight, below 1 by reweighting
-
-
-@dataclass(frozen=True)
-class CheckedControl:
-    """Differences at control that took no part in the adjustment."""
-
-    check: ControlCheck
-    length: FloatArray  # of each difference, object unit, (n,)
-    worst: int  # index of the longest
-
-    @property
-    def rms_length(self) -> float:
-        """Length of the vector of root mean square differences in X, Y, Z, object unit."""
-        return float(np.linalg.norm(self.check.rms))
 
 
 def sigma0_of(result: SurveyResult) -> Sigma0:
@@ -163,38 +139,22 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     )
 
 
-def largest_residuals(adjustment: Adjustment, count: int = LISTED) -> tuple[LargeResidual, ...]:
-    """Return the accepted image points with the largest standardised residuals, largest first."""
+def largest_residuals(adjustment: Adjustment, count: int = LISTED) -> tuple[tuple[Any, ...], ...]:
+    """Return the accepted image points with the largest standardised residuals, largest first.
+
+    Returns:
+        Photograph, point, residuals vx and vy, px, Baarda's w of the worse coordinate and Pope's tau of it.
+    """
     a, seen = adjustment, adjustment.network.image_points
     if len(a.standardised) != len(a.rejected):
         return ()
     w = np.nan_to_num(np.abs(a.standardised))
     size = np.where(a.rejected, -1.0, w.max(axis=1, initial=0.0))
     rows = np.argsort(-size, kind="stable")[: min(count, int((~a.rejected).sum()))]
-    return tuple(
-        LargeResidual(
-            a.network.images[seen.image[k]],
-            a.network.points[seen.point[k]],
-            a.residuals[k],
-            float(a.standardised[k, axis]),
-            float(a.tau[k, axis]),
-        )
-        for k, axis in zip(rows, np.argmax(w[rows], axis=1), strict=True)
-    )
-
-
-def checked_control(result: SurveyResult) -> CheckedControl | None:
-    """Return the differences at control that took no part; None without any."""
-    check = result.control_check
-    if check is None:
-        return None
-    length = np.linalg.norm(check.differences, axis=1)
-    return CheckedControl(check, length, int(np.argmax(length)))
-
-
-def object_size(points: FloatArray) -> float:
-    """Return the diagonal of the box around points, object unit."""
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
+    names = [(a.network.images[seen.image[k]], a.network.points[seen.point[k]]) for k in rows]
+    worse = np.argmax(w[rows], axis=1)
+    tests = np.column_stack([a.residuals[rows], a.standardised[rows, worse], a.tau[rows, worse]]).tolist()
+    return tuple((*name, *test) for name, test in zip(names, tests, strict=True))
 
 
 def _variances(covariance: FloatArray) -> FloatArray:

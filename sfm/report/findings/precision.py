@@ -25,6 +25,11 @@ class Precision:
     fixed_points: int  # points with fixed coordinates, as control or in a minimal datum
 
     @property
+    def exterior_deg(self) -> FloatArray:
+        """Standard deviations of each photograph, object unit and deg, (m, 6)."""
+        return np.asarray(self.exterior * np.repeat([1.0, np.degrees(1.0)], 3))
+
+    @property
     def angles_arcsec(self) -> FloatArray:
         """RMS of omega, phi, kappa, arc seconds, (4,)."""
         return np.degrees(self.angles) * 3600
@@ -81,6 +86,17 @@ def largest(values: FloatArray) -> FloatArray:
     columns = np.where(np.isfinite(values), values, -np.inf).max(axis=0, initial=-np.inf)
     found = np.array([*columns, columns.max()])
     return np.asarray(np.where(np.isfinite(found), found, np.nan))
+
+
+def point_sigma(covariance: FloatArray) -> tuple[float, float]:
+    """Return RMS and largest known standard deviation of the coordinates of points, object unit, NaN without.
+
+    Args:
+        covariance: of the points, object unit^2, (n, 3, 3).
+    """
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    known = sigma[np.isfinite(sigma)]
+    return root_mean_square(sigma), float(known.max()) if len(known) else float("nan")
 
 
 def _sqrt_diagonal(covariance: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ Studio.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,33 +21,10 @@ from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import f_sf
-from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import Given
-from sfm.result import SurveyResult
+from sfm.result import ControlCheck, SurveyResult
 
 EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
-
-
-@dataclass(frozen=True)
-class ResidualGroup:
-    """Residuals of the accepted image points of one photograph or point."""
-
-    kind: str  # photograph | point
-    name: str
-    accepted: int
-    rejected: int
-    rms_px: FloatArray  # in x and y, NaN without any, (2,)
-    largest_px: FloatArray  # largest absolute residual in x and y, NaN without any, (2,)
-    largest_at: tuple[str, str]  # the point or photograph of each, "" without any
-
-
-@dataclass(frozen=True)
-class RejectedRays:
-    """Rejected rays of one point."""
-
-    point: str
-    images: tuple[str, ...]
-    rays: int  # of the point, rejected ones included
 
 
 @dataclass(frozen=True)
@@ -87,8 +65,8 @@ class CumulativeTest:
 class Protocol:
     """All these entries."""
 
-    residuals: tuple[ResidualGroup, ...]
-    rejected: tuple[RejectedRays, ...]
+    residuals: tuple[tuple[Any, ...], ...]  # rows of residuals.csv
+    rejected: tuple[tuple[str, tuple[str, ...], int], ...]  # point, photographs of rejected rays, all rays
     limits: str  # of rejection, in words
     control: tuple[ControlCoordinate, ...]
     rays_by_kind: tuple[tuple[str, int, float, int], ...]  # kind of point, points, mean rays, fewest rays
@@ -96,7 +74,7 @@ class Protocol:
     cumulative: tuple[CumulativeTest, ...]
 
 
-def protocol_of(result: SurveyResult, given: Given, check: CheckedControl | None) -> Protocol:
+def protocol_of(result: SurveyResult, given: Given) -> Protocol:
     """Return the protocol entries of a result."""
     a = result.adjustment
     seen = a.network.image_points
@@ -107,7 +85,7 @@ def protocol_of(result: SurveyResult, given: Given, check: CheckedControl | None
         ),
         rejected=_rejected(a),
         limits=_limits(result),
-        control=(*_control(a, given), *_checked(a, check), *check_coordinates(result)),
+        control=(*_control(a, given), *_checked(a, result.control_check), *check_coordinates(result)),
         rays_by_kind=_rays_by_kind(result),
         lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
         cumulative=_cumulative(a),
@@ -121,32 +99,29 @@ def _groups(
     names: tuple[str, ...],
     other: IntArray,
     others: tuple[str, ...],
-) -> list[ResidualGroup]:
+) -> list[tuple[Any, ...]]:
+    """Return kind, name, accepted, rejected, RMS and largest |v| in x and y, px, and where these are."""
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(1, len(names)))
     out = []
     for name, rows in zip(names, np.split(order, bounds), strict=True):
         kept = rows[~a.rejected[rows]]
         v = np.abs(a.residuals[kept])
+        rms, largest, at = np.full(2, np.nan), np.full(2, np.nan), ["", ""]
         if len(kept):
-            worst = v.argmax(axis=0)
-            at = (others[other[kept[worst[0]]]], others[other[kept[worst[1]]]])
             rms, largest = np.sqrt((v**2).mean(axis=0)), v.max(axis=0)
-        else:
-            at, rms, largest = ("", ""), np.full(2, np.nan), np.full(2, np.nan)
-        out.append(ResidualGroup(kind, name, len(kept), len(rows) - len(kept), rms, largest, at))
+            at = [others[other[k]] for k in kept[v.argmax(axis=0)]]
+        out.append((kind, name, len(kept), len(rows) - len(kept), *rms, *largest, *at))
     return out
 
 
-def _rejected(a: Adjustment) -> tuple[RejectedRays, ...]:
+def _rejected(a: Adjustment) -> tuple[tuple[str, tuple[str, ...], int], ...]:
     seen, rays = a.network.image_points, a.network.rays()
     found: dict[int, list[str]] = {}
     for k in np.flatnonzero(a.rejected):
         found.setdefault(int(seen.point[k]), []).append(a.network.images[seen.image[k]])
-    return tuple(
-        RejectedRays(a.network.points[j], tuple(images), int(rays[j]))
-        for j, images in sorted(found.items(), key=lambda one: -len(one[1]))
-    )
+    most_first = sorted(found.items(), key=lambda one: -len(one[1]))
+    return tuple((a.network.points[j], tuple(images), int(rays[j])) for j, images in most_first)
 
 
 def _limits(result: SurveyResult) -> str:
@@ -183,12 +158,12 @@ def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
     ]
 
 
-def _checked(a: Adjustment, check: CheckedControl | None) -> list[ControlCoordinate]:
+def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinate]:
     if check is None:
         return []
     place = {a.network.points[j]: k for k, j in enumerate(a.network.control.point)}
     rows = []
-    for n, name in enumerate(check.check.points):
+    for n, name in enumerate(check.points):
         k = place.get(name)
         if k is None:
             continue
@@ -196,7 +171,7 @@ def _checked(a: Adjustment, check: CheckedControl | None) -> list[ControlCoordin
         prior = np.sqrt(np.diagonal(a.network.control.covariance[k]))
         posterior = np.sqrt(np.maximum(np.diagonal(a.covariance.points[j]), 0.0))
         for c, axis in enumerate("XYZ"):
-            difference = float(check.check.differences[n, c])
+            difference = float(check.differences[n, c])
             expected = float(np.hypot(prior[c], posterior[c]))
             known = float(a.network.control.xyz[k, c])
             rows.append(

@@ -35,17 +35,16 @@ def write_tables(findings: Findings, folder: Path) -> None:
     """Write all tables of a result into an existing folder; `summary.write_summary` adds the figures."""
     result, statistics = findings.result, findings.statistics
     a = result.adjustment
-    seen = [
-        (*(one.rays, one.code, one.angle_deg, one.rms_px), *one.limiting.tolist()) for one in findings.points
-    ]
-    used = [(one.points, one.rms_px, one.coverage) for one in findings.photographs]
-    further = (list(zip(*seen, strict=True)), list(zip(*used, strict=True)), a.residuals)
+    g, codes = findings.geometry, [None if code < 0 else code for code in result.code.tolist()]
+    limiting = findings.precision.limiting_points.T.tolist()
+    seen = [g.rays.tolist(), codes, g.angle_deg.tolist(), g.point_rms_px.tolist(), *limiting]
+    further = (seen, [one.tolist() for one in (g.image_points, g.image_rms_px, g.hull)], a.residuals)
     tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
     tables.LEFT_OUT.write_rows(folder, left_out_rows(findings))
     tables.GIVEN.write_rows(folder, given_table(findings.given, result))
     tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
-    tables.RESIDUALS.write_rows(folder, _residual_rows(findings))
+    tables.RESIDUALS.write_rows(folder, findings.protocol.residuals)
     tables.CONTROL_POINTS.write_rows(folder, _control_rows(findings))
     tables.INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
     tables.EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
@@ -61,7 +60,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
         tables.CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
     if len(result.seen_targets.image):
         tables.TARGETS.write_rows(folder, target_rows(findings))
-    colours = [UNCODED_COLOUR if one.code is None else CODED_COLOUR for one in findings.points]
+    colours = [UNCODED_COLOUR if code is None else CODED_COLOUR for code in codes]
     unit = result.length_unit
     write_ply(folder / "points.ply", a.estimate.points, colours=colours, unit=unit)
 
@@ -164,14 +163,6 @@ def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
     ):
         for g, name in enumerate(found.names):
             yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
-
-
-def _residual_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    for one in findings.protocol.residuals:
-        yield (
-            *(one.kind, one.name, one.accepted, one.rejected),
-            *(*one.rms_px, *one.largest_px, *one.largest_at),
-        )
 
 
 def _control_rows(findings: Findings) -> Iterable[Sequence[object]]:

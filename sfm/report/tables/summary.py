@@ -12,12 +12,15 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.report.findings.precision import point_sigma
 from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of
 from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
@@ -59,7 +62,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result, some of which may not be finite."""
     result, verdict = findings.result, findings.verdict
     adjustment, given = result.adjustment, findings.given
-    coded = sum(point.code is not None for point in findings.points)
+    coded = int((result.code >= 0).sum())
     return {
         "survey": result.survey,
         "unit": result.unit,
@@ -135,7 +138,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         },
         "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
-        "comparison": summary_of_comparison(findings),
+        "comparison": summary_of_comparison(result),
         "baseline": summary_of_baseline(result),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
@@ -222,24 +225,23 @@ def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, An
     ]
 
 
-def summary_of_comparison(findings: Findings) -> dict[str, Any] | None:
+def summary_of_comparison(result: SurveyResult) -> dict[str, Any] | None:
     """Return the comparison with the other adjuster, None without one."""
-    found = findings.comparison
-    if found is None:
+    both = result.comparison
+    if both is None:
         return None
-    both, difference = found.both, found.both.comparison
-    other = found.backend_conditional
+    difference, C, other = both.comparison, both.adjustment.covariance, both.backend_points
     return {
         **values_of(both, "backend agree outcome gap model stopped_early"),
         **values_of(difference, "max_sigmas max_position max_rotation_deg max_point"),
-        "max_interior_px": or_none(found.max_interior_px),
+        "max_interior_px": or_none(float(np.nanmax(difference.interior_px, initial=0.0))),
         "object_size": or_none(difference.object_size),
         "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
         "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
         "point_sigma_rms": {
-            "kolinear_marginal": or_none(found.marginal.rms),
-            "kolinear_conditional": or_none(found.conditional.rms),
-            f"{both.backend}_conditional": None if other is None else or_none(other.rms),
+            "kolinear_marginal": or_none(point_sigma(C.points)[0]),
+            "kolinear_conditional": or_none(point_sigma(C.points_limiting)[0]),
+            f"{both.backend}_conditional": None if other is None else or_none(point_sigma(other)[0]),
         },
         "exceeded": list(difference.exceeded),
         **values_of(both, "held unshared freed"),
