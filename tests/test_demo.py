@@ -19,9 +19,8 @@ from sfm.rendering.scene_file import Staging, read_scene
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
-from sfm.report.viewer.result_scene import scene_of_result
 from sfm.report.viewer.scene import Marks
-from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.report.viewer.solution_scene import scene_of_result, scene_of_stored
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey

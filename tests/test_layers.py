@@ -30,7 +30,7 @@ LAYERS = (
             "sfm.units",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.point_table", "sfm.solution", "sfm.display", "sfm.remarks"),
+        *("sfm.point_table", "sfm.solution", "sfm.given_residuals", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     (

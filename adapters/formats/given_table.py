@@ -12,6 +12,7 @@ from pydantic import Field
 from sfm.conventions import FloatArray
 from sfm.files.json_files import Content, read_json
 from sfm.files.result_tables import GIVEN
+from sfm.given_residuals import given_residuals, given_rows
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.solution import CONTROL_COVARIANCE
 
@@ -103,40 +104,10 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     )
 
 
-def write_given(folder: Path, network: Network, estimate: Estimate) -> None:
-    """Write what a network was given with a standard deviation, without its residuals; no file of nothing."""
-    rows: list[tuple[object, ...]] = []
-
-    def add(kind: str, name: str, coordinate: str, given: float, sigma: float) -> None:
-        if np.isfinite(sigma):
-            rows.append((kind, name, coordinate, "", given, np.nan, sigma, np.nan, np.nan))
-
-    control, bars, exterior, interior = (
-        network.control,
-        network.scale_bars,
-        network.exterior,
-        network.interior,
-    )
-    for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
-        for axis, value, sigma in zip("XYZ", xyz, np.sqrt(np.diagonal(C)), strict=True):
-            add("control point", network.points[j], axis, value, sigma)
-    rows += [
-        (CONTROL_COVARIANCE, name, pair, "", value, np.nan, np.nan, np.nan, np.nan)
-        for name, pair, value in network.correlated_control()
-    ]
-    for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
-        add("scale bar", f"{network.points[start]} - {network.points[end]}", "length", length, sigma)
-    for camera, s, value, sigma in zip(
-        interior.camera, interior.parameter, interior.value, interior.sigma, strict=True
-    ):
-        one = estimate.cameras[camera]
-        add("interior orientation", f"{one.names[s]} of camera {one.owner_of(s)}", "value", value, sigma)
-    for e, i in enumerate(exterior.image):
-        values = np.concatenate([exterior.position[e], np.degrees(exterior.angles[e])])
-        sigmas = np.sqrt(np.diagonal(exterior.covariance[e])) * np.repeat([1.0, np.degrees(1.0)], 3)
-        for k, (value, sigma) in enumerate(zip(values, sigmas, strict=True)):
-            kind = "projection centre" if k < 3 else "rotation"
-            add(kind, network.images[i], ORIENTATION[k], value, sigma)
+def write_given(folder: Path, network: Network, estimate: Estimate, unit: str) -> None:
+    """Write what a network was given with a standard deviation, without tests; no file of nothing."""
+    kinds = [kind for _, kind in given_residuals(network, estimate, unit)]
+    rows = list(given_rows(kinds, network, unit))
     if rows:
         GIVEN.write_rows(folder, rows)
 

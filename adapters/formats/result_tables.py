@@ -187,7 +187,7 @@ def write_content(folder: Path, content: Content) -> None:
         full = (result.exterior_covariance, result.rig_covariance)
         if any(Q is not None for Q in full) or any(map(len, result.interior_covariance)):
             write_covariances(folder, result)
-        write_given(folder, network, estimate)
+        write_given(folder, network, estimate, result.unit)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:

@@ -14,7 +14,7 @@ from sfm.report.page import Banner, Column, Note, Page, Section, Table
 from sfm.report.planning import exterior_table, shot_columns, shot_rows
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import Pictures
-from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.report.viewer.solution_scene import scene_of_stored
 from sfm.solution import Solution
 
 HIDDEN = Line("note", "What hides a point from a new station is not known: look before you photograph.")

@@ -8,9 +8,11 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.display import counted
-from sfm.report.findings.given_residuals import CENTRE, ROTATION, Given, GivenResiduals
+from sfm.files.result_tables import GIVEN
+from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.report.findings.given_residuals import Given
 from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant
-from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes
+from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes, columns_of
 from sfm.report.phrases import words_of_check
 from sfm.result import ControlCheck
 
@@ -71,7 +73,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
 
 def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
     """Yield the residuals of the values of a kind, that with the largest w first."""
-    rows = given_rows(found)
+    rows = found.table_rows
     if not rows:
         return
     yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
@@ -91,27 +93,21 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
         yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
 
 
-def given_rows(found: GivenResiduals) -> list[tuple[str | float, ...]]:
-    """Return the rows of given.csv of a kind, in the order of its columns."""
-    values = ((one, (one.given, one.difference, one.sigma, one.r, one.w)) for one in found.values)
-    return [(found.kind, one.name, one.coordinate, one.unit, *numbers) for one, numbers in values]
-
-
 def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
-    """Return the columns of `given_rows`; factor and unit of differences where all values have one unit."""
+    """Return the columns of given.csv; factor and unit of differences where all values have one unit."""
     units = {unit for row in found.units for unit in row}
     unit = finer = "" if len(units) > 1 else units.pop()
     factor = 1.0
     if unit == length_unit:
         factor, finer = finer_unit_of(unit, found.difference, found.sigma)
-    columns = (
-        *(Column(None, "kind"), Column(found.kind, "name")),
-        Column("" if len(found.coordinates) > 1 else None, "coordinate"),
-        Column(None if unit else "unit", "unit"),
-        Column("given", "given", unit, ".9g"),
-        Column("adjusted - given", "difference", finer, signed, factor),
-        Column("sigma", "sigma", finer, or_fixed, factor),
-        Column("r", "r", format="z.3f", unknown=""),
-        Column("w", "w", format="+.2f", unknown="not checked"),
-    )
-    return columns, factor, finer
+    several = {"coordinate": Column()} if len(found.coordinates) > 1 else {}
+    shown = {
+        **({} if unit else {"unit": Column("unit")}),
+        "name": Column(found.kind),
+        "given": Column("given", "", unit, ".9g"),
+        "difference": Column("adjusted - given", "", finer, signed, factor),
+        "sigma": Column("sigma", "", finer, or_fixed, factor),
+        "r": Column("r", format="z.3f", unknown=""),
+        "w": Column("w", format="+.2f", unknown="not checked"),
+    }
+    return columns_of(GIVEN, shown | several), factor, finer

@@ -25,7 +25,7 @@ from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
-from sfm.report.viewer.result_scene import scene_of_result
+from sfm.report.viewer.solution_scene import scene_of_result
 from sfm.result import StageTime
 from sfm.runtime.memory import give_back_memory
 from sfm.runtime.progress import SILENT, Progress

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 from urllib.parse import quote
 
@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from sfm.display import aligned, counted
 from sfm.files.plain_text import csv_text, or_none
+from sfm.files.result_tables import ResultTable
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.figures.plot_data import Plot
 from sfm.report.numbers import significant
@@ -103,6 +104,11 @@ def axes(
 def columns(*titles: str) -> tuple[Column, ...]:
     """Return columns of the page by their titles, those of numbers with ">" before them."""
     return tuple(Column(one.removeprefix(">"), format=str if one[:1] == ">" else None) for one in titles)
+
+
+def columns_of(table: ResultTable, shown: Mapping[str, Column]) -> tuple[Column, ...]:
+    """Return the columns of a table of results, and how a page shows some of them, by their names there."""
+    return tuple(replace(shown.get(name, Column(None)), name=name) for name in table.names_of())
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from sfm.adjustment.quality.statistics import STRONG, Correlation
-from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
+from sfm.files.result_tables import VARIANCE_COMPONENTS
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.interior_parameters import InteriorParameter
@@ -36,6 +36,7 @@ from sfm.report.page import (
     Table,
     axes,
     columns,
+    columns_of,
     facts,
 )
 from sfm.report.phrases import (
@@ -46,6 +47,7 @@ from sfm.report.phrases import (
     words_of_test,
     words_of_weights,
 )
+from sfm.report.tables.csv_files import component_rows
 
 MAX_BINS = 12  # numbers of rays that are listed one by one
 MAX_OPEN = 30  # parameters that are shown without a click
@@ -357,31 +359,23 @@ def _pairs(found: Iterable[Correlation]) -> Table:
     return Table(heads, rows, most=STRONGEST, all_in="summary.json")
 
 
+COMPONENTS = {
+    "observations": Column("observations", format=str),
+    "redundancy": Column("redundancy", format="z.1f"),
+    "sigma0": Column("sigma0", format=".3f", unknown="not known"),
+}
+
+
 def component_parts(f: Findings) -> Iterator[Part]:
-    """Yield the variance components of kinds of observation, cameras and photographs."""
-    s = f.statistics
-    several = (s.kinds,) if len(s.kinds.names) > 1 else ()
+    """Yield the variance components of kinds of observation, cameras and photographs, the largest first."""
     yield Note(
         "Variance components: sigma0 of a group over that stated beforehand; a group far above the others "
         "was measured worse, or does not fit."
     )
-    for name, found in (("kind of observation", several), ("camera", (s.cameras,))):
-        for one in found:
-            yield Folded(f"Variance components by {name}", _components(one, name), in_text=True)
-    yield Folded(
-        f"Variance components of {counted(len(s.photographs.names), 'photograph')}",
-        _components(s.photographs, "photograph"),
-        in_text=True,
-    )
-
-
-def _components(found: VarianceComponents, group: str) -> Table:
-    heads = (
-        Column(group),
-        Column("sigma0", format=".3f", unknown="not known"),
-        Column("redundancy", format="z.1f"),
-        Column("observations", format=str),
-    )
-    order = np.argsort(-np.nan_to_num(found.sigma0), kind="stable")
-    rows = [(found.names[k], found.sigma0[k], found.redundancy[k], int(found.count[k])) for k in order]
-    return Table(heads, rows, all_in="variance_components.csv")
+    rows = sorted(component_rows(f.statistics), key=lambda row: -np.nan_to_num(row[-1]))
+    for kind, name in (("kind", "kind of observation"), ("camera", "camera"), ("photograph", "photograph")):
+        columns = columns_of(VARIANCE_COMPONENTS, {"group": Column(name), **COMPONENTS})
+        some = [row for row in rows if row[0] == kind]
+        if kind != "kind" or len(some) > 1:
+            table = Table(columns, some, all_in=VARIANCE_COMPONENTS.file)
+            yield Folded(f"Variance components by {name}", table, in_text=True)

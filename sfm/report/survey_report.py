@@ -13,6 +13,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import angles_from_rotation
 from sfm.display import agreeing, counted, program_name
+from sfm.files.result_tables import LEFT_OUT
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
@@ -34,6 +35,7 @@ from sfm.report.page import (
     Tile,
     axes,
     columns,
+    columns_of,
     facts,
 )
 from sfm.report.phrases import (
@@ -44,6 +46,7 @@ from sfm.report.phrases import (
     words_of_sigma0,
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
+from sfm.report.tables.csv_files import left_out_rows
 from sfm.report.text import text, wrapped
 from sfm.report.viewer.embedded import Viewer
 from sfm.result import likest_first
@@ -190,11 +193,7 @@ def worked(report: Report) -> Section:
     )
     fixes = agreeing(counts.constraints, "fixes|fix")
     besides = f"Besides, {counted(counts.constraints, 'constraint')} {fixes} the datum."
-    lost = Table(
-        columns("photograph", "reason"),
-        [(one.image, one.reason.text) for one in failed],
-        all_in="left_out.csv",
-    )
+    lost = left_out("photograph", f)
     return Section(
         "Did it work?",
         *_calibrated(f),
@@ -203,6 +202,15 @@ def worked(report: Report) -> Section:
         report.plot("network"),
         key="worked",
     )
+
+
+def left_out(kind: str, f: Findings) -> Table:
+    """Return the photographs or points that are not in the result, with the reason, as in left_out.csv."""
+    rows = [row for row in left_out_rows(f.result) if row[0] == kind]
+    shown = {"name": Column(kind), "reason": Column("reason")}
+    if kind == "point":
+        shown["image_points"] = Column("image points", format=str)
+    return Table(columns_of(LEFT_OUT, shown), rows, most=MAX_LISTED, all_in=LEFT_OUT.file)
 
 
 def _calibrated(f: Findings) -> Iterator[Part]:
@@ -252,11 +260,11 @@ def rejected(report: Report) -> Section:
         parts.append(Paragraph(f"{words} {limits}"))
     if result.left_out:
         seen = sum(one.image_points for one in result.left_out)
-        lost = [(one.point, one.image_points, one.reason.text) for one in result.left_out]
+        lost = left_out("point", f)
         parts += [
             Heading("Measured points that are not in the result"),
-            Paragraph(f"{counted(len(lost), 'point')} with {counted(seen, 'image point')}."),
-            Table(columns("point", ">image points", "reason"), lost, most=MAX_LISTED, all_in="left_out.csv"),
+            Paragraph(f"{counted(len(lost.rows), 'point')} with {counted(seen, 'image point')}."),
+            lost,
         ]
     if result.no_circles:
         why = "uncoded points were left out, their outlines are not the images of a circle in space:"

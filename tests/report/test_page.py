@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import FloatArray
+from sfm.files.result_tables import GIVEN
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
 from sfm.report.html import html
@@ -21,6 +22,8 @@ from sfm.report.page import (
     MAX_ROWS,
     YES,
     Banner,
+    Card,
+    Cards,
     Column,
     Folded,
     Heading,
@@ -30,12 +33,18 @@ from sfm.report.page import (
     Page,
     Paragraph,
     Section,
+    Statement,
+    Subheading,
     Table,
     Tile,
     axes,
+    columns_of,
     facts,
 )
 from sfm.report.pages import PAGES, page_of, write_page
+from sfm.report.text import MAX_ROWS as MAX_TEXT_ROWS
+from sfm.report.text import WIDTH
+from sfm.report.text import text as text_of
 
 EVIL = "<img src=x onerror=alert(1)>"
 
@@ -117,12 +126,57 @@ def small(*parts: object, **options: object) -> Page:
 def test_every_kind_of_part_is_rendered_and_escaped() -> None:
     cells = (Mark(EVIL, "bad"), Link(EVIL, 'a b"/x.html'))
     table = Table((Column(EVIL), Column(EVIL)), [cells], total=("sum", None))
-    parts = (Heading(EVIL), Paragraph(EVIL), Note(EVIL), Folded(EVIL, table, open=True), None)
-    text = html(small(*parts, tiles=(Tile(EVIL, EVIL, EVIL),)))
-    assert EVIL not in text and text.count("&lt;img src=x") == 11
+    words = (Heading(EVIL), Subheading(EVIL), Paragraph(EVIL), Note(EVIL), Statement(EVIL, "bad"))
+    parts = (*words, Folded(EVIL, table, open=True), Cards([Card('a b"/x.jpg', b"jpeg", EVIL, EVIL)]), None)
+    text = html(small(*parts, tiles=(Tile(EVIL, EVIL, EVIL, wide=True),)))
+    assert EVIL not in text and text.count("&lt;img src=x") == 16
+    assert "<h4>&lt;img" in text and '<p class="verdict bad">&lt;img' in text and "<div class=wide>" in text
+    assert '<a href="a%20b%22/x.jpg"><img loading=lazy' in text and "data:image/jpeg;base64,anBlZw==" in text
     assert '<span class="mark bad">&lt;img' in text and 'href="a%20b%22/x.html"' in text
     assert "Empty" not in text and "<details open>" in text
     assert "<tr class=sum><th scope=row>sum</th><td></td></tr>" in text
+
+
+def test_sections_with_a_key_are_linked_at_the_head() -> None:
+    sections = (Section("A", Note("a"), key="a"), Section("B", Note("b")), Section("C", key="c"))
+    text = html(Page("x", "Kind", "Title", Banner("good", "Fine."), sections))
+    assert '<nav><a href="#a">A</a></nav>' in text and '<section id="a">' in text and "#c" not in text
+    assert text.startswith("<!DOCTYPE html>") and "<nav>" not in html(small(Note("a")))
+
+
+def test_a_page_as_text_has_tables_facts_and_words() -> None:
+    long = Column("a column of words"), Column("value", "", "mm", ".1f")
+    parts = (
+        *(Heading("Empty"), Note("a note"), Heading("Rows"), Paragraph("Words of 10 mm. " * 10)),
+        facts([("name", "value " * 20), ("other", "b")]),
+        Table(long, [("a|b", 1.0), ("c\nd", 10.0)] + [("e", 2.0)] * MAX_TEXT_ROWS, all_in="all.csv"),
+        Folded("left out", Paragraph("hidden")),
+        Folded("shown", Table(long, [("x" * 95, 1.0)], total=("sum", 3.0)), in_text=True),
+    )
+    sections = (Section("First", *parts), Section("Not here", Paragraph("gone"), in_text=False))
+    verdict = judge(
+        (remark("photographs_not_drawn", photographs=[EVIL]),), {"good": "g", "fair": "f", "bad": "b"}
+    )
+    lines = text_of(Page("x", "Kind", "Title", verdict, sections)).splitlines()
+    words = "\n".join(lines)
+    assert max(map(len, lines)) <= WIDTH and lines[0].endswith("Title") and EVIL in words
+    for absent in ("Empty", "a note", "hidden", "Not here", "gone"):
+        assert absent not in words
+    assert "\n  a|b                       1.0\n  c d                      10.0\n" in words
+    assert (
+        "\n  and 2 more, in all.csv\n" in words
+        and f"\n  {'x' * 95}:\n    value [mm] 1.0\n  sum: value" in words
+    )
+    assert "\n  name   value value" in words and "\n         value" in words and "10\n" not in words
+
+
+def test_columns_of_a_page_are_named_by_the_table_of_results() -> None:
+    columns = columns_of(GIVEN, {"name": Column("bar"), "w": Column("w", format="+.2f")})
+    assert tuple(one.name for one in columns) == GIVEN.names_of()
+    row = ("kind", "a - b", "length", "m", 1.0, 0.1, 0.1, 0.5, 1.234)
+    table = Table(columns, [row])
+    assert table.header == ("bar", ">w") and list(table.cells) == [("a - b", "+1.23")]
+    assert table.csv.splitlines()[0] == ",".join(GIVEN.names_of())
 
 
 def test_remarks_of_a_verdict_stand_in_the_banner() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from sfm.report.viewer.embedded import packed_scene, sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
-from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.report.viewer.solution_scene import scene_of_stored
 from sfm.solution import Solution
 from tests.places import ROOT
 from tests.synthetic import SIZE_PX, make_network, seed_of

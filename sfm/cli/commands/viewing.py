@@ -64,7 +64,7 @@ def view(
         from sfm.files.globs import why_no_folder
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.view_page import photographs_in, refuse_foreign_page, write_view
-        from sfm.report.viewer.stored_scene import scene_of_stored
+        from sfm.report.viewer.solution_scene import scene_of_stored
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
 

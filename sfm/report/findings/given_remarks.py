@@ -17,10 +17,11 @@ from sfm.adjustment.quality.statistics import component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
 from sfm.conventions import METRES
 from sfm.distributions import normal_ppf
+from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.report.findings.bundle_statistics import Statistics
-from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
+from sfm.report.findings.given_residuals import Given
 from sfm.report.findings.protocol import ControlCoordinate
 from sfm.result import SurveyResult
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +20,12 @@ from sfm.files.covariance_file import write_covariances
 from sfm.files.plain_text import BLOCK
 from sfm.files.ply import write_ply
 from sfm.files.rig_tables import write_rigs
+from sfm.given_residuals import given_rows
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.given_residuals import Given
-from sfm.report.given import given_rows
 from sfm.result import SurveyResult
-from sfm.solution import CONTROL_COVARIANCE, MEASURED
+from sfm.solution import MEASURED
 
 CODED_COLOUR, UNCODED_COLOUR = (20, 140, 60), (120, 120, 120)  # in points.ply
 USUAL_R0 = 2 / 3  # of the largest image radius
@@ -40,8 +40,8 @@ def write_tables(findings: Findings, folder: Path) -> None:
     seen = [g.rays.tolist(), codes, g.angle_deg.tolist(), g.point_rms_px.tolist(), *limiting]
     further = (seen, [one.tolist() for one in (g.image_points, g.image_rms_px, g.hull)], a.residuals)
     tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
-    tables.LEFT_OUT.write_rows(folder, left_out_rows(findings))
-    tables.GIVEN.write_rows(folder, given_table(findings.given, result))
+    tables.LEFT_OUT.write_rows(folder, left_out_rows(result))
+    tables.GIVEN.write_rows(folder, given_rows(findings.given.kinds, result.network, result.unit))
     tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
     tables.RESIDUALS.write_rows(folder, findings.protocol.residuals)
@@ -108,21 +108,12 @@ def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
         yield (names[image], *row, reason or MEASURED)
 
 
-def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
+def left_out_rows(result: SurveyResult) -> Iterable[Sequence[Any]]:
     """Return kind, name, image points and reason of every photograph and point that is not in the result."""
-    for failed in findings.result.failed:
+    for failed in result.failed:
         yield ("photograph", failed.image, None, failed.reason.text)
-    for one in findings.result.left_out:
+    for one in result.left_out:
         yield ("point", one.point, one.image_points, one.reason.text)
-
-
-def given_table(given: Given, result: SurveyResult) -> Iterable[Sequence[object]]:
-    """Return every given value, and of control with correlated coordinates their covariances as values."""
-    for kind in given.kinds:
-        yield from given_rows(kind)
-    if result.adjustment.datum == "control":
-        for name, pair, value in result.network.correlated_control():
-            yield (CONTROL_COVARIANCE, name, pair, f"{result.unit}^2", value, None, None, None, None)
 
 
 def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
@@ -154,7 +145,7 @@ def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
     return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 
 
-def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
+def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
     """Return the variance components of kinds of observation, cameras and photographs."""
     for kind, found in (
         ("kind", statistics.kinds),

@@ -14,7 +14,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import Pictures, cut_pictures
 from sfm.report.viewer.scene import ViewerScene
-from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.report.viewer.solution_scene import scene_of_stored
 from sfm.solution import Solution
 
 if TYPE_CHECKING:

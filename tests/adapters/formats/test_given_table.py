@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adapters.formats.content import Content
 from adapters.formats.given_table import read_given
 from adapters.formats.registry import read_content, write_content
 from sfm.errors import SurveyFileError
+from sfm.files.result_tables import GIVEN
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -84,3 +89,15 @@ def test_a_result_in_a_minimal_datum_is_read_back(tmp_path: Path) -> None:
     assert joint is not None and int((np.diagonal(joint) == 0).sum()) == 7
     fixed = np.diagonal(joint) == 0
     assert not joint[fixed].any() and np.linalg.eigvalsh(joint[~fixed][:, ~fixed]).min() > 0
+
+
+def test_a_result_and_a_converted_one_have_the_same_given_values(tmp_path: Path) -> None:
+    """All that does not need the adjustment: kinds, names, coordinates, units, values and sigmas."""
+    network, truth = make_network(seed_of("two writers"), images=6, points=20)
+    known = KnownPoints.from_arrays(["1", "2", "3", "4"], truth.points[:4], 1e-3)
+    result = run_survey(survey_of(network, truth, control=known, datum={"kind": "control"}))
+    write_tables(findings_of(result), tmp_path)
+    write_content(tmp_path / "converted", "tables", Content(replace(result.solution, network=result.network)))
+    first, second = (GIVEN.read(folder) for folder in (tmp_path, tmp_path / "converted"))
+    assert len(first.texts[0]) == 12 and first.texts == second.texts
+    np.testing.assert_array_equal(first.values, second.values)

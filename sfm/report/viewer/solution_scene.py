@@ -1,6 +1,8 @@
-"""The scene of any stored result: tables, a COLMAP model or another program's; residuals by projection."""
+"""The scene of any solution: a survey's result, tables, a COLMAP model or another program's."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,9 +10,25 @@ from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
+from sfm.report.findings.findings import Findings
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
 from sfm.report.viewer.seen_targets import joined_targets
 from sfm.solution import SeenTargets, Solution
+
+
+def scene_of_result(findings: Findings) -> ViewerScene:
+    """Return what the viewer shows of a survey, with what was measured and rejected in its photographs."""
+    result, a = findings.result, findings.result.adjustment
+    names, check = a.network.points, result.control_check
+    scene = scene_of_stored(
+        replace(result.solution.with_joint_covariance, network=a.network),
+        w=a.standardised if len(a.standardised) == len(a.rejected) else None,
+        rejected=a.rejected,
+        seen_targets=result.seen_targets,
+        residuals=a.residuals,
+    )
+    checked = () if check is None else tuple(names.index(name) for name in check.points if name in names)
+    return replace(scene, exterior_sigma=findings.precision.exterior_deg, control=scene.control or checked)
 
 
 def scene_of_stored(
@@ -19,6 +37,7 @@ def scene_of_stored(
     w: FloatArray | None = None,
     rejected: BoolArray | None = None,
     seen_targets: SeenTargets | None = None,
+    residuals: FloatArray | None = None,
 ) -> ViewerScene:
     """Return what the viewer shows of a result; photographs and points without coordinates are left out.
 
@@ -27,6 +46,7 @@ def scene_of_stored(
         w: Baarda's w of its image points, where known, (k, 2).
         rejected: which of its image points took no part; none if not given, (k,).
         seen_targets: outlines of its targets and what else was seen in its photographs, where known.
+        residuals: computed minus measured, px, (k, 2); by projection if not given.
     """
     network, estimate = stored.network, stored.estimate
     seen = network.image_points
@@ -35,7 +55,7 @@ def scene_of_stored(
     w = np.full((len(seen), 2), np.nan) if w is None else w
     kept = np.flatnonzero(estimate.oriented[seen.image] & estimate.determined[seen.point])
     kept = kept[np.lexsort((seen.image[kept], seen.point[kept]))]
-    v = _residuals(stored, seen)[kept]
+    v = (_residuals(stored, seen) if residuals is None else residuals)[kept]
     point = np.searchsorted(determined, seen.point[kept])
     photo = np.searchsorted(oriented, seen.image[kept])
     used = ~rejected[kept]
