@@ -139,7 +139,7 @@ def _camera(one: InteriorDifference, second: str) -> tuple[Part | None, ...]:
 
 
 def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
-    """Return what comparison.json holds."""
+    """Return the content of comparison.json."""
     verdict = verdict_of_comparison(found)
     return {
         "results": found.names,

@@ -77,7 +77,7 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
     if not rows:
         return
     yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
-    what = counted(len(found.names), "photograph" if found.kind in (CENTRE, ROTATION) else found.kind)
+    what = counted(len(found.names), _named(found))
     if not found.checked and found.kind == "control point":
         yield Paragraph(f"{what} held fixed: adjusted coordinates are those given, without residuals.")
         return
@@ -93,6 +93,11 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
         yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
 
 
+def _named(found: GivenResiduals) -> str:
+    """Return what the names of values are names of."""
+    return "photograph" if found.kind in (CENTRE, ROTATION) else found.kind
+
+
 def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
     """Return the columns of given.csv; factor and unit of differences where all values have one unit."""
     units = {unit for row in found.units for unit in row}
@@ -103,7 +108,7 @@ def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...
     several = {"coordinate": Column()} if len(found.coordinates) > 1 else {}
     shown = {
         **({} if unit else {"unit": Column("unit")}),
-        "name": Column(found.kind),
+        "name": Column(_named(found)),
         "given": Column("given", "", unit, ".9g"),
         "difference": Column("adjusted - given", "", finer, signed, factor),
         "sigma": Column("sigma", "", finer, or_fixed, factor),

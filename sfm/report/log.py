@@ -149,7 +149,7 @@ class SurveyLog:
 
 
 def result_entries(findings: Findings) -> dict[str, Any]:
-    """Return the figures of a result by which a log or a table of surveys tells it; None where unknown."""
+    """Return the figures of a result in a log or a table of surveys; None where unknown."""
     result = findings.result
     a, both = result.adjustment, result.comparison
     return {

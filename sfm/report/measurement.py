@@ -265,7 +265,7 @@ def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, floa
 
 
 def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
-    """Return what measurement.json holds."""
+    """Return the content of measurement.json."""
     alignment, best_fit = None, None
     if found.alignment is not None:
         fit = found.alignment.fitted

@@ -26,11 +26,6 @@ def fixed(value: float, decimals: int) -> str:
     return f"{float(value):z.{decimals}f}"
 
 
-def plus(value: float, decimals: int) -> str:
-    """Write a number with its sign and so many decimals."""
-    return f"{value:+.{decimals}f}"
-
-
 def scientific(value: float, decimals: int) -> str:
     """Write a number with an exponent and so many decimals before it."""
     return f"{value:.{decimals}e}"
@@ -68,9 +63,9 @@ def or_fixed(sigma: float) -> str:
 
 def alike(values: Sequence[float], digits: int = 3) -> tuple[str, ...]:
     """Write numbers of one quantity with significant digits, all with an exponent if one has it."""
-    told = tuple(significant(value, digits) for value in values)
-    if not any("e" in one for one in told):
-        return told
+    written = tuple(significant(value, digits) for value in values)
+    if not any("e" in one for one in written):
+        return written
     return tuple(scientific(value, digits - 1) if np.isfinite(value) else "not known" for value in values)
 
 

@@ -44,7 +44,7 @@ class _Summary(Content):
     survey: Name
 
 
-def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs: bool = True) -> None:
+def refuse_other_origin(out: Path, origin: Origin, *, survey: str = "", photographs: bool = True) -> None:
     """Raise OutputError where a folder has the result of another survey file or of other photographs.
 
     A result that does not state its origin, as one that a script wrote, is another's if it has another name,
@@ -52,7 +52,7 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
 
     Args:
         out: the folder.
-        own: origin of what is to be written there.
+        origin: of what is to be written there.
         survey: its name, where it is known.
         photographs: whether it is of photographs.
     """
@@ -67,7 +67,7 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
         except SurveyFileError:
             images = ()
         other_name = bool(survey) and name != survey
-        present = any((own.images / one).is_file() for one in images)
+        present = any((origin.images / one).is_file() for one in images)
         if other_name or (photographs and not present):
             of = f"{counted(len(images), 'photograph')} ({listed(images)})"
             what = of if images else "no table of photographs"
@@ -77,8 +77,8 @@ def refuse_other_origin(out: Path, own: Origin, *, survey: str = "", photographs
             )
         return
     for what, there, here in (
-        ("the survey", earlier.file, own.file),
-        ("the photographs in", earlier.images, own.images),
+        ("the survey", earlier.file, origin.file),
+        ("the photographs in", earlier.images, origin.images),
     ):
         if os.path.realpath(there) != os.path.realpath(here):
             raise OutputError(

@@ -8,6 +8,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import BoolArray, FloatArray
 from sfm.files.covariance_file import ARRAYS, POINTS_NAME, write_covariance
 from sfm.files.covariance_file import NAME as POINT_COVARIANCE
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
@@ -16,9 +20,12 @@ from sfm.files.rig_tables import MOMENTS, MOUNTS
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
+from sfm.report.figures.plot_data import PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
-from sfm.report.figures.plotted import plot_data
+from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.findings import Findings, with_remark
+from sfm.report.findings.precision import adjusted_sigmas, root_mean_square
+from sfm.report.numbers import finer_unit
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
@@ -74,7 +81,7 @@ def write_result(
         The path of report.html.
 
     Raises:
-        OutputError: the folder cannot be written, or holds something else than an earlier result.
+        OutputError: the folder cannot be written, or contains something else than an earlier result.
     """
     out = Path(out)
     refuse_foreign_folder(out)
@@ -130,6 +137,56 @@ def write_result(
 
 
 def folder_name(name: str) -> str:
-    """Return the name of the folder of a survey's result: its own, as far as all disks take it."""
+    """Return the name of the folder of a survey's result: that of the survey, as far as all disks take it."""
     kept = re.sub(r"[^\w.\-]+", "_", name).encode()[:MAX_FOLDER_BYTES].decode(errors="ignore")
     return kept.strip("._-") or "survey"
+
+
+def plot_data(findings: Findings) -> PlotData:
+    """Return what the plots of a report show."""
+    adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
+    network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
+    seen = network.image_points.select(used)
+    sigma = np.array([root_mean_square(one) for one in adjusted_sigmas(adjustment.covariance.points)])
+    factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
+    centre = np.array([camera.frame[:2] for camera in estimate.cameras])
+    return PlotData(
+        unit=findings.result.length_unit,
+        images=network.images,
+        position=estimate.position,
+        rotation=estimate.rotation,
+        points=estimate.points,
+        cameras=tuple(PlotCamera(one.name, one.camera.c_px, one.camera.size_px) for one in interior.families),
+        camera=interior.family,
+        image=seen.image,
+        xy=seen.xy,
+        from_centre=seen.xy - centre[network.camera[seen.image]],
+        residuals=adjustment.residuals[used],
+        standardised=_standardised_residuals(adjustment),
+        image_rms_px=geometry.image_rms_px,
+        image_points=geometry.image_points,
+        rms_px=adjustment.rms_px,
+        sigma=sigma * factor,
+        sigma_unit=unit,
+        projection=tuple(
+            _projection(adjustment, interior.family == f) for f in range(len(interior.families))
+        ),
+    )
+
+
+def _projection(adjustment: Adjustment, photographs: BoolArray) -> ProjectionMap | None:
+    """Return the projection uncertainty of the camera of photographs, (m,); None where it was held."""
+    found = projection_of(adjustment, photographs)
+    return None if found is None else ProjectionMap(*found)
+
+
+def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
+    """Return accepted residuals over their standard deviations a posteriori, shape (2k,).
+
+    Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
+    """
+    used = ~adjustment.rejected
+    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
+    r = adjustment.redundancy_numbers[used]
+    sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
+    return np.asarray((adjustment.residuals[used] / sigma).ravel())

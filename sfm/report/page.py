@@ -121,7 +121,7 @@ class Table:
     facts: bool = False  # names and words without a header
     total: Sequence[Any] | None = None  # a last row, of sums or means, on the page
     most: int = MAX_ROWS  # rows on the page
-    all_in: str = ""  # the file with all rows, where that is not its own CSV file
+    all_in: str = ""  # the file with all rows, where that is another one than `file`
     kind: ClassVar[str] = "table"
 
     @property

@@ -60,7 +60,7 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
         Path of the page.
 
     Raises:
-        OutputError: the folder holds something else or cannot be written, or another run is writing it.
+        OutputError: the folder contains something else or cannot be written, or another run is writing it.
     """
     return write_declared(page_of(found, **beside), out, also=also)
 

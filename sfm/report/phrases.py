@@ -24,8 +24,8 @@ NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that
 def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
     """Return sigma0 and what it is to the stated one, with the image points where they show another."""
     times = f"{sigma0.px / sigma0.stated_px:.3f} times the {significant(sigma0.stated_px)} px expected"
-    own = f"image points by themselves {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
-    return f"{sigma0.px:.4f} px", f"{times}; {own}" if sigma0.differs else times
+    alone = f"image points by themselves {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
+    return f"{sigma0.px:.4f} px", f"{times}; {alone}" if sigma0.differs else times
 
 
 def words_of_neighbours(a: Adjustment) -> str:
@@ -45,7 +45,7 @@ def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
 
     Args:
         test: of all observations, or of a kind.
-        adjustment: tells what sigma_px was; None to say a factor.
+        adjustment: with its sigma_px; None to write a factor.
     """
     if test.passed is None:
         return f"{test.of}: not tested, {_why_untested(test)}"
@@ -69,7 +69,7 @@ def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
     """Return the stated standard deviations with which a test would pass, as sigma_px where that decides."""
     factor = float(np.sqrt(test.statistic / test.redundancy))
     if a is not None and a.observations == 2 * int((~a.rejected).sum()):
-        measured = a.stated_px**2 - a.sigma_px**2  # what targets state of their own; sigma_px comes on top
+        measured = a.stated_px**2 - a.sigma_px**2  # what targets state; sigma_px is added
         left = (factor * a.stated_px) ** 2 - measured
         if 0 <= measured < 0.5 * a.stated_px**2 and left > 0:
             return f"sigma_px = {significant(float(np.sqrt(left)))}"

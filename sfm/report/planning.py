@@ -78,7 +78,7 @@ def page(plan: Plan) -> Page:
     axis = Note(
         "Azimuth from +X towards +Y and elevation: where the camera looks. Roll: counter-clockwise about "
         "that direction, 0 upright. Distance: mean of the points shown, along the axis. Focus: one for all "
-        "photographs, as a calibration holds for one focus only; unless it was given, as sharp at the "
+        "photographs, as a calibration is valid for one focus only; unless it was given, as sharp at the "
         "nearest point as at the farthest."
     )
     rows = [(name[0].upper() + name[1:], value) for name, value in figures(plan)]
@@ -310,7 +310,7 @@ def _gain_in_words(one: Contribution) -> str:
 
 
 def _summary(plan: Plan) -> dict[str, Any]:
-    """Return what plan.json holds."""
+    """Return the content of plan.json."""
     p = plan.prediction
     found = {c.camera: c for c in plan.calibrations}
     return {

@@ -30,7 +30,6 @@ from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
-from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
 from sfm.report.numbers import (
@@ -42,7 +41,7 @@ from sfm.report.numbers import (
     to_precision,
     with_exponent,
 )
-from sfm.report.output import WRITTEN, write_result
+from sfm.report.output import WRITTEN, plot_data, write_result
 from sfm.report.pages import html_of
 from sfm.report.phrases import words_left_out, words_of_precision
 from sfm.report.survey_report import text_report

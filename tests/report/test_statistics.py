@@ -32,7 +32,6 @@ from sfm.conventions import angles_from_rotation
 from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
-from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.checks import (
     LISTED,
@@ -46,6 +45,7 @@ from sfm.report.findings.given_residuals import given_of
 from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
 from sfm.report.numbers import signed
+from sfm.report.output import plot_data
 from sfm.report.pages import html_of
 from sfm.report.phrases import (
     words_of_check,

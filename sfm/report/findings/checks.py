@@ -31,7 +31,7 @@ class ObservationCounts:
     exterior: int  # observed parameters of exterior orientation
     interior: int  # observed parameters of interior orientation
     scale_bars: int
-    further: int  # of other kinds, less parameters of their own
+    further: int  # of other kinds, less the parameters that these add
     constraints: int  # of the datum
     total: int  # without the constraints
 
@@ -75,12 +75,12 @@ class LongestResidual:
 def sigma0_of(result: SurveyResult) -> Sigma0:
     """Return sigma0 of all observations, and of the image points by themselves.
 
-    The latter is by the variance component of the image points; without redundancy of their own it is sigma0
+    The latter is by the variance component of the image points; without redundancy of theirs it is sigma0
     of all observations.
     """
     a = result.adjustment
-    own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
-    ratio = float(own if np.isfinite(own) else a.sigma0_px / a.stated_px)
+    factor = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
+    ratio = float(factor if np.isfinite(factor) else a.sigma0_px / a.stated_px)
     size = np.array([camera.pixel_mm.mean() for camera in a.estimate.cameras])
     used = a.network.camera[a.network.image_points.image[~a.rejected]]
     return Sigma0(a.sigma0_px, ratio, a.stated_px, float(size[used].mean()) if len(used) else float("nan"))

@@ -10,7 +10,7 @@ Studio.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ from sfm.result import ControlCheck, SurveyResult
 EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
 
 
-@dataclass(frozen=True)
-class ControlCoordinate:
+class ControlCoordinate(NamedTuple):
     """A coordinate of control or of a check point, before and after."""
 
     use: str  # control | check
@@ -142,71 +141,63 @@ def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
     if found is None:
         return []
     points = a.network.control.point
-    posterior = np.sqrt(np.maximum(np.einsum("nii->ni", a.covariance.points[points]), 0.0))
+    xyz, posterior = a.estimate.points[points], _sigmas(a.covariance.points[points])
+    numbers = np.stack([found.given, found.sigma, xyz, posterior, found.difference, found.w], axis=-1)
     return [
-        ControlCoordinate(
-            "control",
-            name,
-            axis,
-            *(float(found.given[k, c]), float(found.sigma[k, c])),
-            *(float(a.estimate.points[points[k], c]), float(posterior[k, c])),
-            *(float(found.difference[k, c]), float(found.w[k, c])),
-        )
-        for k, name in enumerate(found.names)
-        for c, axis in enumerate("XYZ")
-        if np.isfinite(found.sigma[k, c])
+        ControlCoordinate("control", found.names[k], "XYZ"[c], *numbers[k, c].tolist())
+        for k, c in np.argwhere(np.isfinite(found.sigma))
     ]
 
 
 def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinate]:
+    """Return the control that took no part, beside the points that were placed on it."""
     if check is None:
         return []
-    place = {a.network.points[j]: k for k, j in enumerate(a.network.control.point)}
-    rows = []
-    for n, name in enumerate(check.points):
-        k = place.get(name)
-        if k is None:
-            continue
-        j = a.network.control.point[k]
-        prior = np.sqrt(np.diagonal(a.network.control.covariance[k]))
-        posterior = np.sqrt(np.maximum(np.diagonal(a.covariance.points[j]), 0.0))
-        for c, axis in enumerate("XYZ"):
-            difference = float(check.differences[n, c])
-            expected = float(np.hypot(prior[c], posterior[c]))
-            known = float(a.network.control.xyz[k, c])
-            rows.append(
-                ControlCoordinate(
-                    *("check", name, axis, known, float(prior[c]), known + difference),
-                    *(float(posterior[c]), difference, difference / expected if expected > 0 else np.nan),
-                )
-            )
-    return rows
+    control = a.network.control
+    place = {a.network.points[j]: k for k, j in enumerate(control.point)}
+    rows = [(n, place[name]) for n, name in enumerate(check.points) if name in place]
+    prior, posterior = _sigmas(control.covariance), _sigmas(a.covariance.points[control.point])
+    placed = [(check.points[n], k, check.differences[n]) for n, k in rows]
+    return [
+        _check(name, c, given, prior[k, c], given + d[c], posterior[k, c], d[c])
+        for name, k, d in placed
+        for c, given in enumerate(control.xyz[k])
+    ]
 
 
 def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
     """Return the coordinates that check a datum of control, with the test of their differences."""
     a = result.adjustment
-    if a.datum != "control":
-        return ()
-    rows = []
     place = {name: j for j, name in enumerate(a.network.points)}
-    for one in result.check_points:
-        j = place.get(one.point)
-        if j is None:
-            continue
-        posterior = np.sqrt(np.maximum(np.diagonal(a.covariance.points[j]), 0.0))
-        for c in np.flatnonzero(np.isfinite(one.xyz)):
-            adjusted, known = float(a.estimate.points[j, c]), float(one.xyz[c])
-            prior, after = float(one.sigma[c]), float(posterior[c])
-            expected = float(np.hypot(prior, after))
-            test = (adjusted - known) / expected if expected > 0 else np.nan
-            rows.append(
-                ControlCoordinate(
-                    *("check", one.point, "XYZ"[c], known, prior, adjusted, after),
-                    *(adjusted - known, test),
-                )
-            )
-    return tuple(rows)
+    posterior = _sigmas(a.covariance.points)
+    points = a.estimate.points
+    return tuple(
+        _check(one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given)
+        for one in (result.check_points if a.datum == "control" else ())
+        if (j := place.get(one.point)) is not None
+        for c, given in enumerate(one.xyz)
+        if np.isfinite(given)
+    )
+
+
+def _check(point: str, c: int, given: float, prior: float, *found: float) -> ControlCoordinate:
+    """Return a coordinate that took no part, and its difference over the standard deviation of that.
+
+    Args:
+        point: its name.
+        c: which of its coordinates.
+        given: the coordinate.
+        prior: its standard deviation.
+        found: the adjusted coordinate, its standard deviation, and adjusted minus given.
+    """
+    _, posterior, difference = found
+    expected = float(np.hypot(prior, posterior))
+    test = difference / expected if expected > 0 else np.nan
+    return ControlCoordinate("check", point, "XYZ"[c], *map(float, (given, prior, *found, test)))
+
+
+def _sigmas(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0)))
 
 
 def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:
@@ -223,9 +214,9 @@ def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ..
         ("other points", ~coded & ~control),
     )
     return tuple(
-        (name, int(own.sum()), float(rays[own].mean()), int(rays[own].min()))
-        for name, own in kinds
-        if own.any()
+        (name, int(some.sum()), float(rays[some].mean()), int(rays[some].min()))
+        for name, some in kinds
+        if some.any()
     )
 
 
@@ -264,9 +255,9 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
     for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         free = np.flatnonzero(camera.free)[: len(Q)]
         names = [camera.names[s] for s in free]
-        own = np.flatnonzero(camera.plays(Role.RADIAL)[free])
-        for first in range(len(own)):
-            some = own[first:]
+        radial = np.flatnonzero(camera.plays(Role.RADIAL)[free])
+        for first in range(len(radial)):
+            some = radial[first:]
             value = camera.parameters[free[some]]
             scale = np.sqrt(np.diagonal(Q)[some])
             if not (scale > 0).all() or a.redundancy < 1:

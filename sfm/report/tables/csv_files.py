@@ -45,7 +45,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
     tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
     tables.RESIDUALS.write_rows(folder, findings.protocol.residuals)
-    tables.CONTROL_POINTS.write_rows(folder, _control_rows(findings))
+    tables.CONTROL_POINTS.write_rows(folder, findings.protocol.control)
     tables.INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
     tables.EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
     for table, names, covariance in (
@@ -74,7 +74,7 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """
     given = dict(findings.result.balance_radius_mm)
     a = findings.result.adjustment
-    for camera, own in zip(a.estimate.cameras, a.covariance.interior, strict=True):
+    for camera, covariance in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         if camera.model != BALANCED_MODEL:
             continue
         half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
@@ -84,8 +84,8 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
         except GeometryError:
             continue
         Q = np.zeros((len(camera.names), len(camera.names)))
-        if len(own):
-            Q[np.ix_(camera.free, camera.free)] = own
+        if len(covariance):
+            Q[np.ix_(camera.free, camera.free)] = covariance
         order = [camera.names.index(name) for name, _ in from_balanced(rows)]
         inverse = np.linalg.inv(brown_by_balanced(rows))
         variance = np.diagonal(inverse @ Q[np.ix_(order, order)] @ inverse.T)
@@ -154,14 +154,6 @@ def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
     ):
         for g, name in enumerate(found.names):
             yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
-
-
-def _control_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    for one in findings.protocol.control:
-        yield (
-            *(one.use, one.point, one.coordinate, one.given, one.prior),
-            *(one.adjusted, one.posterior, one.difference, one.test),
-        )
 
 
 def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:

@@ -1,7 +1,4 @@
-"""summary.json: the figures of a result for programs.
-
-The parts of summary.json on the other adjuster and the other pipeline.
-"""
+"""summary.json: the figures of a result for programs."""
 
 from __future__ import annotations
 
@@ -14,16 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import CoordinateTest
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.report.findings.bundle_statistics import spread
+from sfm.report.findings.bundle_statistics import Spread, spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.precision import point_sigma
 from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of
-from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
+from sfm.report.phrases import words_of_test, words_of_weights
 from sfm.result import SurveyResult
 
 
@@ -31,6 +30,13 @@ def write_summary(findings: Findings, folder: Path) -> None:
     """Write summary.json into an existing folder."""
     text = json.dumps(summary(findings), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+
+
+def summary(findings: Findings) -> dict[str, Any]:
+    """Return the content of summary.json: plain values only, None for what is not known or not finite."""
+    names: list[str] = []
+    figures: dict[str, Any] = _finite(_figures(findings), "", names)
+    return figures | {"not_finite": names}
 
 
 def _finite(value: Any, name: str, names: list[str]) -> Any:
@@ -51,81 +57,58 @@ def _finite(value: Any, name: str, names: list[str]) -> Any:
     return value
 
 
-def summary(findings: Findings) -> dict[str, Any]:
-    """Return what summary.json holds: plain values only, None for what is not known or not finite."""
-    names: list[str] = []
-    figures: dict[str, Any] = _finite(_figures(findings), "", names)
-    return figures | {"not_finite": names}
-
-
 def _figures(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result, some of which may not be finite."""
-    result, verdict = findings.result, findings.verdict
-    adjustment, given = result.adjustment, findings.given
+    result, verdict, given = findings.result, findings.verdict, findings.given
+    a = result.adjustment
     coded = int((result.code >= 0).sum())
     return {
-        "survey": result.survey,
-        "unit": result.unit,
-        "length_unit": result.length_unit,
+        **values_of(result, "survey unit length_unit"),
         "verdict": {
             "level": verdict.level,
             "headline": verdict.headline,
             "remarks": [one.as_dict() for one in verdict.remarks],
         },
-        "converged": adjustment.converged,
-        "iterations": adjustment.iterations,
-        "sigma0_at_start": or_none(adjustment.start_sigma0),
+        **values_of(a, "converged iterations"),
+        "sigma0_at_start": or_none(a.start_sigma0),
         "images": {
-            "used": len(adjustment.network.images),
+            "used": len(a.network.images),
             "total": result.images_total,
             "failed": [{"image": f.image, "reason": f.reason.as_dict()} for f in result.failed],
         },
         "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
         "observations": {
-            "used": int((~adjustment.rejected).sum()),
-            "rejected": int(adjustment.rejected.sum()),
+            "used": int((~a.rejected).sum()),
+            "rejected": int(a.rejected.sum()),
             "not_in_result": result.unused_image_points,
         },
         "left_out": [
-            {"point": one.point, "image_points": one.image_points, "reason": one.reason.as_dict()}
-            for one in result.left_out
+            values_of(one, "point image_points") | {"reason": one.reason.as_dict()} for one in result.left_out
         ],
-        "unknowns": adjustment.unknowns,
-        "redundancy": adjustment.redundancy,
+        **values_of(a, "unknowns redundancy"),
         "datum": {
-            "kind": adjustment.datum,
-            "points": _datum_points(adjustment),
-            "defect": adjustment.defect,
-            "expected_defect": adjustment.expected_defect,
-            "undetermined": list(adjustment.undetermined),
+            "kind": a.datum,
+            "points": None if a.datum_points is None else list(compress(a.network.points, a.datum_points)),
+            **values_of(a, "defect expected_defect undetermined"),
         },
-        "sigma0": or_none(adjustment.sigma0),
-        "sigma0_px": or_none(adjustment.sigma0_px),
-        "error_correlation": _error_correlation(adjustment),
-        "rms_px": or_none(adjustment.rms_px),
-        "max_residual_px": or_none(adjustment.max_residual_px),
+        **values_of(a, "sigma0 sigma0_px"),
+        "error_correlation": _error_correlation(a),
+        **values_of(a, "rms_px max_residual_px"),
         "cameras": [
-            {
-                "name": camera.name,
-                "model": camera.model,
-                "size_px": list(camera.size_px),
-                "pixel_mm": [or_none(value) for value in camera.pixel_mm],
+            values_of(camera, "name model size_px pixel_mm")
+            | {
                 "parameters": {
                     name: {"value": or_none(value), "sigma": or_none(sigma), "unit": unit}
                     for name, value, sigma, unit in zip(
-                        camera.names,
-                        camera.parameters,
-                        findings.interior.sigmas[index],
-                        camera.units,
-                        strict=True,
+                        camera.names, camera.parameters, sigmas, camera.units, strict=True
                     )
-                },
+                }
             }
-            for index, camera in enumerate(adjustment.estimate.cameras)
+            for camera, sigmas in zip(a.estimate.cameras, findings.interior.sigmas, strict=True)
         ],
         "rigs": summary_of_rigs(findings.rigs),
-        "statistics": summary_of_statistics(findings),
-        "consistency": summary_of_consistency(findings),
+        "statistics": _statistics(findings),
+        "consistency": _consistency(findings),
         "geometry": _geometry(findings),
         "control": _control(findings),
         "scale_bars": _scale_bars(findings),
@@ -138,8 +121,8 @@ def _figures(findings: Findings) -> dict[str, Any]:
         },
         "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
-        "comparison": summary_of_comparison(result),
-        "baseline": summary_of_baseline(result),
+        "comparison": _comparison(result),
+        "baseline": _baseline(result),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
 
@@ -152,11 +135,94 @@ def _error_correlation(a: Adjustment) -> dict[str, float] | None:
     return {"alone_px": alone, "common_px": common, "length_px": a.error_correlation.length_px}
 
 
-def _datum_points(adjustment: Adjustment) -> list[str] | None:
-    """Return the names of chosen datum points, None where all points carry the datum."""
-    if adjustment.datum_points is None:
-        return None
-    return list(compress(adjustment.network.points, adjustment.datum_points))
+def _statistics(findings: Findings) -> dict[str, Any]:
+    """Return the tests, reliability, components, correlations and significance of a result."""
+    result, found, sigma0, counts = findings.result, findings.statistics, findings.sigma0, findings.counts
+    return {
+        "sigma0_ratio": or_none(sigma0.ratio),
+        **values_of(sigma0, "image_points_px stated_px"),
+        "weight_factor": result.adjustment.weight_factor,
+        "weights": words_of_weights(result),
+        "global_tests": [
+            {
+                "of": test.of,
+                "vPv": or_none(test.statistic),
+                **values_of(test, "redundancy lower upper passed"),
+                "words": words_of_test(test, result.adjustment),
+            }
+            for test in found.global_tests
+        ],
+        "w_test": _coordinate_test(found.w, found.largest_w),
+        "tau_test": _coordinate_test(found.tau, found.largest_tau),
+        "observations": {
+            "image_coordinates": counts.image,
+            **values_of(counts, "control exterior interior scale_bars further constraints total"),
+        },
+        "redundancy_number": {
+            "sum": or_none(found.redundancy_sum),
+            "mean": or_none(found.redundancy.mean),
+            "min": or_none(found.redundancy.smallest),
+        },
+        "minimal_detectable_bias_px": _median_and_max(found.minimal_bias),
+        "external_reliability_sigmas": _median_and_max(found.external),
+        "sigma0_by_kind": _components(found.kinds),
+        "sigma0_by_camera": _components(found.cameras),
+        "sigma0_by_photograph": _components(found.photographs),
+        "correlations": [values_of(pair, "first second value") for pair in found.correlations],
+        "orientation_correlations": [
+            {
+                "parameter": one.parameter,
+                "with": one.part,
+                "image": one.image,
+                "value": one.largest,
+                "photographs": dict(one.counts),
+            }
+            for one in result.orientation_correlations
+        ],
+        "significance": [
+            values_of(test, "camera parameter t probability significant") for test in found.significance
+        ],
+        "not_significant": [values_of(test, "camera parameter t") for test in found.not_significant],
+    }
+
+
+def _consistency(findings: Findings) -> dict[str, Any]:
+    """Return what the tests of points, photographs and the format have found."""
+    found = findings.consistency
+    return {
+        "large_residuals": list(found.large),
+        "doubtful": [values_of(one, "point rejected instead misfit other") for one in found.doubtful],
+        "uneven_photographs": found.uneven and values_of(found.uneven, "probability worst largest median"),
+        "other_solutions": [
+            {
+                **values_of(one, "camera c unit reflected"),
+                "moved_over_sigma": or_none(one.moved),
+                "vPv_ratio": or_none(one.vPv),
+            }
+            for one in findings.result.other_solutions
+        ],
+        "given_against_free_network": [
+            {
+                "what": one.what,
+                "chi2": or_none(one.statistic),
+                "degrees_of_freedom": one.dof,
+                "probability": or_none(one.probability),
+            }
+            for one in findings.result.given_tests
+        ],
+    }
+
+
+def _median_and_max(values: Spread) -> dict[str, float | None]:
+    return {"median": or_none(values.median), "max": or_none(values.largest)}
+
+
+def _coordinate_test(test: CoordinateTest, largest: float) -> dict[str, Any]:
+    return values_of(test, "alpha critical tested beyond expected") | {"max": or_none(largest)}
+
+
+def _components(components: VarianceComponents) -> dict[str, float | None]:
+    return {name: or_none(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}
 
 
 def _geometry(findings: Findings) -> dict[str, Any]:
@@ -225,7 +291,7 @@ def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, An
     ]
 
 
-def summary_of_comparison(result: SurveyResult) -> dict[str, Any] | None:
+def _comparison(result: SurveyResult) -> dict[str, Any] | None:
     """Return the comparison with the other adjuster, None without one."""
     both = result.comparison
     if both is None:
@@ -257,7 +323,7 @@ def summary_of_comparison(result: SurveyResult) -> dict[str, Any] | None:
     }
 
 
-def summary_of_baseline(result: SurveyResult) -> dict[str, Any] | None:
+def _baseline(result: SurveyResult) -> dict[str, Any] | None:
     """Return the comparison with the other pipeline, None without one."""
     found = result.baseline
     if found is None:
@@ -277,19 +343,19 @@ def summary_of_baseline(result: SurveyResult) -> dict[str, Any] | None:
 
 
 def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
-    """Return what files of a result or a plan say of rigs: every mount with its standard deviations."""
+    """Return where the cameras of rigs are mounted."""
+
+    def stated(values: Any) -> dict[str, Any]:
+        return {name: {"value": or_none(value), "sigma": or_none(sigma)} for name, value, sigma, _ in values}
+
     return [
         {
-            "name": rig.name,
-            "reference": rig.reference,
-            "moments": rig.moments,
+            **values_of(rig, "name reference moments"),
             "mounts": [
-                {"camera": mount.camera}
-                | {name: _value(*one) for name, *one, is_length in mount.values if is_length}
-                | {
-                    "rotation_deg": {
-                        name: _value(*one) for name, *one, is_length in mount.values if not is_length
-                    }
+                {
+                    "camera": mount.camera,
+                    **stated(one for one in mount.values if one[3]),
+                    "rotation_deg": stated(one for one in mount.values if not one[3]),
                 }
                 for mount in rig.mounts
             ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -12,8 +13,11 @@ from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import Findings
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
-from sfm.report.viewer.seen_targets import joined_targets
+from sfm.result import likest_first
 from sfm.solution import SeenTargets, Solution
+
+SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
+UNUSED = "measured, not part of the result"
 
 
 def scene_of_result(findings: Findings) -> ViewerScene:
@@ -61,12 +65,12 @@ def scene_of_stored(
     used = ~rejected[kept]
     ellipse, marks = np.full((len(kept), 3), np.nan), Marks.none()
     if seen_targets is not None:
-        own = np.flatnonzero(estimate.oriented[seen_targets.image])
+        there = np.flatnonzero(estimate.oriented[seen_targets.image])
         shown = SeenTargets(
-            np.searchsorted(oriented, seen_targets.image[own]),
-            seen_targets.xy[own],
-            seen_targets.ellipse[own],
-            tuple(seen_targets.reason[k] for k in own),
+            np.searchsorted(oriented, seen_targets.image[there]),
+            seen_targets.xy[there],
+            seen_targets.ellipse[there],
+            tuple(seen_targets.reason[k] for k in there),
         )
         ellipse, marks = joined_targets(shown, photo, seen.xy[kept])
     rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, ellipse)
@@ -145,3 +149,35 @@ def _rms(index: IntArray, v: FloatArray, count: int) -> FloatArray:
     total = np.bincount(index[known], weights=(v[known] ** 2).sum(axis=1), minlength=count)
     mean = np.divide(total, 2 * number, out=np.full(count, np.nan), where=number > 0)
     return np.asarray(np.sqrt(mean))
+
+
+def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
+    """Return the ellipse of each image point, NaN without one, (k, 3), and what else was seen.
+
+    Args:
+        seen: in the same photographs.
+        image: photograph of each image point, (k,).
+        xy: where it is, px, (k, 2).
+    """
+    ellipse = np.full((len(xy), 3), np.nan)
+    left = np.ones(len(seen.image), dtype=bool)
+    for i in np.unique(seen.image).tolist():
+        rows = np.flatnonzero(image == i)
+        measured = np.flatnonzero((seen.image == i) & seen.measured)
+        used = _join(seen.xy[measured], xy[rows])
+        ellipse[rows[used[used >= 0]]] = seen.ellipse[measured[used >= 0]]
+        left[measured[used >= 0]] = False
+    kept = np.flatnonzero(left)
+    kept = kept[np.argsort(seen.image[kept], kind="stable")]
+    words = [seen.reason[k] or UNUSED for k in kept.tolist()]
+    reasons = {word: number for number, word in enumerate(likest_first(set(words)))}
+    number = np.array([reasons[word] for word in words], dtype=np.int64)
+    return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
+
+
+def _join(targets: FloatArray, xy: FloatArray) -> IntArray:
+    """Return for each target of a photograph the image point that was made of it, -1 for none, (k,)."""
+    if not len(targets) or not len(xy):
+        return np.full(len(targets), -1, dtype=np.int64)
+    distance, nearest = cKDTree(xy).query(targets, distance_upper_bound=SAME_PX)
+    return np.where(np.isfinite(distance), nearest, -1)
