@@ -14,7 +14,7 @@ from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import finer_unit, fixed, significant
+from sfm.report.numbers import finer_unit, fixed, length_of, significant
 from sfm.report.page import YES, Column, Folded, Note, Page, Part, Section, Table, axes, values_of
 
 PICTURE = (
@@ -202,8 +202,7 @@ def words_of_scale(found: ResultComparison) -> str:
 def largest_difference(found: ResultComparison) -> str:
     """Return the largest difference of a point with its unit."""
     longest = _longest(found.point_difference)
-    factor, unit = finer_unit(found.unit, longest)
-    return f"{significant(longest * factor)} {unit or 'object units of ' + found.names[0]}"
+    return length_of(longest, found.unit, of_unknown=f"object units of {found.names[0]}")
 
 
 def _largest(values: FloatArray) -> float:

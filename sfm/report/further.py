@@ -9,7 +9,7 @@ import numpy as np
 from sfm.display import counted
 from sfm.planning.further import Further
 from sfm.remarks.verdict import Line
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.numbers import length_of
 from sfm.report.page import Banner, Column, Note, Page, Section, Table
 from sfm.report.planning import exterior_table, shot_columns, shot_rows
 from sfm.report.viewer.embedded import viewer_of
@@ -62,7 +62,7 @@ def page(found: Further, *, result: Solution) -> Page:
 def headline(found: Further, result: Solution) -> str:
     """Return what the photographs give, in a sentence."""
     known = np.isfinite(found.before)
-    before, after = (_length(result, float(s[known].max())) for s in (found.before, found.after))
+    before, after = (length_of(float(s[known].max()), result.unit) for s in (found.before, found.after))
     count = len(found.stations)
     return f"{counted(count, 'more photograph')}: sigma of the worst point from {before} to {after}"
 
@@ -72,13 +72,8 @@ def weakest(found: Further, result: Solution) -> list[tuple[str, str, str]]:
     return [
         (
             result.network.points[j],
-            _length(result, float(found.before[j])),
-            _length(result, float(found.after[j])),
+            length_of(float(found.before[j]), result.unit),
+            length_of(float(found.after[j]), result.unit),
         )
         for j in found.points
     ]
-
-
-def _length(result: Solution, value: float) -> str:
-    factor, unit = finer_unit(result.unit, value)
-    return f"{significant(value * factor)} {unit or 'object units'}"

@@ -124,6 +124,12 @@ def finer_unit_of(unit: str, *values: FloatArray) -> tuple[float, str]:
     return finer_unit(unit, max(float(np.nanmax(np.abs(array), initial=0.0)) for array in values))
 
 
+def length_of(value: float, unit: str, *, of_unknown: str = "object units") -> str:
+    """Write a length in a unit in which it reads well, or in the words for a unit that is not known."""
+    factor, finer = finer_unit(unit, value)
+    return f"{significant(value * factor)} {finer or of_unknown}"
+
+
 def is_number(text: str) -> bool:
     """Whether a cell of a table is a number, which is set to the right."""
     return text.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in text.replace("e", ""))

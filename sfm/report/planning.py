@@ -28,6 +28,7 @@ from sfm.report.numbers import (
     NOT_DETERMINED,
     finer_unit,
     fixed,
+    length_of,
     or_unlimited,
     placed,
     raised,
@@ -252,7 +253,7 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
 
 def figures(plan: Plan) -> list[tuple[str, str]]:
     """Return the figures of a plan, each with its unit."""
-    p, a = plan.prediction, plan.prediction.adjustment
+    p, a, unit = plan.prediction, plan.prediction.adjustment, plan.unit
     found = reliability(a)
     d = found_displacement(p)[p.determined]
     r = a.redundancy_numbers[np.isfinite(a.redundancy_numbers)]
@@ -265,13 +266,13 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),
         (
             "sigma of points" + (", what is not determined left out" if a.undetermined else ""),
-            f"1 sigma {_length(plan, p.rms_sigma)} RMS per coordinate (95 % "
-            f"{_length(plan, NORMAL_95 * p.rms_sigma)}), {_length(plan, worst)} at the worst point, "
-            f"{_length(plan, along)} in its worst direction",
+            f"1 sigma {length_of(p.rms_sigma, unit)} RMS per coordinate (95 % "
+            f"{length_of(NORMAL_95 * p.rms_sigma, unit)}), {length_of(worst, unit)} at the worst point, "
+            f"{length_of(along, unit)} in its worst direction",
         ),
         (
             f"displacement found between two such surveys ({POWER:.0%} power, {ALPHA:.1%} significance)",
-            f"{_length(plan, float(np.median(d)))} (median), {_length(plan, float(d.max()))} (worst)",
+            f"{length_of(float(np.median(d)), unit)} (median), {length_of(float(d.max()), unit)} (worst)",
         ),
         (
             "redundancy",
@@ -414,8 +415,3 @@ def _spread(values: FloatArray, unit: str) -> str:
     """Write median and largest of reliabilities, which are unlimited where nothing checks an image point."""
     median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
     return f"{median} {unit} (median), {largest} at most"
-
-
-def _length(plan: Plan, value: float) -> str:
-    factor, unit = finer_unit(plan.unit, value)
-    return f"{significant(value * factor)} {unit}"

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import IntArray
 from sfm.display import agreeing, counted
 from sfm.remarks.verdict import judge
 from sfm.report.findings.given_residuals import given_of
+from sfm.report.findings.precision import rms_of_groups, standard_deviations
 from sfm.report.given import given_parts
 from sfm.report.numbers import general, significant
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes
@@ -194,11 +195,10 @@ def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, 
     used = ~a.rejected
     used[len(found.rows) :] = False  # targets
     after = np.full(m, np.nan)
-    after[found.images] = _rms_of(
-        a.residuals[used], a.network.image_points.image[used], int(found.images.sum())
-    )
+    seen_anew = a.network.image_points.image[used]
+    after[found.images] = rms_of_groups(seen_anew, a.residuals[used], int(found.images.sum()))
     sigma = np.full((m, 6), np.nan)
-    sigma[found.images] = np.sqrt(np.diagonal(a.covariance.exterior, axis1=1, axis2=2))
+    sigma[found.images] = standard_deviations(a.covariance.exterior)
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
     columns = (
         *(Column(None, "image_id"), Column("photograph", "name")),
@@ -218,7 +218,7 @@ def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, 
             np.sqrt((sigma[:, 3:] ** 2).mean(axis=1)),
             np.bincount(seen.image, minlength=m),
             np.bincount(seen.image[found.accepted], minlength=m),
-            *(_rms_of(found.residuals_before, seen.image, m), after),
+            *(rms_of_groups(seen.image, found.residuals_before, m), after),
             strict=True,
         )
     ]
@@ -241,7 +241,7 @@ def _coordinates(
     """Return name, coordinates, their standard deviations and rays of points of the adjustment."""
     a = found.adjustment
     rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
-    sigma = np.sqrt(np.diagonal(a.covariance.points[points], axis1=1, axis2=2))
+    sigma = standard_deviations(a.covariance.points[points])
     columns = (
         *(Column(name, name), *axes("", unit, ".9g")),
         *(Column(f"sigma {one}", f"s{one}", unit, significant) for one in "XYZ"),
@@ -250,11 +250,3 @@ def _coordinates(
     xyz = a.estimate.points[points]
     rows = [(n, *at, *s, r) for n, at, s, r in zip(names, xyz, sigma, rays[points], strict=True)]
     return Table(columns, rows, file)
-
-
-def _rms_of(v: FloatArray, image: IntArray, m: int) -> FloatArray:
-    """Return the RMS per coordinate of residuals (k, 2) of each photograph, NaN where there is none, (m,)."""
-    known = np.isfinite(v).all(axis=1)
-    count = np.bincount(image[known], minlength=m)
-    squares = np.bincount(image[known], (v[known] ** 2).sum(axis=1), minlength=m)
-    return np.asarray(np.sqrt(np.where(count > 0, squares / (2 * np.maximum(count, 1)), np.nan)))

@@ -18,6 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.interior_parameters import families, family_of_photographs
+from sfm.report.findings.precision import rms_of_groups
 
 WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across
 
@@ -75,8 +76,8 @@ def geometry_of(adjustment: Adjustment) -> Geometry:
         if (family == f).any()
     )
     v = adjustment.residuals[~adjustment.rejected]
-    image_rms, image_points = _rms(used.image, v, m)
-    point_rms, rays = _rms(used.point, v, n)
+    image_rms, point_rms = rms_of_groups(used.image, v, m), rms_of_groups(used.point, v, n)
+    rays, image_points = np.bincount(used.point, minlength=n), np.bincount(used.image, minlength=m)
     angle = ray_angles(adjustment.network, adjustment.estimate, ~adjustment.rejected)
     return Geometry(rays, angle, point_rms, image_rms, hull, coverage, image_points)
 
@@ -89,11 +90,3 @@ def hull_area(xy: FloatArray) -> float:
         return float(ConvexHull(xy).volume)
     except QhullError:
         return 0.0
-
-
-def _rms(index: IntArray, residuals: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
-    """Return RMS residual per coordinate and number of the image points of each photograph or point."""
-    number = np.bincount(index, minlength=count)
-    total = np.bincount(index, weights=(residuals**2).sum(axis=1), minlength=count)
-    mean = np.divide(total, 2 * number, out=np.full(count, np.nan), where=number > 0)
-    return np.asarray(np.sqrt(mean)), number

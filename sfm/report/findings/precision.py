@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ def precision_of(adjustment: Adjustment) -> Precision:
     exterior = adjusted_sigmas(covariance.exterior)
     rms, largest_of_all, limiting = point_precision(adjustment)
     return Precision(
-        _sqrt_diagonal(covariance.points),
-        _sqrt_diagonal(covariance.points_limiting),
-        _sqrt_diagonal(covariance.exterior),
+        standard_deviations(covariance.points),
+        standard_deviations(covariance.points_limiting),
+        standard_deviations(covariance.exterior),
         rms,
         largest_of_all,
         limiting,
@@ -81,6 +81,21 @@ def root_mean_square(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
+def rms_of_groups(index: IntArray, v: FloatArray, count: int) -> FloatArray:
+    """Return the RMS residual per coordinate of each photograph or point, px, NaN without any, (n,).
+
+    Args:
+        index: photograph or point of each image point, (k,).
+        v: residuals, NaN where not known, px, (k, 2).
+        count: of photographs or points, n.
+    """
+    known = np.isfinite(v).all(axis=1)
+    number = np.bincount(index[known], minlength=count)
+    total = np.bincount(index[known], weights=(v[known] ** 2).sum(axis=1), minlength=count)
+    mean = np.divide(total, 2 * number, out=np.full(count, np.nan), where=number > 0)
+    return np.asarray(np.sqrt(mean))
+
+
 def largest(values: FloatArray) -> FloatArray:
     """Return the largest of each column (n, d) and of all, of the values known, (d + 1,)."""
     columns = np.where(np.isfinite(values), values, -np.inf).max(axis=0, initial=-np.inf)
@@ -99,7 +114,7 @@ def point_sigma(covariance: FloatArray) -> tuple[float, float]:
     return root_mean_square(sigma), float(known.max()) if len(known) else float("nan")
 
 
-def _sqrt_diagonal(covariance: FloatArray) -> FloatArray:
+def standard_deviations(covariance: FloatArray) -> FloatArray:
     """Return standard deviations of covariance matrices (..., d, d), shape (..., d)."""
     diagonal = np.einsum("...ii->...i", covariance)
     return np.asarray(np.sqrt(np.where(diagonal >= 0, diagonal, np.nan)))

@@ -22,6 +22,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import f_sf
 from sfm.report.findings.given_residuals import Given
+from sfm.report.findings.precision import standard_deviations
 from sfm.result import ControlCheck, SurveyResult
 
 EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
@@ -141,7 +142,7 @@ def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
     if found is None:
         return []
     points = a.network.control.point
-    xyz, posterior = a.estimate.points[points], _sigmas(a.covariance.points[points])
+    xyz, posterior = a.estimate.points[points], standard_deviations(a.covariance.points[points])
     numbers = np.stack([found.given, found.sigma, xyz, posterior, found.difference, found.w], axis=-1)
     return [
         ControlCoordinate("control", found.names[k], "XYZ"[c], *numbers[k, c].tolist())
@@ -156,7 +157,10 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
     control = a.network.control
     place = {a.network.points[j]: k for k, j in enumerate(control.point)}
     rows = [(n, place[name]) for n, name in enumerate(check.points) if name in place]
-    prior, posterior = _sigmas(control.covariance), _sigmas(a.covariance.points[control.point])
+    prior, posterior = (
+        standard_deviations(control.covariance),
+        standard_deviations(a.covariance.points[control.point]),
+    )
     placed = [(check.points[n], k, check.differences[n]) for n, k in rows]
     return [
         _check(name, c, given, prior[k, c], given + d[c], posterior[k, c], d[c])
@@ -169,7 +173,7 @@ def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
     """Return the coordinates that check a datum of control, with the test of their differences."""
     a = result.adjustment
     place = {name: j for j, name in enumerate(a.network.points)}
-    posterior = _sigmas(a.covariance.points)
+    posterior = standard_deviations(a.covariance.points)
     points = a.estimate.points
     return tuple(
         _check(one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given)
@@ -194,10 +198,6 @@ def _check(point: str, c: int, given: float, prior: float, *found: float) -> Con
     expected = float(np.hypot(prior, posterior))
     test = difference / expected if expected > 0 else np.nan
     return ControlCoordinate("check", point, "XYZ"[c], *map(float, (given, prior, *found, test)))
-
-
-def _sigmas(covariance: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0)))
 
 
 def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:

@@ -12,6 +12,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import Findings
+from sfm.report.findings.precision import rms_of_groups
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
 from sfm.result import likest_first
 from sfm.solution import SeenTargets, Solution
@@ -102,13 +103,13 @@ def scene_of_stored(
         covariance,
         np.bincount(point[used], minlength=n),
         ray_angles(network, estimate, use)[determined],
-        _rms(point[used], v[used], n),
+        rms_of_groups(point[used], v[used], n),
         tuple(network.images[i] for i in oriented),
         network.camera[oriented],
         estimate.position[oriented],
         estimate.rotation[oriented],
         sigma,
-        _rms(photo[used], v[used], m),
+        rms_of_groups(photo[used], v[used], m),
         np.bincount(photo[used], minlength=m),
         rays,
         marks,
@@ -140,15 +141,6 @@ def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
             where = estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]]
             computed[rows] = project(camera, *where)
     return computed - seen.xy
-
-
-def _rms(index: IntArray, v: FloatArray, count: int) -> FloatArray:
-    """Return the RMS residual per coordinate of each photograph or point, NaN where there is none."""
-    known = np.isfinite(v).all(axis=1)
-    number = np.bincount(index[known], minlength=count)
-    total = np.bincount(index[known], weights=(v[known] ** 2).sum(axis=1), minlength=count)
-    mean = np.divide(total, 2 * number, out=np.full(count, np.nan), where=number > 0)
-    return np.asarray(np.sqrt(mean))
 
 
 def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
