@@ -139,7 +139,7 @@ class Table:
         """The rows as the page shows them."""
         return self._cells(self.rows[: self.most])
 
-    def first(self, count: int) -> Iterable[tuple[str | Mark | Link, ...]]:
+    def first(self, count: int | None) -> Iterable[tuple[str | Mark | Link, ...]]:
         """Return the first rows and the last one, of sums, as the page shows them."""
         return (*self._cells(self.rows[:count]), *self.sums)
 
@@ -189,11 +189,20 @@ class Table:
     @property
     def text(self) -> str:
         """All rows in columns of plain text, numbers at the right."""
+        return "\n".join((*self.lines(), ""))
+
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the first rows in columns of plain text, numbers at the right; all without a number."""
         shown = [one for _, one in self.shown]
-        rows = [[str(cell) for cell in row] for row in self._cells(self.rows)]
+        rows = [[one_line(str(cell)) for cell in row] for row in self.first(most)]
         if not self.facts:
             rows.insert(0, [one.heading for one in shown])
-        return "\n".join((*aligned(rows, [one.format is None for one in shown]), ""))
+        return aligned(rows, [one.format is None for one in shown])
+
+
+def one_line(words: str) -> str:
+    """Return a text without breaks of lines."""
+    return " ".join(words.splitlines())
 
 
 def facts(rows: Sequence[tuple[str | Link, str]]) -> Table:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from sfm.display import NO_BREAK, aligned, bound
+from sfm.display import NO_BREAK, bound
 from sfm.report.figures.plot_data import Plot
-from sfm.report.page import Cards, Folded, Heading, Note, Page, Paragraph, Part, Subheading, Table
+from sfm.report.page import Cards, Folded, Heading, Note, Page, Paragraph, Part, Subheading, Table, one_line
 
 WIDTH = 100
 MAX_ROWS = 10  # of a table
@@ -19,10 +19,10 @@ MARGIN = "  "
 
 def text(page: Page) -> str:
     """Return a page as text of at most `WIDTH` columns."""
-    lines = [f"KOLINEAR  {_one_line(page.title)}"[:WIDTH], "=" * WIDTH]
-    lines += wrapped(_one_line(page.verdict.headline), behind=0)
+    lines = [f"KOLINEAR  {one_line(page.title)}"[:WIDTH], "=" * WIDTH]
+    lines += wrapped(one_line(page.verdict.headline), behind=0)
     for one in page.verdict.lines:
-        lines += wrapped(_one_line(f"- {one.severity}: {one.text} {one.remedy}"), behind=2)
+        lines += wrapped(one_line(f"- {one.severity}: {one.text} {one.remedy}"), behind=2)
     for section in page.sections:
         found = list(_lines(section.parts)) if section.in_text else []
         if found:
@@ -38,13 +38,13 @@ def _lines(parts: Iterable[Part]) -> Iterator[str]:
             case Plot() | Note() | Cards():
                 continue
             case Heading():
-                heading = ["", f"{_one_line(part.text)} ".ljust(WIDTH, "-")]
+                heading = ["", f"{one_line(part.text)} ".ljust(WIDTH, "-")]
             case Subheading():
-                heading += ["", *wrapped(MARGIN + _one_line(part.text), behind=4)]
+                heading += ["", *wrapped(MARGIN + one_line(part.text), behind=4)]
             case Folded():
                 found = list(_lines(part.parts)) if part.in_text else []
             case Paragraph():
-                found = wrapped(MARGIN + _one_line(part.text), behind=4)
+                found = wrapped(MARGIN + one_line(part.text), behind=4)
             case Table():
                 found = _facts(part) if part.facts else _table(part)
         if found:
@@ -53,7 +53,7 @@ def _lines(parts: Iterable[Part]) -> Iterator[str]:
 
 
 def _facts(table: Table) -> list[str]:
-    rows = [[_one_line(str(cell)) for cell in row] for row in table.cells]
+    rows = [[one_line(str(cell)) for cell in row] for row in table.cells]
     width = min(max((len(name) for name, _ in rows), default=0), NAME_WIDTH)
     return [
         line
@@ -64,11 +64,10 @@ def _facts(table: Table) -> list[str]:
 
 def _table(table: Table) -> list[str]:
     """Return the first rows in columns; each as a sentence where the columns are too wide."""
-    rows = [[_one_line(str(cell)) for cell in row] for row in table.first(MAX_ROWS)]
-    heads, numbers = zip(*((one.heading, one.format is not None) for _, one in table.shown), strict=True)
-    lines = [f"{MARGIN}{line}" for line in aligned([heads, *rows], [not one for one in numbers])]
+    lines = [MARGIN + line for line in table.lines(MAX_ROWS)]
     if max(map(len, lines)) > WIDTH:
-        before = [f"{head} " if number else "" for head, number in zip(heads, numbers, strict=True)]
+        before = ["" if one.format is None else f"{one.heading} " for _, one in table.shown]
+        rows = ([one_line(str(cell)) for cell in row] for row in table.first(MAX_ROWS))
         named = ([b + cell for b, cell in zip(before, row, strict=True) if cell] for row in rows)
         sentences = (f"{MARGIN}{name}: {'; '.join(cells)}" for name, *cells in named)
         lines = [line for one in sentences for line in wrapped(one, behind=4)]
@@ -87,7 +86,3 @@ def wrapped(line: str, *, behind: int) -> list[str]:
         lines.append(rest[:cut])
         rest = " " * behind + rest[cut:].strip()
     return [one.replace(NO_BREAK, " ") for one in (*lines, rest)]
-
-
-def _one_line(words: str) -> str:
-    return " ".join(words.splitlines())
