@@ -25,6 +25,7 @@ CROWDED = 300  # image points of a photograph; more of them are drawn as dots wi
 CROWDED_ARROW_PX = 8.0  # the same length where photographs are crowded, which keeps the vectors apart
 DOT_PX = 2  # radius of such a dot
 LABEL_SIZE = 0.5  # of OpenCV's Hershey font
+SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
 SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
 
 # Colours in OpenCV's order blue, green, red.
@@ -132,7 +133,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     rows, names = _image_points(photograph.image, adjustment)
     seen = adjustment.network.image_points.xy[rows]
     colour = [DROPPED if rejected else USED for rejected in adjustment.rejected[rows]]
-    owner = _nearest(photograph.xy, seen)
+    owner = nearest_image_points(photograph.xy, seen)
     colour_of_target = [UNUSED if row < 0 else colour[row] for row in owner]
     crowded = len(photograph.xy) > CROWDED
     if crowded:
@@ -185,12 +186,17 @@ def _image_points(image: str, adjustment: Adjustment) -> tuple[IntArray, tuple[s
     return rows, tuple(network.points[j] for j in network.image_points.point[rows])
 
 
-def _nearest(xy: FloatArray, measured: FloatArray) -> IntArray:
-    """Return for each target the image point that was made of it, -1 for none, (k,)."""
-    if len(xy) == 0 or len(measured) == 0:
+def nearest_image_points(xy: FloatArray, measured: FloatArray) -> IntArray:
+    """Return for each target of a photograph the image point that was made of it, -1 for none, (k,).
+
+    Args:
+        xy: centres of the targets, px, (k, 2).
+        measured: image points of the photograph, px, (n, 2).
+    """
+    if not len(xy) or not len(measured):
         return np.full(len(xy), -1, dtype=np.int64)
-    distance, nearest = cKDTree(measured).query(xy)
-    return np.where(distance < 0.5, nearest, -1)  # half a pixel: re-measuring may move it
+    distance, nearest = cKDTree(measured).query(xy, distance_upper_bound=SAME_PX)
+    return np.where(np.isfinite(distance), nearest, -1)
 
 
 def _remarks(photograph: PhotographTargets) -> IntArray:

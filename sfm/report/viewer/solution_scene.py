@@ -5,19 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
+from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.precision import rms_of_groups
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
 from sfm.result import likest_first
 from sfm.solution import SeenTargets, Solution
 
-SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
 UNUSED = "measured, not part of the result"
 
 
@@ -156,7 +155,7 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     for i in np.unique(seen.image).tolist():
         rows = np.flatnonzero(image == i)
         measured = np.flatnonzero((seen.image == i) & seen.measured)
-        used = _join(seen.xy[measured], xy[rows])
+        used = nearest_image_points(seen.xy[measured], xy[rows])
         ellipse[rows[used[used >= 0]]] = seen.ellipse[measured[used >= 0]]
         left[measured[used >= 0]] = False
     kept = np.flatnonzero(left)
@@ -165,11 +164,3 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     reasons = {word: number for number, word in enumerate(likest_first(set(words)))}
     number = np.array([reasons[word] for word in words], dtype=np.int64)
     return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
-
-
-def _join(targets: FloatArray, xy: FloatArray) -> IntArray:
-    """Return for each target of a photograph the image point that was made of it, -1 for none, (k,)."""
-    if not len(targets) or not len(xy):
-        return np.full(len(targets), -1, dtype=np.int64)
-    distance, nearest = cKDTree(xy).query(targets, distance_upper_bound=SAME_PX)
-    return np.where(np.isfinite(distance), nearest, -1)
