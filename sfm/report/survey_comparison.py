@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
-from sfm.display import program_name
+from sfm.display import counted, program_name
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.precision import point_sigma
@@ -154,8 +154,8 @@ def pipeline_parts(f: Findings) -> Iterator[Part]:
     yield Paragraph(
         f"{name} oriented {found.photographs[1]} of {found.total} photographs from their natural texture "
         f"alone, Kolinear {found.photographs[0]} from the survey's points. Brought onto the survey by "
-        f"shift, rotation and scale, its orientations put {found.targets} points of the survey {point} "
-        f"{finer} (RMS of a coordinate) from where the survey has them; the survey's standard deviation is "
+        f"shift, rotation and scale, its orientations put {counted(found.targets, 'point')} of the survey "
+        f"{point} {finer} (RMS of a coordinate) from where the survey has them; its standard deviation is "
         f"{sigma} {finer}."
     )
     oriented = (f"{one} of {found.total}" for one in found.photographs)

@@ -277,7 +277,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         camera = family.camera
         yield Subheading(family.name)
         size, pixel = camera.size_px, [general(1000 * one, 5) for one in camera.pixel_mm]
-        shared = f"; these parameters are common to {family.photographs} photographs"
+        shared = f"; these parameters are common to {counted(family.photographs, 'photograph')}"
         yield Paragraph(
             f"model {camera.model}, {size[0]} x {size[1]} px of {pixel[0]} x {pixel[1]} µm"
             f"{shared if camera.shared else ''}"
@@ -296,7 +296,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         )
         yield Paragraph(f"Radial distortion together against 0 (F test): {'; '.join(tests)}.")
     if single := f.interior.single:
-        summary = f"{len(single)} parameters of single photographs and groups"
+        summary = f"{counted(len(single), 'parameter')} of single photographs and groups"
         yield Folded(summary, _parameters(single, of=True), open=len(single) <= MAX_OPEN, in_text=True)
     for rig in f.rigs:
         yield Heading(f"Rig {rig.name}")

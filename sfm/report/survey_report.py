@@ -174,7 +174,7 @@ def worked(report: Report) -> Section:
             ("Datum", f"{datum}; rank defect of the normal equations {a.defect}, {expected}"),
             (
                 "Unknowns",
-                f"{a.unknowns} ({exterior} exterior orientation, {interior} interior, {points} points)",
+                f"{a.unknowns} (exterior orientation {exterior}, interior {interior}, points {points})",
             ),
             ("Redundancy", str(a.redundancy)),
             *(("Cannot be determined", words) for words in a.undetermined),
@@ -445,7 +445,7 @@ def photographs(report: Report) -> Section:
             words += f", edges {fixed(f.edges[one.image], 2)} px"
         cards.append(Card(f"overlays/{one.file_name}", one.thumbnail, one.image, words))
     others = [(Link(one.image, f"overlays/{one.file_name}"),) for one in overlays[MAX_LISTED:]]
-    without = f"The other {len(others)} photographs, without a small picture here"
+    without = f"{counted(len(others), 'further photograph')}, without a small picture here"
     more = Folded(without, Table(columns("photograph"), others)) if others else None
     return Section("The photographs", legend, Cards(cards), more, key="photographs", in_text=False)
 
