@@ -11,8 +11,19 @@ from sfm.display import counted
 from sfm.files.result_tables import GIVEN
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings.given_residuals import Given
-from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant
-from sfm.report.page import Column, Folded, Heading, Note, Paragraph, Part, Table, axes, columns_of
+from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant, with_exponent
+from sfm.report.page import (
+    Column,
+    Folded,
+    Heading,
+    Note,
+    Paragraph,
+    Part,
+    Table,
+    axes,
+    columns,
+    columns_of,
+)
 from sfm.report.phrases import words_of_check
 from sfm.result import ControlCheck
 
@@ -44,6 +55,10 @@ def given_parts(
     parts = list(_check(check, adjustment, unit)) if check is not None else []
     for kind in given.kinds:
         parts += _kind(kind, adjustment, unit)
+    if found := adjustment.group_parameters:
+        rows = [(one.group, one.name, *with_exponent(one.value, one.sigma), unit) for one in found]
+        heads = columns("of", "parameter", ">value", ">sigma", "unit")
+        parts += [Heading("Parameters of survey observations"), Table(heads, rows, all_in="summary.json")]
     return tuple(parts)
 
 
@@ -60,7 +75,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
         "The control took no part in the adjustment. The result was placed on it afterwards by "
         f"{placed} Differences at each point, placed minus nominal [{finer}]:"
     )
-    columns = (
+    heads = (
         *(Column("control point"), *axes("d", "", signed, factor=factor)),
         Column("length", format=significant, factor=factor),
     )
@@ -68,7 +83,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
     rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, length, strict=True)]
     rms = ("RMS", *(significant(factor * one) for one in check.rms), float(np.linalg.norm(check.rms)))
     words = Paragraph(words_of_check(check, unit))
-    return Heading("Check at the control"), words, note, Table(columns, rows, total=rms)
+    return Heading("Check at the control"), words, note, Table(heads, rows, total=rms)
 
 
 def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
@@ -81,13 +96,13 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
     if not found.checked and found.kind == "control point":
         yield Paragraph(f"{what} held fixed: adjusted coordinates are those given, without residuals.")
         return
-    columns, factor, unit = _columns(found, length_unit)
+    heads, factor, unit = _columns(found, length_unit)
     if len(found.coordinates) > 1 and unit:
         rms = ", ".join(significant(factor * one) for one in found.rms)
         yield Paragraph(f"{what}, RMS {rms} {unit} in {', '.join(found.coordinates)}, adjusted minus given.")
     yield Note(R_AND_W)
     rows.sort(key=lambda row: -abs(np.nan_to_num(row[-1])))
-    table = Table(columns, rows, all_in="given.csv")
+    table = Table(heads, rows, all_in="given.csv")
     yield table if len(rows) <= MAX_OPEN else Folded(counted(len(rows), "value"), table, in_text=True)
     if found.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
         yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")

@@ -38,6 +38,7 @@ from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
+from sfm.result import SurveyResult
 from sfm.similarity import Similarity
 from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
@@ -340,9 +341,17 @@ def table_of(folder: Path, network: Network, kinds: dict[str, list[TableKind]]) 
     return lines
 
 
-def run_with(folder: Path, network: Network, truth: Estimate, kinds: dict[str, list[TableKind]]) -> Any:
+def run_with(
+    folder: Path, network: Network, truth: Estimate, kinds: dict[str, list[TableKind]]
+) -> SurveyResult:
     """Return the result of a survey with tables of observations."""
     return run_survey(read_survey(written(folder, network, truth, table_of(folder, network, kinds))))
+
+
+def reported(folder: Path, result: SurveyResult) -> Any:
+    """Return the summary of a result, written with its report."""
+    write_result(findings_of(result), folder / "out")
+    return json.loads((folder / "out" / "summary.json").read_text("utf-8"))
 
 
 @pytest.mark.parametrize(
@@ -403,6 +412,7 @@ def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
         (f"horizontal direction {network.points[first.point[0]]}: {target}",): (),
         (f"height difference {ends}",): ("exchanged",),
     }
+    assert len(reported(tmp_path, result)["further_observations"]["horizontal direction"]) == 5 + 6
     sets = [kind for kind in result.network.observations if isinstance(kind, HorizontalDirections)]
     assert [len(one.value) for one in sets] == [5, 6]
     assert sets[1].group == f"{sets[0].group} (2)"
@@ -418,6 +428,12 @@ def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path)
     given = {"distance with additive constant": [replace(one, value=value)]}
     result = run_with(tmp_path, network, truth, given)  # type: ignore[arg-type]
     assert result.adjustment.has_scale
+    stored = reported(tmp_path, result)
+    (constant,) = stored["group_parameters"]
+    assert (constant["group"], constant["name"], constant["unit"]) == ("tape", "additive constant", "m")
+    (true,) = one.own_parameters(values_of(truth)).value + 0.1
+    assert abs(constant["value"] - true) < 5 * constant["sigma"] < 5e-3
+    assert "additive constant" in (tmp_path / "out" / "report.html").read_text("utf-8")
     (kept,) = result.network.observations
     assert len(kept.value) == 6
     order = [network.points.index(name) for name in result.network.points]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from itertools import compress
 from pathlib import Path
@@ -19,6 +20,7 @@ from sfm.files.plain_text import or_none
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings.bundle_statistics import Spread, spread
 from sfm.report.findings.findings import Findings
+from sfm.report.findings.given_residuals import Given
 from sfm.report.findings.precision import point_sigma
 from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of
@@ -116,9 +118,8 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "observed_exterior": [
             one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")
         ],
-        "further_observations": {
-            kind.kind: _given_values(kind, "name", "component") for kind in given.further
-        },
+        "further_observations": _further(given),
+        "group_parameters": [{**one._asdict(), "unit": result.length_unit} for one in a.group_parameters],
         "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
         "comparison": _comparison(result),
@@ -340,6 +341,14 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
         "targets": found.targets,
         **values_of(found, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
     }
+
+
+def _further(given: Given) -> dict[str, list[dict[str, Any]]]:
+    """Return the values of all other kinds, those of all groups of a kind together."""
+    found = defaultdict[str, list[dict[str, Any]]](list)
+    for kind in given.further:
+        found[kind.kind] += _given_values(kind, "name", "component")
+    return dict(found)
 
 
 def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
