@@ -299,6 +299,11 @@ class Mounts:
         """Which cameras are held fixed at 0, as the reference of a rig is and those without are, (a,)."""
         return np.asarray(~self.free.any(axis=1) & ~self.position.any(axis=1))
 
+    def select(self, on: BoolArray) -> Mounts:
+        """Return the mounts of some cameras, (a,)."""
+        rig = tuple(name for name, keep in zip(self.rig, on, strict=True) if keep)
+        return Mounts(self.position[on], self.rotation[on], self.free[on], rig)
+
     def by_rig(self) -> dict[str, list[int]]:
         """Return the cameras of each rig, its reference first."""
         found: dict[str, list[int]] = {}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self
 
+import numpy as np
+
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.observations.kind import MOUNT, Block, Values
 from sfm.observations.pose import PoseObservations
@@ -41,6 +43,11 @@ class MountObservations(PoseObservations):
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the cameras."""
         return tuple(estimate.cameras[a].name for a in self.camera)
+
+    def of_cameras(self, on: BoolArray) -> Self:
+        """Return the mounts of some cameras, counted anew, (a,)."""
+        kept = self.select(on[self.camera])
+        return replace(kept, camera=(np.cumsum(on) - 1)[kept.camera])
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the mounts."""

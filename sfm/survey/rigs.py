@@ -10,6 +10,7 @@ Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -18,11 +19,11 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
-from sfm.display import listed
+from sfm.display import counted, listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
 from sfm.similarity import Similarity, nearest_rotation
-from sfm.survey.inputs.settings import CameraSettings, RigSettings
+from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import Survey
 
 TINY = float(np.finfo(float).tiny)
@@ -144,7 +145,10 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
     """
     if network.moment is None:
         return estimate
-    mounts = mounts_of(survey.rigs, survey.cameras, network, estimate)
+    if any(rig.blocks for rig in survey.rigs):  # the final adjustment has their mounts
+        placed = place_by_rigs(*split_blocks(survey, network, estimate))
+        return replace(estimate, position=placed.position, rotation=placed.rotation)
+    mounts = mounts_of(_rigs_of(survey), network, estimate)
     given = survey.given_mounts
     if len(given):
         a = given.camera
@@ -159,14 +163,81 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
     return place_by_rigs(network, replace(estimate, mounts=mounts))
 
 
-def mounts_of(
-    rigs: Sequence[RigSettings], cameras: Sequence[CameraSettings], network: Network, estimate: Estimate
-) -> Mounts:
+def _rigs_of(survey: Survey) -> dict[str, list[int]]:
+    """Return the cameras of each rig, the reference first, by their indices."""
+    number = {camera.name: a for a, camera in enumerate(survey.cameras)}
+    return {rig.name: [number[name] for name in rig.cameras] for rig in survey.rigs}
+
+
+def split_blocks(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return the network and estimate with a rig for each block of time of rigs that have some.
+
+    Each block has cameras of its name, which share their interior orientation with those of the others.
+
+    Args:
+        survey: names the rigs.
+        network: with moments, and one camera for each of the survey's.
+        estimate: of the same.
+
+    Raises:
+        SurveyFileError: a photograph of such a rig is of no block or of several, a moment is of two, or a
+            block has no photographs.
+        GeometryError: as `mounts_of` does.
+    """
+    if network.moment is None or not any(rig.blocks for rig in survey.rigs):
+        return network, estimate
+    cameras, owner, rigs = list(estimate.cameras), network.camera.copy(), _rigs_of(survey)
+    for rig in survey.rigs:
+        if not rig.blocks:
+            continue
+        of_rig = rigs.pop(rig.name)
+        block = _blocks_of(rig, survey.source, network, of_rig)
+        for g, glob in enumerate(rig.blocks):
+            mounted = rigs[f"{rig.name} {glob}"] = []
+            for a in of_rig:
+                camera = estimate.cameras[a]
+                shared = (camera.name,) * len(camera.names)
+                one = replace(camera, name=f"{camera.name} {glob}", shared=shared)
+                mounted.append(len(cameras) if g else a)
+                cameras[mounted[-1] : mounted[-1] + 1] = [one]
+                owner[[i for i in block if block[i] == g and network.camera[i] == a]] = mounted[-1]
+    network, estimate = replace(network, camera=owner), replace(estimate, cameras=tuple(cameras))
+    return network, replace(estimate, mounts=mounts_of(rigs, network, estimate))
+
+
+def _blocks_of(rig: RigSettings, source: str, network: Network, of_rig: Sequence[int]) -> dict[int, int]:
+    """Return the block of each photograph of a rig, by its index."""
+    assert network.moment is not None
+    where, found, at = f"{source}: rig {rig.name}", dict[int, int](), dict[int, int]()
+    for i in np.flatnonzero(np.isin(network.camera, of_rig)).tolist():
+        name, moment = network.images[i], int(network.moment[i])
+        blocks = [g for g, glob in enumerate(rig.blocks) if fnmatch.fnmatchcase(name, glob)]
+        if len(blocks) != 1:
+            many = "no block" if not blocks else counted(len(blocks), "block")
+            raise SurveyFileError(
+                f"{where}: photograph '{name}' is in {many} of {listed(rig.blocks)}, needed 1"
+            )
+        found[i] = blocks[0]
+        if at.setdefault(moment, found[i]) != found[i]:
+            raise SurveyFileError(f"{where}: the moment of photograph '{name}' is in two blocks, needed 1")
+    for g, glob in enumerate(rig.blocks):
+        if g not in found.values():
+            raise SurveyFileError(f"{where}: block '{glob}' has no photographs")
+    return found
+
+
+def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Estimate) -> Mounts:
     """Return the mounts that photographs oriented one by one give, those beside the reference cameras free.
+
+    Args:
+        rigs: indices of the cameras of each, the reference first, by its name.
+        network: with moments.
+        estimate: with photographs oriented one by one.
 
     Raises:
         GeometryError: a camera of a rig is oriented at no moment together with the others.
     """
+    cameras = estimate.cameras
     a = len(cameras)
     position, rotation = np.zeros((a, 3)), np.tile(np.eye(3), (a, 1, 1))
     free, names = np.zeros((a, 6), dtype=bool), [""] * a
@@ -174,23 +245,21 @@ def mounts_of(
     if network.moment is not None:
         for i in np.flatnonzero(estimate.oriented):
             at[int(network.moment[i]), int(network.camera[i])] = int(i)
-    number = {camera.name: k for k, camera in enumerate(cameras)}
-    for rig in rigs:
-        known = [number[rig.cameras[0]]]
-        names[known[0]] = rig.name
-        left = [number[name] for name in rig.cameras[1:]]
+    for rig, (reference, *left) in rigs.items():
+        known = [reference]
+        names[reference] = rig
         while left:
             pairs = {b: [(k, one) for k in known for one in _common(at, k, b)] for b in left}
             b = max(left, key=lambda one: len(pairs[one]))
             if not pairs[b]:
                 raise GeometryError(
-                    f"rig {rig.name}: camera {cameras[b].name} is oriented at no moment together with "
+                    f"rig {rig}: camera {cameras[b].name} is oriented at no moment together with "
                     f"{listed([cameras[k].name for k in known])}; more points that both see are needed"
                 )
             relative = [_relative(estimate, position[k], rotation[k], i, j) for k, (i, j) in pairs[b]]
             position[b] = np.median([t for t, _ in relative], axis=0)
             rotation[b] = _middle(np.array([R for _, R in relative]))
-            free[b], names[b] = True, rig.name
+            free[b], names[b] = True, rig
             known.append(b)
             left.remove(b)
     return Mounts(position, rotation, free, tuple(names))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +13,14 @@ import pytest
 
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.conventions import angles_from_rotation
+from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
-from sfm.survey.inputs.settings import RigSettings
+from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs
 from tests.rigs import make_rig
@@ -125,9 +126,8 @@ def test_mounts_are_those_of_most_moments() -> None:
     position[1::18] += 1.0
     position[2::6] = np.nan  # camera 3 at every other moment, and camera 1 at the others
     position[3::6] = np.nan
-    rigs = [RigSettings(name="rig", cameras=("camera 1", "camera 2", "camera 3"), moment="order")]
-    start = replace(truth, position=position, mounts=None)
-    found = mounts_of(rigs, truth.cameras, network, start)  # type: ignore[arg-type]
+    rigs, start = {"rig": [0, 1, 2]}, replace(truth, position=position, mounts=None)
+    found = mounts_of(rigs, network, start)
     assert found.position == pytest.approx(truth.mounts.position, abs=1e-9)
     assert found.rotation == pytest.approx(truth.mounts.rotation, abs=1e-9)
     assert list(found.free.any(axis=1)) == [False, True, True]
@@ -135,7 +135,7 @@ def test_mounts_are_those_of_most_moments() -> None:
     assert placed.position[3::6] == pytest.approx(truth.position[3::6], abs=1e-9)
     lost = replace(start, position=np.where(np.arange(30)[:, None] % 3 == 2, np.nan, position))
     with pytest.raises(GeometryError, match="camera camera 3 is oriented at no moment together with"):
-        mounts_of(rigs, truth.cameras, network, lost)  # type: ignore[arg-type]
+        mounts_of(rigs, network, lost)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
@@ -179,3 +179,59 @@ def test_wrong_mounts_are_refused(row: str, said: str, tmp_path: Path) -> None:
     path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
     with pytest.raises(SurveyFileError, match=said):
         run_survey(read_survey(path))
+
+
+BLOCKS = RIG + 'blocks = ["moment [1-4] *", "moment [5-8] *"]\n'
+
+
+def moved_rig(name: str) -> tuple[Network, Estimate, FloatArray]:
+    """Return a rig whose second camera is moved by 20 mm and turned by 2 deg after four of eight moments."""
+    network, truth = make_rig(seed_of(name), moments=8, free=("c",))
+    assert truth.mounts is not None
+    move, turn = np.array([0.02, -0.01, 0.01]), rotation_from_vector(np.array([0.02, -0.03, 0.01]))
+    position, rotation = truth.position.copy(), truth.rotation.copy()
+    for i in range(9, 16, 2):
+        rig = rotation[i] @ truth.mounts.rotation[1].T
+        position[i] += rig @ move
+        rotation[i] = rig @ truth.mounts.rotation[1] @ turn
+    moved = replace(truth, position=position, rotation=rotation)
+    return *simulate_network(network, moved, seed_of(f"{name} noise")), move
+
+
+def test_a_rig_has_other_mounts_in_another_block_of_time(tmp_path: Path) -> None:
+    """Each block its base; c is one for both, and COLMAP gets the same."""
+    network, truth, move = moved_rig("blocks")
+    path = written(tmp_path, network, truth, BLOCKS)
+    path.write_text(path.read_text("utf-8").replace("free = []", 'free = ["c"]'), "utf-8")
+    result = run_survey(read_survey(path))
+    found = findings_of(result)
+    assert [one.kind for one in found.verdict.remarks if one.kind == "rig_bumped"] == []
+    first, second = found.rigs
+    assert (first.name, second.name) == ("stereo moment [1-4] *", "stereo moment [5-8] *")
+    assert (first.moments, second.moments) == (4, 4)
+    assert truth.mounts is not None
+    sizes = [np.linalg.norm(X - X.mean(axis=0)) for X in (result.estimate.points, truth.points)]
+    scale = sizes[1] / sizes[0]
+    for rig, X in ((first, truth.mounts.position[1]), (second, truth.mounts.position[1] + move)):
+        (mount,) = rig.mounts
+        assert np.abs((mount.position * scale - X) / (mount.position_sigma * scale)).max() < 5
+    c = {one.name: one.c_px for one in result.estimate.cameras}
+    assert len(c) == 4 and len(set(c.values())) == 2
+    write_result(found, tmp_path / "out")
+    again = read_result(tmp_path / "out")
+    assert again.estimate.mounts is not None and again.estimate.mounts.rig[:2] == (first.name,) * 2
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[5-8]", "[5-7]"), "photograph 'moment 8 camera 1' is in no block of"),
+        (("[5-8]", "[4-8]"), "photograph 'moment 4 camera 1' is in 2 blocks of"),
+        (("[5-8] *", "[5-8] camera 1"), "photograph 'moment 5 camera 2' is in no block"),
+        (("[1-4] *", "[1-8] *"), "is in 2 blocks of"),
+    ],
+)
+def test_photographs_are_of_one_block(change: tuple[str, str], said: str, tmp_path: Path) -> None:
+    network, truth, _ = moved_rig("blocks")
+    with pytest.raises(SurveyFileError, match=re.escape(said)):
+        run_survey(read_survey(written(tmp_path, network, truth, BLOCKS.replace(*change))))

@@ -196,7 +196,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
     Where other observations take part, the image points are weighted by their own variance component, unless
     the survey wants all weights as stated.
     """
-    part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
+    part, estimate = without_idle_cameras(part, estimate, count=len(task.survey.cameras))
 
     def adjust_part(factor: FloatArray) -> Adjustment:
         return _tested(task, part, estimate, covariance=True, factor=factor, rejected=rejected)

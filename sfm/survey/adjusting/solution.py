@@ -60,6 +60,7 @@ from sfm.survey.placing import (
     place_on_observations,
     scale_to_bars,
 )
+from sfm.survey.rigs import split_blocks
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
@@ -239,6 +240,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     cameras = tuple(_with_own_c(one) if one.name in varying else one for one in chosen.cameras)
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
+    network, estimate = split_blocks(survey, network, estimate)
     fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
     if network.moment is not None:  # the other photographs of a moment determine its pose

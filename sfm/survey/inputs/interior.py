@@ -20,6 +20,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
+from sfm.observations.mounts import MountObservations
 from sfm.survey.inputs.cameras import free_start_values
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
@@ -114,15 +115,15 @@ def _started(camera: Camera, settings: CameraSettings, given: StartCameras | Non
     return camera.with_parameters(p)
 
 
-def without_idle_cameras(network: Network, estimate: Estimate, *, cameras: int) -> tuple[Network, Estimate]:
+def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) -> tuple[Network, Estimate]:
     """Return the network and estimate without the cameras of single photographs that have left it.
 
     Args:
         network: as `split_cameras` returns it, or a part.
         estimate: of the same.
-        cameras: how many the survey has; as many stay as they are.
+        count: of cameras of the survey; as many stay as they are.
     """
-    if len(estimate.cameras) == cameras:
+    if len(estimate.cameras) == count:
         return network, estimate
     used = np.zeros(len(estimate.cameras), dtype=bool)
     used[network.camera] = True
@@ -133,9 +134,14 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, cameras: int) 
         *(number[seen.camera[keep]], seen.parameter[keep], seen.value[keep], seen.sigma[keep]),
         None if seen.correlation is None else seen.correlation[np.ix_(keep, keep)],
     )
+    observations = tuple(
+        one.of_cameras(used) if isinstance(one, MountObservations) else one for one in network.observations
+    )
+    mounts = None if estimate.mounts is None else estimate.mounts.select(used)
+    cameras = tuple(c for c, on in zip(estimate.cameras, used, strict=True) if on)
     return (
-        replace(network, camera=number[network.camera], interior=interior),
-        replace(estimate, cameras=tuple(c for c, on in zip(estimate.cameras, used, strict=True) if on)),
+        replace(network, camera=number[network.camera], interior=interior, observations=observations),
+        replace(estimate, cameras=cameras, mounts=mounts),
     )
 
 

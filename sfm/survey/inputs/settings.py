@@ -210,6 +210,8 @@ class RigSettings(Section):
     # data; a table image,moment (.csv); else a regular expression with one group, which is the moment,
     # searched for in the names of photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
+    # globs of the photographs of blocks of time, between which mounts changed and the cameras did not
+    blocks: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()
     tolerance_s: Annotated[float, Field(ge=0, le=86_400)] = 1.0  # between times of one moment, s
     # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
     # the reference camera; sigma 0 = held fixed

@@ -271,6 +271,8 @@ def _refuse_contradictions_of_rigs(
                     f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
                 )
             owner[name] = rig.name
+        if rig.blocks and rig.mounts is not None:
+            raise SurveyFileError(f"{here}: mounts and blocks, of which one is needed: blocks find theirs")
         if rig.moment != "order" and not rig.named:
             _refuse_pattern(rig.moment, here)
     for camera in cameras if rigs else ():
