@@ -64,11 +64,6 @@ class InteriorOrientation:
         """The camera models."""
         return tuple(sorted({family.camera.model for family in self.families}))
 
-    @property
-    def adjusted(self) -> int:
-        """How many parameters were adjusted."""
-        return sum(1 for one in self.parameters if np.isfinite(one.sigma))
-
 
 def interior_of(adjustment: Adjustment) -> InteriorOrientation:
     """Return the interior orientation of an adjustment."""

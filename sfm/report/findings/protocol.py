@@ -57,7 +57,6 @@ class CumulativeTest:
 
     camera: str
     parameters: str  # such as "K2, K3"
-    statistic: float
     probability: float  # of an F so large by chance
 
 
@@ -267,5 +266,5 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
             p = float(f_sf(statistic, len(some), a.redundancy))
             owner = camera.owner_of(int(free[some[0]]))
             which = ", ".join(names[s] for s in some)
-            tests[owner, which] = CumulativeTest(owner, which, statistic, p)
+            tests[owner, which] = CumulativeTest(owner, which, p)
     return tuple(tests.values())
