@@ -386,7 +386,7 @@ def coordinates(report: Report) -> Section:
 def _object_points(f: Findings) -> Table:
     a, unit, g = f.result.adjustment, f.result.length_unit, f.geometry
     rows = [
-        (name, *map(to_precision, xyz, sigma), *sigma, rays, "" if code < 0 else code, angle, rms)
+        (name, *zip(xyz, sigma, strict=True), *sigma, rays, "" if code < 0 else code, angle, rms)
         for name, xyz, sigma, rays, code, angle, rms in zip(
             *(a.network.points, a.estimate.points, f.precision.points, g.rays),
             *(f.result.code, g.angle_deg, g.point_rms_px),
@@ -394,7 +394,12 @@ def _object_points(f: Findings) -> Table:
         )
     ]
     heads = (
-        *(Column("point"), *axes("", unit, str), *axes("s", unit, or_fixed), *columns(">rays", ">code")),
+        *(
+            Column("point"),
+            *axes("", unit, _with_digits),
+            *axes("s", unit, or_fixed),
+            *columns(">rays", ">code"),
+        ),
         *(Column("angle", "", "deg", "z.1f"), Column("RMS", "", "px", "z.3f")),
     )
     return Table(heads, rows, all_in="points.csv")
@@ -408,14 +413,20 @@ def _exterior(f: Findings) -> Table:
         *(g.image_points, g.image_rms_px, g.hull),
         strict=True,
     )
-    rows = [(n, *map(to_precision, values, s), *s, *others) for n, values, s, *others in of_photographs]
+    rows = [(n, *zip(X, s, strict=True), *s, *others) for n, X, s, *others in of_photographs]
     names = ("omega", "phi", "kappa")
     heads = (
-        *(Column("photograph"), *axes("", unit, str), *(Column(one, "", "deg", str) for one in names)),
+        *(Column("photograph"), *axes("", unit, _with_digits)),
+        *(Column(one, "", "deg", _with_digits) for one in names),
         *(*axes("s", unit), *(Column(f"s {one}", "", "deg", significant) for one in names)),
         *(*columns(">points"), Column("RMS", "", "px", "z.4f"), Column("coverage", "", "%", "z.0f", 100.0)),
     )
     return Table(heads, rows, all_in="images.csv")
+
+
+def _with_digits(pair: tuple[float, float]) -> str:
+    """Write a coordinate or an angle to the second digit of its standard deviation."""
+    return to_precision(*pair)
 
 
 def photographs(report: Report) -> Section:
