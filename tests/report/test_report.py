@@ -28,6 +28,7 @@ from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
+from sfm.report import survey_report
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.findings.findings import findings_of
@@ -42,7 +43,8 @@ from sfm.report.numbers import (
     with_exponent,
 )
 from sfm.report.output import WRITTEN, plot_data, write_result
-from sfm.report.pages import html_of
+from sfm.report.page import Paragraph, Section
+from sfm.report.pages import html_of, page_of
 from sfm.report.phrases import words_left_out, words_of_precision
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
@@ -308,6 +310,27 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     assert "too small" in tags.text
     assert "1 of 9 photographs is not in the result." in tags.text
     assert f"{result.adjustment.sigma0_px:.4f}\N{NO-BREAK SPACE}px" in tags.text
+
+
+def test_a_new_section_is_a_function_and_a_row(result: SurveyResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    def weather(report: survey_report.Report) -> Section:
+        return Section("Weather", Paragraph(f"dry in {report.f.result.unit}"), key="weather")
+
+    monkeypatch.setattr(survey_report, "SECTIONS", (*survey_report.SECTIONS, weather))
+    found = findings_of(result)
+    page, lines = html_of(found), text_report(found).splitlines()
+    assert '<a href="#weather">Weather</a></nav>' in page and '<section id="weather">' in page
+    at = lines.index("Weather ".ljust(WIDTH, "="))
+    assert lines[at + 1] == "  dry in m"
+    keys = [one.key for one in page_of(found).sections if one.parts]
+    assert keys == [
+        *("worked", "quality", "rejected", "comparison", "coordinates", "photographs", "process"),
+        "weather",
+    ]
+    assert [one for one in lines if one.endswith("===")] == [
+        "=" * WIDTH,
+        *(f"{one.title} ".ljust(WIDTH, "=") for one in page_of(found).sections if one.parts and one.in_text),
+    ]
 
 
 def test_plots_are_legible_on_a_telephone(browser: Any, result: SurveyResult, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ NO_PICTURE = "no photograph was read for this page"
 
 @dataclass(frozen=True)
 class Viewer:
-    """Values for the template `viewer.html`."""
+    """What a page embeds of a viewer."""
 
     script: Markup  # to the letter, since the policy allows it by its hash
     style: Markup
