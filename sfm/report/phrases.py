@@ -85,7 +85,7 @@ def words_of_weights(result: SurveyResult) -> str:
         return ""
     return (
         "Weights: the standard deviations of the image points were multiplied by "
-        f"{factor:.3f}, from their own variance component, so that the other kinds of "
+        f"{factor:.3f}, from their variance component, so that the other kinds of "
         "observation keep those stated for them. A test of all observations together would pass by "
         "construction; each kind is tested against the standard deviations stated for it."
     )

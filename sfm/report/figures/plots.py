@@ -114,7 +114,7 @@ _RESIDUALS = (
     "their mean in each cell. A pattern in the means is distortion that the camera model does not describe."
 )
 _DISTRIBUTION = (
-    "Residuals divided by their own standard deviation, against the normal distribution, and residuals by "
+    "Residuals divided by their standard deviations, against the normal distribution, and residuals by "
     "distance from the centre of the photograph."
 )
 _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points of each photograph."
