@@ -34,7 +34,7 @@ from sfm.survey.diagnosis.contradicting_codes import (
     plates_elsewhere,
     remarks_on_contested,
 )
-from sfm.survey.diagnosis.own_camera import treat_lost
+from sfm.survey.diagnosis.own_camera import find_photograph_cameras
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs
@@ -42,7 +42,7 @@ from sfm.survey.measuring.tie_points import needed_rays
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
-LET_GO = 100.0  # tolerances: median residual of a photograph beyond which nothing has held it
+MAX_STRAY = 100.0  # tolerances: median residual of a photograph beyond which it has left its points
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 
@@ -59,9 +59,9 @@ class Correspondences:
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     remarks: tuple[Remark, ...] = ()
     point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
-    given: bool = False  # whether the survey's own approximate values were what the orientation started from
+    given: bool = False  # whether the orientation started from approximate values that the survey gives
     left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
-    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    suspected: tuple[str, ...] = ()  # photographs that could be matched with a per-photograph camera only
     overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
 
@@ -97,12 +97,12 @@ def find_correspondences(
     matched, left_out, contested = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)
-    told = {name for name, _ in left_out}
+    named = {name for name, _ in left_out}
     lost = start.estimate.oriented & ~circles.estimate.oriented
     left_out += tuple(
         (photographs.names[i], remark("photograph_with_few_accepted", needed=MIN_IMAGE_POINTS))
         for i in np.flatnonzero(lost)
-        if photographs.names[i] not in told
+        if photographs.names[i] not in named
     )
     return Correspondences(
         circles.network,
@@ -126,7 +126,7 @@ class _Matched:
     naming: Naming
     network: Network
     estimate: Estimate
-    suspected: tuple[str, ...]  # photographs that were matched with a camera of their own
+    suspected: tuple[str, ...]  # photographs that were matched with a per-photograph camera
 
 
 def _without_other_objects(
@@ -202,18 +202,18 @@ def _match_and_adjust(
         images, points = determined(network, estimate, everything, min_rays(naming))
         part, values = reduce_network(without_given(network), estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
-        estimate = merge_held(estimate, adjusted, images, points, tolerance_px=tolerance_px)
+        estimate = restore_strayed(estimate, adjusted, images, points, tolerance_px=tolerance_px)
         spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
     return _with_own_cameras(survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px)
 
 
-def merge_held(
+def restore_strayed(
     before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray, *, tolerance_px: float
 ) -> Estimate:
-    """Return the adjusted values, and those before of photographs that nothing has held.
+    """Return the adjusted values, and those before of photographs that have left their points.
 
-    Robust weights let go of a photograph that does not fit, as one that was zoomed, and it moves out of sight
+    Robust weights reject a photograph that does not fit, as one that was zoomed, and it moves out of sight
     of its points, or far away; the reason is looked for from where it was before.
 
     Args:
@@ -227,7 +227,7 @@ def merge_held(
     length = np.nan_to_num(np.linalg.norm(adjusted.residuals, axis=1), nan=np.inf)
     of_photograph = rows_of(adjusted.network.image_points.image, int(images.sum()))
     median = np.array([np.median(length[rows]) if len(rows) else 0.0 for rows in of_photograph])
-    lost = np.flatnonzero(images)[median > LET_GO * tolerance_px]
+    lost = np.flatnonzero(images)[median > MAX_STRAY * tolerance_px]
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
     position[lost], rotation[lost] = before.position[lost], before.rotation[lost]
     return replace(estimate, position=position, rotation=rotation)
@@ -236,17 +236,17 @@ def merge_held(
 def _with_own_cameras(
     survey: Survey, photographs: MeasuredPhotographs, matched: _Matched, tolerance_px: float
 ) -> _Matched:
-    """Match photographs that fit only with a camera of their own by that camera; else return what is there.
+    """Match photographs that fit only with a per-photograph camera by that camera; else return what is there.
 
     Which camera they have is for the adjustment; with the one of the others their targets lie beyond the
-    tolerance and would make points of their own.
+    tolerance and would make other points.
     """
     estimate = matched.estimate
     accepted = residual_lengths(matched.network, estimate) <= tolerance_px
-    treated = treat_lost(matched.network, estimate, accepted, oriented=estimate.oriented)
-    if treated is None or not treated.own:
+    per_photograph = find_photograph_cameras(matched.network, estimate, accepted, oriented=estimate.oriented)
+    if per_photograph is None or not per_photograph.own:
         return matched
-    own = replace(photographs, camera=treated.network.camera)
-    naming, found = match_uncoded(own, matched.naming, treated.estimate, tolerance_px=tolerance_px)
+    own = replace(photographs, camera=per_photograph.network.camera)
+    naming, found = match_uncoded(own, matched.naming, per_photograph.estimate, tolerance_px=tolerance_px)
     network = build_network(survey, photographs, naming)
-    return _Matched(naming, network, replace(found, cameras=estimate.cameras), treated.own)
+    return _Matched(naming, network, replace(found, cameras=estimate.cameras), per_photograph.own)

@@ -16,7 +16,7 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
-from sfm.survey.correspondences import merge_held
+from sfm.survey.correspondences import restore_strayed
 from sfm.survey.diagnosis.own_camera import SCALES, TOLERANCE
 from sfm.survey.inputs.settings import AdjustSettings
 from tests.survey.faults import planted
@@ -137,7 +137,7 @@ def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:
         residuals = adjusted.residuals.copy()
         residuals[network.image_points.image == 2] = off
         lost, all_of_them = replace(adjusted, residuals=residuals), np.ones(12, dtype=bool)
-        kept = merge_held(truth, lost, all_of_them[:4], all_of_them, tolerance_px=2.0)
+        kept = restore_strayed(truth, lost, all_of_them[:4], all_of_them, tolerance_px=2.0)
         assert np.array_equal(kept.position[2], truth.position[2])
         assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
         assert kept.oriented.all()

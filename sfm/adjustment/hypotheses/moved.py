@@ -1,6 +1,6 @@
 """Alternatives of an object that did not stay as it was: points, bodies or a part of it moved in between.
 
-They moved at a place in the sequence of photographs. Points that move by vectors of their own are tried by
+They moved at a place in the sequence of photographs. Points that move by different vectors are tried by
 their single gains, those that shift by one vector by two means, and bodies as they are known.
 """
 

@@ -2,7 +2,7 @@
 
 With long lenses all rays of a photograph are nearly parallel: principal distance, distance of the photographs
 and depth of the object can hardly be distinguished, Gauss-Newton creeps along a bent valley, and the object
-turned inside out in depth is a minimum of its own. With the cameras held at their start values there is no
+turned inside out in depth is another minimum. With the cameras held at their start values there is no
 such valley; from where that ends the cameras are freed.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 13.3.6 (affine cameras, reversal).
@@ -33,7 +33,7 @@ from sfm.observations.kind import is_observed
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.diagnosis.own_camera import Treated, treat_lost
+from sfm.survey.diagnosis.own_camera import PhotographCameras, find_photograph_cameras
 from sfm.survey.inputs.interior import without_idle_cameras
 from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.survey import Survey
@@ -57,7 +57,7 @@ class Task:
     network: Network
     needed: IntArray  # rays that each point needs to stay, (n,)
     least: IntArray  # image points that each photograph needs to stay, (m,)
-    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    suspected: tuple[str, ...] = ()  # photographs that could be matched with a per-photograph camera only
     # On the stated standard deviations of the image points. Where these are far too large, control and bars
     # bend the network by more than its noise, and their points seem to be gross errors.
     factor: float = 1.0
@@ -76,7 +76,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Settled:
+class StableAdjustment:
     """An adjustment after which no point or photograph leaves."""
 
     task: Task
@@ -88,15 +88,15 @@ class Settled:
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
     start_sigma0: float  # at the start values
     held: tuple[Remark, ...]  # parameters that were held because it did not converge with them
-    treated: Treated | None = None  # photographs with cameras of their own, or left out; None without
+    per_photograph: PhotographCameras | None = None  # or left out; None without such
 
-    def after(self, before: Settled) -> Settled:
+    def after(self, before: StableAdjustment) -> StableAdjustment:
         """Return it as what followed an earlier one."""
         return replace(
             self,
             iterations=before.iterations + self.iterations,
             start_sigma0=before.start_sigma0,
-            treated=self.treated or before.treated,
+            per_photograph=self.per_photograph or before.per_photograph,
         )
 
     @property
@@ -120,7 +120,7 @@ class Settled:
         return self.adjustment.rejected
 
 
-def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) -> Settled:
+def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) -> StableAdjustment:
     """Adjust until the points and photographs that are left stay.
 
     Args:
@@ -156,12 +156,14 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
         if (left_images == images).all() and (left_points == points).all():
-            return Settled(task, adjustment, images, points, accepted, iterations, rays, start_sigma0, held)
+            return StableAdjustment(
+                task, adjustment, images, points, accepted, iterations, rays, start_sigma0, held
+            )
         images, points = left_images, left_points
 
 
-def settle_treated(task: Task, estimate: Estimate) -> Settled:
-    """Adjust, then again with cameras of their own for the photographs that fit with them, others left out.
+def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
+    """Adjust, then again with per-photograph cameras where these fit, and without photographs that do not.
 
     Args:
         task: what to adjust; without tests nothing shows a photograph that does not fit.
@@ -170,30 +172,30 @@ def settle_treated(task: Task, estimate: Estimate) -> Settled:
     settled = settle(task, estimate)
     if task.survey.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
         return settled
-    treated = treat_lost(
+    per_photograph = find_photograph_cameras(
         task.network,
         settled.whole,
         settled.accepted,
         oriented=estimate.oriented,
         suspected=task.suspected,
     )
-    if treated is None:
+    if per_photograph is None:
         return settled
-    one, again = treated.estimate, ~treated.estimate.oriented & ~treated.without
+    one, again = per_photograph.estimate, ~per_photograph.estimate.oriented & ~per_photograph.without
     start = replace(
         one,
         position=np.where(again[:, None], estimate.position, one.position),
         rotation=np.where(again[:, None, None], estimate.rotation, one.rotation),
         points=np.where(one.determined[:, None], one.points, estimate.points),
     )
-    found = settle(replace(task, network=treated.network), start)
-    return replace(found, treated=treated, iterations=settled.iterations + found.iterations)
+    found = settle(replace(task, network=per_photograph.network), start)
+    return replace(found, per_photograph=per_photograph, iterations=settled.iterations + found.iterations)
 
 
 def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:
     """Return the last adjustment with its covariance; it begins without what was rejected, (k,).
 
-    Where other observations take part, the image points are weighted by their own variance component, unless
+    Where other observations take part, the image points are weighted by their variance component, unless
     the survey wants all weights as stated.
     """
     part, estimate = without_idle_cameras(part, estimate, count=len(task.survey.cameras))
@@ -283,7 +285,7 @@ def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
 
 
 def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float) -> Adjustment:
-    """Return the adjustment with the image points weighted by their own variance component.
+    """Return the adjustment with the image points weighted by their variance component.
 
     Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
     posteriori, which the image points decide, would scale these too. The component is that of the image

@@ -24,13 +24,17 @@ from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.result import (
-    ControlCheck,
-    LeftOutPoint,
-)
+from sfm.result import ControlCheck, LeftOutPoint
 from sfm.runtime.progress import report_step
 from sfm.solution import NO_SCALE
-from sfm.survey.adjusting.settling import Settled, Task, adjust_finally, on_points, settle, settle_treated
+from sfm.survey.adjusting.settling import (
+    StableAdjustment,
+    Task,
+    adjust_finally,
+    on_points,
+    settle,
+    settle_by_photograph,
+)
 from sfm.survey.adjusting.solution_remarks import (
     contradicted,
     handedness_unchecked,
@@ -97,8 +101,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
         survey: says the datum and the a priori sigma, and gives observed exterior orientation.
         matched: all image points, and approximate values of all that is to be adjusted.
 
-    Where the survey leaves to the photographs what is free, and texture shows that they were zoomed, each has
-    its own c.
+    Where the survey leaves to the photographs what is free, and texture shows that they were zoomed, c is
+    adjusted per photograph.
 
     Raises:
         GeometryError: too little is left to adjust, or control is asked for and not seen.
@@ -108,10 +112,11 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     if varying:
         report_step("adjusting c of each photograph")
         with suppress(GeometryError):
-            own = _solution(survey, matched, varying)
-            a = own.adjustment
-            if a.converged and not a.undetermined and _is_zoomed(varying, a.estimate):
-                return own
+            zoomed = _solution(survey, matched, varying)
+            a, focal = zoomed.adjustment, [c for _, c, _ in _own_c(varying, zoomed.adjustment.estimate)]
+            differs = any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal)  # more than by focusing
+            if a.converged and not a.undetermined and differs:
+                return zoomed
     return found
 
 
@@ -157,7 +162,7 @@ def _solution(
         _dropped(start, settled),
         (
             *start.remarks,
-            *(() if settled.treated is None else settled.treated.remarks),
+            *(() if settled.per_photograph is None else settled.per_photograph.remarks),
             *given.remarks,
             *gross,
             *better,
@@ -204,7 +209,7 @@ class _Prepared:
 class _Final:
     """A last adjustment and what it was settled from."""
 
-    settled: Settled
+    settled: StableAdjustment
     adjustment: Adjustment  # with the iterations of all adjustments on the way
     check: ControlCheck | None
     c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
@@ -229,7 +234,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     report_step("choosing the free parameters of the cameras")
     if datum == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
-    if datum == "minimal" and matched.given:  # what it holds are the given coordinates
+    if datum == "minimal" and matched.given:  # it holds the given coordinates fixed
         given = given_values(survey, network)
         held = np.where(given.determined[:, None], given.points, estimate.points)
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
@@ -262,7 +267,7 @@ def _with_own_c(settings: CameraSettings) -> CameraSettings:
     return settings.model_copy(update={"per_photograph": focal})
 
 
-def _free_network(start: _Prepared) -> Settled | None:
+def _free_network(start: _Prepared) -> StableAdjustment | None:
     """Adjust the image points alone: nothing that was given bends their network, or costs one of them.
 
     Returns:
@@ -278,7 +283,7 @@ def _free_network(start: _Prepared) -> Settled | None:
     report_step("adjusting the image points alone")
     network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=())
     try:
-        return settle_treated(replace(task.in_free_datum, network=network), estimate)
+        return settle_by_photograph(replace(task.in_free_datum, network=network), estimate)
     except GeometryError:
         if task.datum.kind != "control":
             raise
@@ -292,12 +297,12 @@ def _has_no_identity(survey: Survey) -> bool:
 
 
 def _judged(
-    start: _Prepared, free: Settled | None, plates: tuple[tuple[str, ...], ...]
+    start: _Prepared, free: StableAdjustment | None, plates: tuple[tuple[str, ...], ...]
 ) -> tuple[Task, JudgedGiven]:
     """Return the task with what was given, as on plates, as far as the image points confirm it."""
     task = start.task
     network = task.network
-    if free is not None:  # photographs may have got cameras of their own
+    if free is not None:  # with per-photograph cameras, if there are
         network = replace(
             free.task.network,
             control=network.control,
@@ -331,8 +336,8 @@ def _judged(
 
 
 def _settled(
-    start: _Prepared, free: Settled | None, task: Task, given: JudgedGiven
-) -> tuple[Settled, tuple[Remark, ...]]:
+    start: _Prepared, free: StableAdjustment | None, task: Task, given: JudgedGiven
+) -> tuple[StableAdjustment, tuple[Remark, ...]]:
     """Adjust the image points and what was given together.
 
     Args:
@@ -364,14 +369,14 @@ def _settled(
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
     if free is None:
-        return settle_treated(task, estimate), gross
+        return settle_by_photograph(task, estimate), gross
     if task.datum.kind != "control" and not len(task.network.scale_bars) and not task.network.observations:
         return _with_given(replace(free, task=task)), gross
     settled = settle(task, estimate, free.accepted).after(free)
     return replace(settled, held=settled.held or free.held), gross
 
 
-def _best(start: _Prepared, settled: Settled) -> tuple[_Final, tuple[Remark, ...]]:
+def _best(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:
     """Return the last adjustment, and a remark where it starts from a solution of smaller v'Pv."""
     found = _final(start, settled)
     if not found.others or not found.others[0].converges:
@@ -384,7 +389,7 @@ def _best(start: _Prepared, settled: Settled) -> tuple[_Final, tuple[Remark, ...
     return again, (_better_taken(found.adjustment, other),)
 
 
-def _final(start: _Prepared, settled: Settled, *, before: Adjustment | None = None) -> _Final:
+def _final(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:
     """Return the last adjustment of a settled network, and the other solutions that its image points allow.
 
     Args:
@@ -406,7 +411,9 @@ def _final(start: _Prepared, settled: Settled, *, before: Adjustment | None = No
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
-def _without_gross(task: Task, settled: Settled, estimate: Estimate) -> tuple[Task, tuple[Remark, ...]]:
+def _without_gross(
+    task: Task, settled: StableAdjustment, estimate: Estimate
+) -> tuple[Task, tuple[Remark, ...]]:
     """Return the task without observations of tables that contradict all others, by the settled network."""
 
     def adjusted(part: Network) -> Adjustment:
@@ -432,13 +439,13 @@ def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven
     if given.placing is not None and task.datum.kind == "control":
         found = given.placing.apply_estimate(found)
     elif task.datum.kind == "control":
-        return replace(before, cameras=found.cameras)  # photographs may have got cameras of their own
+        return replace(before, cameras=found.cameras)  # with per-photograph cameras, if there are
     lost = task.needed == 1  # control that one photograph sees is determined by its coordinates
     points = np.where((lost & ~found.determined)[:, None], before.points, found.points)
     return replace(found, points=points)
 
 
-def _with_given(settled: Settled) -> Settled:
+def _with_given(settled: StableAdjustment) -> StableAdjustment:
     """Return an adjustment with the network of its task, which has what was given beside the image points."""
     network = settled.task.network
     every = np.ones(len(network.image_points), dtype=bool)
@@ -456,7 +463,7 @@ def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     )
 
 
-def _placed(start: _Prepared, settled: Settled) -> tuple[Adjustment, ControlCheck | None]:
+def _placed(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, ControlCheck | None]:
     """Return the final adjustment of a settled network, placed on control or on the frame of its datum."""
     task, last, check = settled.task, settled.estimate, None
     if task.datum.kind != "control" and len(settled.part.control.complete) >= MIN_CONTROL:
@@ -472,9 +479,9 @@ def _placed(start: _Prepared, settled: Settled) -> tuple[Adjustment, ControlChec
     return adjust_finally(task, settled.part, last, settled.rejected), check
 
 
-def _dropped(start: _Prepared, settled: Settled) -> tuple[tuple[str, Remark], ...]:
+def _dropped(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Remark], ...]:
     """Return the photographs that had an orientation and are not in the result, with the reason."""
-    reasons = {} if settled.treated is None else dict(settled.treated.left_out)
+    reasons = {} if settled.per_photograph is None else dict(settled.per_photograph.left_out)
     task = start.task
     return tuple(
         (name, reasons.get(name, remark("photograph_with_few_accepted", needed=int(fewest))))
@@ -495,11 +502,6 @@ def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
         better=(other.c, other.unit),
         vPv=other.vPv,
     )
-
-
-def _is_zoomed(varying: frozenset[str], estimate: Estimate) -> bool:
-    """Return whether c of the photographs of a camera differs by more than focusing changes it."""
-    return any(max(c) > MAX_FOCUS_CHANGE * min(c) for _, c, _ in _own_c(varying, estimate))
 
 
 def _own_c(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:

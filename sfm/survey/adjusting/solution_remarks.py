@@ -82,7 +82,7 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
 def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
 
-    Points of a plate may be out of view: nobody expects all of them in the result.
+    Points of a plate may be out of view: not all of them are expected in the result.
     """
     remarks, known = [], set(network.points)
     plate = is_plate_control(survey.control, plate_control(survey.targets))
@@ -116,7 +116,7 @@ def left_out_points(
         accepted_rays: accepted rays of each point when it left, (n,).
         needed: rays that each point needs, (n,).
     """
-    told, rays = dict(reasons), whole.rays()
+    known, rays = dict(reasons), whole.rays()
     kept = set(in_result)
     out = []
     for j, name in enumerate(whole.points):
@@ -124,8 +124,8 @@ def left_out_points(
             continue
         if rays[j] < needed[j]:
             reason = remark("point_with_few_rays", rays=int(rays[j]), needed=int(needed[j]))
-        elif name in told:
-            reason = told[name]
+        elif name in known:
+            reason = known[name]
         elif accepted_rays[j] >= needed[j]:
             reason = remark("point_of_lost_photographs", measured=int(rays[j]), needed=int(needed[j]))
         else:
@@ -194,7 +194,7 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
 
 
 def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
-    """Return a remark where the residuals have a cause and c was held at a value that nobody measured."""
+    """Return a remark where the residuals have a cause and c was held at a value that was not measured."""
     if not held or not causes:
         return ()
     return (remark("c_held_contradicted", cameras=held),)

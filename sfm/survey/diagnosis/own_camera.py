@@ -48,25 +48,25 @@ OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple
 
 
 @dataclass(frozen=True)
-class Treated:
-    """A network after its photographs that did not fit were given a camera of their own, or left out."""
+class PhotographCameras:
+    """A network whose photographs that did not fit have per-photograph cameras, or are left out."""
 
     network: Network
     estimate: Estimate
     left_out: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
-    remarks: tuple[Remark, ...]  # on those with a camera of their own
+    remarks: tuple[Remark, ...]  # on those with per-photograph cameras
     own: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
 
 
-def treat_lost(
+def find_photograph_cameras(
     network: Network,
     estimate: Estimate,
     accepted: BoolArray,
     *,
     oriented: BoolArray,
     suspected: tuple[str, ...] = (),
-) -> Treated | None:
+) -> PhotographCameras | None:
     """Give photographs that lost most of their points a camera of their own, or leave them out.
 
     Args:
@@ -136,7 +136,7 @@ def treat_lost(
         return None
     position = np.where(out[:, None], np.nan, estimate.position)
     rotation = np.where(out[:, None, None], np.nan, estimate.rotation)
-    return Treated(
+    return PhotographCameras(
         network,
         replace(estimate, position=position, rotation=rotation),
         tuple(left),
