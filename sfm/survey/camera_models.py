@@ -43,7 +43,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
     """
     found, failure = None, None
     texture = survey.tie_points is not None
-    unsaid = [a for a, one in enumerate(survey.cameras) if texture and not one.says_its_model]
+    unsaid = [a for a, one in enumerate(survey.cameras) if texture and not one.states_model]
     try:
         found = orient_survey(survey, measured)
     except GeometryError as error:

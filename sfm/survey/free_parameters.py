@@ -65,7 +65,7 @@ def choose_free_parameters(
         The settings with what is free in each, and the estimate. Both as they were where the survey says it
         of every camera.
     """
-    silent = [a for a, one in enumerate(survey.cameras) if not one.says_what_is_free]
+    silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
     names: Chosen = [set(one.may_be_free) if a in silent else None for a, one in enumerate(survey.cameras)]

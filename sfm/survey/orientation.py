@@ -33,8 +33,8 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.circles import circle_misfit
-from sfm.survey.diagnosis.codes_found import words_of_codes
-from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
+from sfm.survey.diagnosis.codes_found import describe_codes
+from sfm.survey.diagnosis.lost_photographs import explain_lost_photographs, try_other_principal_distances
 from sfm.survey.diagnosis.no_base import refuse_no_base
 from sfm.survey.diagnosis.second_object import find_second_motion, find_second_objects
 from sfm.survey.free_parameters import choose_free_parameters
@@ -87,7 +87,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     except GeometryError as error:
         failure = error
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
-            raise GeometryError(words_of_codes(survey, measured.photographs)) from error
+            raise GeometryError(describe_codes(survey, measured.photographs)) from error
     wrong_c: tuple[Remark, ...] = ()
     if not given:
         found, wrong_c = try_other_principal_distances(network, estimate, found, orient_from)
@@ -114,7 +114,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     if survey.datum.kind != "control":
         estimate = place_on_observations(measured.network, estimate)
     found = replace(found, estimate=estimate)
-    return tell_lost_photographs(network, found, named=survey.tie_points is None)
+    return explain_lost_photographs(network, found, named=survey.tie_points is None)
 
 
 def _orient(
@@ -190,7 +190,7 @@ def _hold_cameras_of_two(
     cameras = list(estimate.cameras)
     for index in used.tolist():
         camera = cameras[index]
-        said = survey.cameras[index].says_what_is_free
+        said = survey.cameras[index].states_free
         free = set(np.array(camera.names)[camera.free]) if said else set(survey.cameras[index].may_be_free)
         names = [name for name in camera.names if name in free]
         if names:

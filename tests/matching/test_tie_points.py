@@ -60,7 +60,7 @@ from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.covering_points import _returning, find_covering_points
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.survey.other_programs import OtherPrograms
-from sfm.survey.refining.refinement import refine_model, refinement_text
+from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
 from sfm.textbook.along_line import match_along_line
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
@@ -749,7 +749,7 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
         ({"min_correlation": 7.0}, "smallest correlation is 7, needed 0 to 1"),
     ):
         with pytest.raises(GeometryError, match=message):
-            refine_model(network, estimate, tmp_path, **wrong)
+            RefineSettings(**wrong)
     nothing = replace(estimate, points=estimate.points * np.nan)
     with pytest.raises(GeometryError, match="nothing to refine"):
         refine_model(network, nothing, tmp_path)

@@ -200,6 +200,6 @@ def test_image_points_that_are_given_keep_the_camera_given_with_them() -> None:
     camera = CameraSetup(
         name="a", size_px=truth.cameras[0].size_px, pixel_mm=truth.cameras[0].pixel_mm.tolist(), c_mm=10.0
     )
-    assert not camera.says_what_is_free
+    assert not camera.states_free
     survey = replace(survey_of(network, truth), cameras=(camera,))
-    assert survey.cameras[0].says_what_is_free and survey.cameras[0].free == ()
+    assert survey.cameras[0].states_free and survey.cameras[0].free == ()

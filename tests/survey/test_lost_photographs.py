@@ -16,8 +16,8 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.lost_photographs import (
+    explain_lost_photographs,
     lost_groups,
-    tell_lost_photographs,
     try_other_principal_distances,
 )
 from sfm.survey.inputs.survey import Survey
@@ -56,7 +56,7 @@ def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -
     (group,) = lost_groups(network, estimate)
     assert group.images.tolist() == [6, 7, 8, 9] and not group.connected
     assert [network.points[j] for j in group.shared] == ["21", "22"]
-    found = tell_lost_photographs(network, orientation(network, estimate))
+    found = explain_lost_photographs(network, orientation(network, estimate))
     (lost,) = found.remarks
     assert lost.kind == "not_connected" and lost.number("oriented") == 6 and lost.number("needed") == 4
     assert lost.names("photographs") == ("image 7", "image 8", "image 9", "image 10")
@@ -85,7 +85,9 @@ def test_points_of_one_oriented_photograph_connect_nothing() -> None:
     assert not group.connected and group.shared.tolist() == [20, 21]
     (group,) = lost_groups(network, estimate)
     assert group.connected
-    told = tell_lost_photographs(network, orientation(network, replace(estimate, points=points)), named=False)
+    told = explain_lost_photographs(
+        network, orientation(network, replace(estimate, points=points)), named=False
+    )
     assert not told.remarks[0].names("shared") and not told.remarks[0].names("others")
 
 
@@ -97,7 +99,7 @@ def test_a_photograph_with_fewer_points_than_it_needs_is_no_group(shown: int) ->
     kept = np.isin(np.arange(len(seen)), own) | (seen.image > 0) & ~np.isin(seen.point, seen.point[own])
     network = replace(network, image_points=seen.select(kept))
     before = orientation(network, partly(truth, np.arange(IMAGES) > 0))
-    found = tell_lost_photographs(network, before)
+    found = explain_lost_photographs(network, before)
     if shown < 4:
         assert found is before
     else:
@@ -109,7 +111,7 @@ def test_photographs_that_are_connected_are_no_group_of_their_own() -> None:
     estimate = partly(truth, np.arange(IMAGES) < 6)
     assert all(group.connected for group in lost_groups(network, estimate))
     found = orientation(network, estimate)
-    assert tell_lost_photographs(network, found) is found
+    assert explain_lost_photographs(network, found) is found
 
 
 @pytest.mark.parametrize("free", [True, False])

@@ -84,13 +84,13 @@ def undetermined_of(
     if optimum.motions.defect > allowed_motions:
         words.append(
             f"datum: {optimum.motions.defect - allowed_motions} of the seven of position, attitude and scale "
-            f"are not determined by the control: {words_of_motions(optimum, layout)}"
+            f"are not determined by the control: {describe_motions(optimum, layout)}"
         )
     words += [_name(vector, layout, network, estimate) for vector in optimum.factor.further.T]
     return tuple(words)
 
 
-def words_of_motions(optimum: Optimum, layout: Unknowns) -> str:
+def describe_motions(optimum: Optimum, layout: Unknowns) -> str:
     """Return the motions that the observations leave open: "shift along X and Y, rotation about Z, scale".
 
     A rotation about an axis that does not run through the centre of the points is a rotation here, the shift

@@ -74,7 +74,7 @@ def refine(
         from sfm.report.refinement import Numbers, words_of_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import read_survey
-        from sfm.survey.refining.refinement import refine_model, refinement_text
+        from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
         from sfm.survey.refining.targets import measure_model_targets
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
@@ -92,10 +92,9 @@ def refine(
             opened.network,
             opened.estimate,
             images,
-            window_px=window,
-            min_correlation=min_correlation,
-            fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
-            masks_dir=masks,
+            RefineSettings(
+                window, min_correlation, tuple(name.strip() for name in fix.split(",") if name.strip()), masks
+            ),
             targets=targets,
             progress=progress,
         )

@@ -95,14 +95,12 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
 
     Points that keep too few rays and photographs that keep too few points leave the network, and the rest
     is adjusted again. A free network is placed on the scale bars and the control, where there are some,
-    without changing its shape.
+    without changing its shape. Where the survey leaves to the photographs what is free, and texture shows
+    that they were zoomed, c is adjusted per photograph.
 
     Args:
         survey: says the datum and the a priori sigma, and gives observed exterior orientation.
         matched: all image points, and approximate values of all that is to be adjusted.
-
-    Where the survey leaves to the photographs what is free, and texture shows that they were zoomed, c is
-    adjusted per photograph.
 
     Raises:
         GeometryError: too little is left to adjust, or control is asked for and not seen.
@@ -125,7 +123,7 @@ def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     if survey.tie_points is None or survey.rigs or not differs:
         return frozenset()
-    return frozenset(one.name for one in survey.cameras if not one.says_what_is_free)
+    return frozenset(one.name for one in survey.cameras if not one.states_free)
 
 
 def _solution(

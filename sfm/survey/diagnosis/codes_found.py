@@ -162,7 +162,7 @@ def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[R
     )
 
 
-def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
+def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say how many targets and codes were found where more codes were needed, and what decides on that."""
     if plates := missing_plates(survey.family, photographs):
         return _in_error(*plates)
@@ -177,7 +177,7 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
         f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
-        f"{_words_of_size(survey, photographs)}{_other_settings(survey, photographs)}"
+        f"{_describe_size(survey, photographs)}{_other_settings(survey, photographs)}"
     )
 
 
@@ -217,7 +217,7 @@ def _in_error(one: Remark) -> str:
     return f"{one.text.rstrip('.')}: {one.remedy.rstrip('.')}"
 
 
-def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
+def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say that codes are too small to read, or that candidates are below the least diameter, if so."""
     if small := small_codes(photographs.targets):
         return f"; {_in_error(*small)}"

@@ -31,7 +31,7 @@ class Lost:
     connected: bool  # whether one of them shows enough of these to be oriented
 
 
-def tell_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
+def explain_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
     """Return the orientation with what is missing between the groups of photographs that are not connected.
 
     A photograph with fewer points than any orientation needs is no group: its own reason says so.

@@ -129,7 +129,7 @@ class CameraSettings(Section):
         return (*self.free, *(name for name, _ in self.weighted))
 
     @property
-    def says_what_is_free(self) -> bool:
+    def states_free(self) -> bool:
         """Whether `free` is there, empty or not, or a calibration; else the photographs decide."""
         varying = self.per_photograph or self.per_group
         return bool(
@@ -137,16 +137,14 @@ class CameraSettings(Section):
         )
 
     @property
-    def says_its_model(self) -> bool:
+    def states_model(self) -> bool:
         """Whether `model` is there, or parameters that are those of one; else the photographs decide."""
-        return bool(
-            "model" in self.model_fields_set or self.says_what_is_free or self.start or self.calibration
-        )
+        return bool("model" in self.model_fields_set or self.states_free or self.start or self.calibration)
 
     @property
     def may_be_free(self) -> tuple[str, ...]:
         """Parameters that are adjusted without an observation, or may be where nothing is said."""
-        if self.says_what_is_free:
+        if self.states_free:
             return self.free
         return tuple(name for name in MODELS[self.model].names if name in FREED_FIRST)
 

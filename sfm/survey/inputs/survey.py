@@ -134,7 +134,7 @@ class Survey:
         if (
             self.observations is not None
         ):  # they are adjusted as they are, with the camera that goes with them
-            said = [one if one.says_what_is_free else one.model_copy(update={"free": ()}) for one in cameras]
+            said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
             cameras = tuple(said)
         datum: object = self.datum
         if isinstance(datum, Datum):

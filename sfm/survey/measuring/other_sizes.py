@@ -127,7 +127,7 @@ def _kind(size: Size, main: Size) -> str:
 
 def _held(camera: CameraSettings) -> bool:
     """Return whether a camera is held at given values, which belong to its whole photograph."""
-    return bool(camera.fixed or camera.weighted or (camera.says_what_is_free and not camera.may_be_free))
+    return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 
 
 def _resized(

@@ -75,7 +75,7 @@ def orient(
             anew, estimate, np.ones(len(anew.image_points), dtype=bool), rays
         )
     except GeometryError as error:
-        why = words_of_reasons(by_count(lost))
+        why = describe_reasons(by_count(lost))
         raise GeometryError(
             f"refine: {int(good.sum())} of {len(seen)} key points could be measured anew"
             + (f" (not: {why})" if why else "")
@@ -109,7 +109,7 @@ def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[st
         GeometryError: no redundancy.
     """
     if adjusted.redundancy <= 0:
-        why = words_of_reasons(by_count(lost))
+        why = describe_reasons(by_count(lost))
         raise GeometryError(
             f"refine: {counted(2 * len(part.image_points), 'coordinate')} of {len(part.points)} points "
             "measured anew in "
@@ -141,7 +141,7 @@ def by_count(reasons: list[tuple[str, int]]) -> tuple[tuple[str, int], ...]:
     return tuple((why, count) for why, count in sorted(reasons, key=lambda one: -one[1]) if count)
 
 
-def words_of_reasons(reasons: tuple[tuple[str, int], ...]) -> str:
+def describe_reasons(reasons: tuple[tuple[str, int], ...]) -> str:
     """Return the reasons as a list within a sentence."""
     return ", ".join(f"{count} {why}" for why, count in reasons)
 

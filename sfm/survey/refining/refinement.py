@@ -36,12 +36,12 @@ from sfm.survey.refining.model_photographs import outside_masks
 from sfm.survey.refining.oriented_windows import (
     Oriented,
     by_count,
+    describe_reasons,
     orient,
     part_of,
     reasons_of,
     refuse_undetermined,
     whole_model,
-    words_of_reasons,
 )
 from sfm.survey.refining.targets import ModelTargets
 from sfm.survey.refining.windows import (
@@ -172,15 +172,34 @@ class Refinement:
         return np.arange(int(self.points.sum()), len(self.adjustment.network.points))
 
 
+@dataclass(frozen=True)
+class RefineSettings:
+    """How image points are measured anew.
+
+    Raises:
+        GeometryError: an impossible window or correlation.
+    """
+
+    window_px: int | None = None  # odd side of the windows, at most MAX_WINDOW_PX; the best of some if None
+    min_correlation: float = 0.7  # smallest coefficient r of a window and its template, 0 to 1
+    fixed: tuple[str, ...] = ()  # interior parameters that are held at the model's values, as fx, cx or k1
+    masks_dir: Path | None = None
+    """folder of masks, named as their photographs with .png behind; black key points take no part"""
+
+    def __post_init__(self) -> None:
+        """Refuse what is impossible before a photograph is read."""
+        if self.window_px is not None and odd_window("refine", self.window_px) > MAX_WINDOW_PX:
+            raise GeometryError(f"refine: window is {self.window_px} px, needed at most {MAX_WINDOW_PX} px")
+        if not 0 <= self.min_correlation <= 1:
+            raise GeometryError(f"refine: smallest correlation is {self.min_correlation:g}, needed 0 to 1")
+
+
 def refine_model(
     network: Network,
     estimate: Estimate,
     images_dir: Path,
+    settings: RefineSettings = RefineSettings(),
     *,
-    window_px: int | None = None,
-    min_correlation: float = 0.7,
-    fixed: tuple[str, ...] = (),
-    masks_dir: Path | None = None,
     targets: ModelTargets | None = None,
     progress: Progress = SILENT,
 ) -> Refinement:
@@ -193,27 +212,20 @@ def refine_model(
         network: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
         estimate: its solution.
         images_dir: folder of its photographs.
-        window_px: odd side of the windows, at most MAX_WINDOW_PX; what the surface bears if not given.
-        min_correlation: smallest coefficient r of a window and its template, 0 to 1.
-        fixed: names of interior parameters that are held at the model's values, as fx, cx or k1.
-        masks_dir: folder of masks, named as their photographs with .png behind; key points where a mask is
-            black take no part.
+        settings: windows, and what is held.
         targets: of its photographs, in the frame of the estimate; see `measure_model_targets`.
         progress: receives stages and parts.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
         PhotographError: a photograph that cannot be read, or of another size than its camera.
-        GeometryError: an impossible window, correlation or name to hold, or too little is left to adjust.
+        GeometryError: an impossible name to hold, or too little is left to adjust.
     """
-    if window_px is not None and odd_window("refine", window_px) > MAX_WINDOW_PX:
-        raise GeometryError(f"refine: window is {window_px} px, needed at most {MAX_WINDOW_PX} px")
-    if not 0 <= min_correlation <= 1:
-        raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
+    window_px = settings.window_px
     seen = network.image_points
     if not len(seen):
         raise GeometryError("refine: no key point of the model has a point, nothing to refine")
-    estimate = replace(estimate, cameras=free_cameras(network, estimate, fixed))
+    estimate = replace(estimate, cameras=free_cameras(network, estimate, settings.fixed))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     depth, distance = _lengths(network, estimate)
     within = depth > np.cos(np.radians(MAX_OFF_AXIS_DEG)) * distance
@@ -230,8 +242,8 @@ def refine_model(
     first, start, _, _ = part_of(network, estimate, usable, np.full(len(network.points), MIN_RAYS))
     readjusted = with_neighbours(adjust(first, start, datum=Datum("free"), reject="none"))
     masked = np.zeros(len(seen), dtype=bool)
-    if masks_dir is not None:
-        masked = outside_masks(network, estimate, masks_dir)
+    if settings.masks_dir is not None:
+        masked = outside_masks(network, estimate, settings.masks_dir)
     beyond = int((np.isfinite(depth) & ~usable & ~masked).sum())
     reference = _references(network, estimate, usable & ~masked)
     rows = np.flatnonzero((reference >= 0)[seen.point] & usable & ~masked)
@@ -242,7 +254,7 @@ def refine_model(
             f"black, {len(seen) - black - beyond} of points that fewer than {MIN_RAYS} photographs see"
             + (f", {beyond} {BEYOND}" if beyond else "")
         )
-    limits = Limits(max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread), min_correlation)
+    limits = Limits(max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread), settings.min_correlation)
     keys = KeyPoints(images_dir, network, rows, reference, limits)
 
     def reasons(windows: Windows) -> list[tuple[str, int]]:
@@ -320,7 +332,7 @@ def _off_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
 
 def refinement_text(result: Refinement) -> str:
     """Return the lines that the command line prints."""
-    why = words_of_reasons(result.reasons)
+    why = describe_reasons(result.reasons)
     return (
         f"key points    {result.refined} of {result.key_points} measured anew"
         + (f" (not: {why})" if why else "")
@@ -330,12 +342,12 @@ def refinement_text(result: Refinement) -> str:
         f"{result.readjusted_px:.4f} px adjusted anew\n"
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
-        + _words_of_targets(result)
+        + _describe_targets(result)
         + "".join(f"{one.severity}: {one.text}\n" for one in result.remarks)
     )
 
 
-def _words_of_targets(result: Refinement) -> str:
+def _describe_targets(result: Refinement) -> str:
     """Return the line of targets, control and scale bars; none where they were not asked for."""
     if result.targets is None:
         return ""

@@ -240,8 +240,8 @@ def test_a_lens_that_is_called_a_fisheye_is_drafted_as_one(
         Image.new("L", (120, 80), 10 * k).save(tmp_path / f"{k}.jpg", exif=exif)
     (tmp_path / "survey.toml").write_text(draft_survey(tmp_path).text, encoding="utf-8")
     (camera,) = read_survey_file(tmp_path / "survey.toml").cameras
-    assert camera.model == (model or "brown") and camera.says_its_model == (model is not None)
-    assert not camera.says_what_is_free
+    assert camera.model == (model or "brown") and camera.states_model == (model is not None)
+    assert not camera.states_free
 
 
 def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
