@@ -18,7 +18,7 @@ from sfm.adjustment.quality.given_values import NONCENTRALITY, GivenModel, Given
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, Network, ObjectPoints
+from sfm.network import ExteriorObservations, Network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given_groups import (
@@ -120,20 +120,21 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
 def _judged(task: Task) -> JudgedGiven:
     """Judge points, then the scales of bars and points."""
     network, datum = task.network, task.datum
-    control, centres = _control_of(task), _centres_of(task)
-    groups = [one for one in (control, centres) if one is not None]
+    control, seen = network.control, network.exterior
+    names = [network.points[j] for j in control.point], [network.images[i] for i in seen.image]
+    both = (
+        _group(task, "control", names[0], task.places.of_point, control.xyz, control.covariance),
+        _group(task, "centres", names[1], task.places.of_image, seen.position, seen.covariance[:, :3, :3]),
+    )
+    groups = [one for one in both if one is not None]
     scales = judge_scales(task, [one for one in groups if one.dependable])
     used = [one for one in groups if not one.placed.mirrored and one.of not in scales.left_out]
     contradiction = contradiction_of(task, used)
     if contradiction is not None:
         used = []
     network = replace(network, scale_bars=scales.bars)
-    if control is not None:
-        taken = _judged_control(task, control) if control in used else ObjectPoints()
-        network = replace(network, control=taken)
-    if centres is not None:
-        seen = _judged_centres(task, centres) if centres in used else ExteriorObservations()
-        network = replace(network, exterior=seen)
+    for one in groups:
+        network = _as_judged(network, one, rescale=task.rescale, used=one in used)
     if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
     return JudgedGiven(
@@ -150,34 +151,19 @@ def _judged(task: Task) -> JudgedGiven:
     )
 
 
-def _control_of(task: Task) -> Group | None:
-    control = task.network.control
-    names = [task.network.points[j] for j in control.point]
-    return _group(task, "control", names, task.places.of_point, control.xyz, control.covariance)
-
-
-def _centres_of(task: Task) -> Group | None:
-    seen = task.network.exterior
-    names = [task.network.images[i] for i in seen.image]
-    return _group(task, "centres", names, task.places.of_image, seen.position, seen.covariance[:, :3, :3])
-
-
-def _judged_control(task: Task, group: Group) -> ObjectPoints:
-    """Return control without what does not fit, or changed."""
-    control = task.network.control
-    order, keep, covariance = group.as_judged(control.covariance, rescale=task.rescale)
-    return ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep])
-
-
-def _judged_centres(task: Task, group: Group) -> ExteriorObservations:
-    """Return observed orientation without projection centres that do not fit, or changed."""
-    seen = task.network.exterior
-    order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=task.rescale)
+def _as_judged(network: Network, group: Group, *, rescale: bool, used: bool) -> Network:
+    """Return the network with the given points of a kind that fit; with none of them where not used."""
+    if group.of == "control":
+        control = network.control
+        order, keep, covariance = group.as_judged(control.covariance, rescale=rescale)
+        control = replace(control, xyz=control.xyz[order], covariance=covariance)
+        return replace(network, control=control.select(keep & used))
+    seen = network.exterior
+    order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=rescale)
     covariance = seen.covariance[order]
     covariance[:, :3, :3] = of_centres
-    return ExteriorObservations(
-        seen.image[keep], seen.position[order][keep], seen.angles[order][keep], covariance[keep]
-    )
+    seen = replace(seen, position=seen.position[order], angles=seen.angles[order], covariance=covariance)
+    return replace(network, exterior=seen.select(keep & used))
 
 
 def _group(
