@@ -206,11 +206,6 @@ def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | 
     return Optimum(state, found.equations, found.factor, found.motions, True, 0, vPv, vPv)
 
 
-def newton_step(problem: Problem, state: State, weight: FloatArray) -> Step | None:
-    """Return the undamped step from a state; None where the normal equations cannot be solved."""
-    return _solve(problem, state, weight)
-
-
 def _solve(
     problem: Problem,
     state: State,

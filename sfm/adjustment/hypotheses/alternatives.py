@@ -79,7 +79,7 @@ def alternatives_of(
     found = [
         *interiors(a, reduced, HELD),
         *interiors(a, reduced, GIVEN),
-        *_format(a, reduced),
+        *_in_all(reduced, FORMAT, format_columns(a)),
         *_by_photographs(a, reduced, columns),
         *moved_points(reduced),
         *moved_bodies(a, reduced, columns, bodies),
@@ -184,11 +184,6 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
                     key=lambda one: one.factor,
                 )
                 yield score_alternative(reduced, family, everywhere, gain, spread, parameters=parameters)
-
-
-def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
-    """Return the alternative of residuals that depend on the place in the photograph."""
-    return _in_all(reduced, FORMAT, format_columns(a))
 
 
 def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[Alternative]:
