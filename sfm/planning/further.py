@@ -59,8 +59,8 @@ def further_photographs(
 ) -> Further:
     """Return the photographs that help the weakest points of a survey most.
 
-    They are taken with the camera that most photographs have, from the distances and within the room that it
-    was photographed from.
+    They are taken with the camera that most photographs have, without the others of its rig, from the
+    distances and within the room that it was photographed from.
 
     Args:
         network: of the survey, with the standard deviations that its image points turned out to have.
@@ -110,11 +110,13 @@ def further_photographs(
         np.concatenate([seen.xy, sight.xy[i, j]]),
         np.concatenate([seen.covariance, sight.covariance[i, j]]),
     )
+    moment = network.moment  # of photographs of a rig: further ones are single
     larger = replace(
         network,
         images=(*network.images, *names),
         camera=np.concatenate([network.camera, np.full(len(chosen), camera)]),
         image_points=more,
+        moment=None if moment is None else np.append(moment, moment.max() + 1 + np.arange(len(chosen))),
     )
     state = replace(
         estimate,

@@ -30,6 +30,8 @@ from sfm.report.pages import write_page
 from sfm.solution import Solution
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
+from tests.rigs import make_rig
+from tests.synthetic import seed_of
 
 CAMERA = camera_from_values("c", "brown", (3000, 2000), (0.006, 0.006), c_mm=18.0, free=("c", "x0", "y0"))
 
@@ -61,6 +63,14 @@ def test_further_photographs_help_the_weakest_points(tmp_path: Path) -> None:
     page = write_page(found, tmp_path / "more", result=result).read_text(encoding="utf-8")
     assert headline(found, result) in page and weakest(found, result)[0][1] in page
     assert (tmp_path / "more" / "exterior.csv").read_text(encoding="utf-8").count("\n") == 3
+
+
+def test_further_photographs_of_a_rig_are_single_ones() -> None:
+    network, truth = make_rig(seed_of("further"), moments=4)
+    found = further_photographs(network, truth, sigma_px=0.1, count=2)
+    assert found.camera == "camera 1" and (found.after < found.before).all()
+    moment = found.adjustment.network.moment
+    assert moment is not None and moment.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 5]
 
 
 def test_what_cannot_be_helped_is_said() -> None:
