@@ -11,6 +11,8 @@ import numpy as np
 from sfm.conventions import FloatArray, rotation_from_vector, skew
 from sfm.observations.groups import Fit, Group
 
+ON_LINE = 1e-6  # of the largest singular value, below which a turn does not change coordinates given
+
 
 class RigidFrames(Group):
     """Coordinates of points in a system of their own, known up to a motion of it."""
@@ -26,7 +28,7 @@ class RigidFrames(Group):
         R, t = _motion(self.value, X, W.mean(axis=1))
         for _ in range(5):  # to the weights of single coordinates
             local = (X - t) @ R
-            H = self._by_motion()
+            H, _ = self._by_motion(local)
             root = np.sqrt(W)
             rows, l = root.reshape(-1, 1) * H.reshape(-1, 6), (root * (local - self.value)).ravel()
             step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-12)[0], dtype=float)
@@ -35,23 +37,38 @@ class RigidFrames(Group):
             t = t + R @ step[:3] + (R - turned) @ centre
             R = turned
         local = (X - t) @ R
+        H, about = self._by_motion(local)
         Jx = np.zeros((len(X), 3, len(X), 3))
         Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
-        return Fit(local - self.value, Jx, self._by_motion())
+        if about.any():
+            root = np.sqrt(W).ravel()[:, None]
+            U, singular, _ = np.linalg.svd(root * about.reshape(len(root), -1), full_matrices=False)
+            U = U[:, singular > ON_LINE * singular[0]]
+            H, Jx = (
+                (A - U / root @ (U.T @ (root * A))).reshape(shape)
+                for A, shape in ((one.reshape(len(root), -1), one.shape) for one in (H, Jx))
+            )
+        return Fit(local - self.value, Jx, H)
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the coordinates of a mirrored system."""
         return {"mirrored": replace(self, value=self.value * [1.0, 1.0, -1.0])}
 
-    def _by_motion(self) -> FloatArray:
+    def _by_motion(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).
 
-        They are those of the coordinates given: of points on a line a turn about it changes nothing.
+        Of points on a line a turn about it changes nothing but the errors of their coordinates: it is no
+        parameter, and its derivatives (p, 3, 3) are those that the second array has.
+
+        Args:
+            local: R'(X - t), (p, 3).
         """
-        H = np.zeros((len(self.value), 3, 6))
-        H[:, :, :3] = -np.eye(3)
-        H[:, :, 3:] = skew(self.value - self.value.mean(axis=0))
-        return H
+        given, found = (skew(x - self.value.mean(axis=0)) for x in (self.value, local))
+        _, singular, Vt = np.linalg.svd(given.reshape(-1, 3), full_matrices=False)
+        on = singular > ON_LINE * singular[0]
+        shift = np.tile(-np.eye(3), (len(local), 1, 1))
+        turn, about = (found @ Vt[rows].T @ Vt[rows] for rows in (on, ~on))
+        return np.concatenate([shift, turn], axis=2), about
 
 
 def _motion(source: FloatArray, target: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -447,3 +447,17 @@ def test_the_how_to_lists_the_columns_of_every_kind(kind: str) -> None:
     text = (Path(__file__).parents[2] / "docs" / "how-to" / "scale-and-control.md").read_text("utf-8")
     (row,) = [line for line in text.splitlines() if line.startswith("|") and f"`{kind}`" in line]
     assert f"| {','.join((*of.texts, *of.columns()))} |" in row
+
+
+@pytest.mark.parametrize("line", [False, True])
+def test_a_frame_alone_gives_the_scale_and_leaves_position_and_attitude_open(line: bool) -> None:
+    """With its errors: they turn with the network, and a bar may turn about itself."""
+    network, truth = network_of("frame alone", ())
+    rng = seed_of("one frame")
+    local = truth.points[14:21] + 1e-4 * rng.standard_normal((7, 3))
+    if line:
+        local = np.linspace(-0.5, 0.5, 7)[:, None] * [np.sqrt(0.77), 0, 0]
+    frame = RigidFrames("frame", np.arange(7) + 14 * (not line), local, np.full((7, 3), 1e-4))
+    a = adjust(replace(network, observations=(frame,)), truth, reject="none", datum=Datum("free"))
+    assert a.defect == a.expected_defect == 6 and not a.undetermined
+    assert np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2)).max() < 3e-4
