@@ -8,6 +8,7 @@ Source: Baarda (1973), S-transformations and criterion matrices.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,8 @@ from sfm.reduced_network import reduce_network
 from sfm.similarity import similarity_motions
 
 RIG = "rig"
+MIN_SHAPE = 3  # points that have one
+OPEN = 1e-6  # share of a rotation or scale in open motions; it is of their order or rounding
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,12 @@ class Contribution:
 
     name: str  # of the kind
     count: int  # observations, or moments of the rig
-    motions: int  # of position, attitude and scale that nothing else gives
+    shifts: int  # of the network that nothing else fixes, up to 3
+    rotations: int  # likewise
+    scale: bool  # whether nothing else gives it
     points: int  # that nothing else determines
-    sigma_without: float  # of the shape of the other points, RMS of a coordinate, object unit
+    sigma_without: float  # of the shape of the other points, RMS of a coordinate, object unit; infinite where
+    # nothing is determined without it
     sigma_with: float
 
     @property
@@ -58,23 +64,23 @@ def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
 
 def _contribution(a: Adjustment, name: str, count: int, network: Network, estimate: Estimate) -> Contribution:
     """Return what is gained from a network without a kind to the whole one."""
-    try:
-        less = predict(network, estimate)
-    except GeometryError:  # others that need a scale, which only this one gives
-        rest = tuple(kind for kind in network.observations if not kind.needs_scale)
-        less = predict(replace(network, observations=rest), estimate)
-    known, left = _determined(a), _determined(less)
-    place = {point: j for j, point in enumerate(less.network.points) if left[j]}
+    rest = tuple(kind for kind in network.observations if not kind.needs_scale)
+    known, less = _determined(a), None
+    for observations in (network.observations, rest):  # the others need a scale, which only this one may give
+        with suppress(GeometryError):
+            less = less or predict(replace(network, observations=observations), estimate)
+    left = np.zeros(0, dtype=bool) if less is None else _determined(less)
+    names = () if less is None else less.network.points
+    place = {point: j for j, point in enumerate(names) if left[j]}
     both = [(j, place[point]) for j, point in enumerate(a.network.points) if known[j] and point in place]
-    whole, part = spread_evenly(np.array(both, dtype=np.int64).reshape(-1, 2)).T
-    return Contribution(
-        name,
-        count,
-        less.expected_defect - a.expected_defect,
-        int(known.sum()) - len(both),
-        shape_sigma(less, part),
-        shape_sigma(a, whole),
-    )
+    if less is None or len(both) < MIN_SHAPE:
+        sigma, _ = shape(a, spread_evenly(np.flatnonzero(known)))
+        return Contribution(name, count, 0, 0, False, int(known.sum()), np.inf, sigma)
+    whole, part = spread_evenly(np.array(both, dtype=np.int64)).T
+    (before, open_before), (after, open_after) = shape(less, part), shape(a, whole)
+    shifts, rotations, scale = open_before - open_after
+    points = int(known.sum()) - len(both)
+    return Contribution(name, count, int(shifts), int(rotations), bool(scale), points, before, after)
 
 
 def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, Estimate]:
@@ -109,15 +115,24 @@ def _determined(a: Adjustment) -> BoolArray:
     return np.asarray(np.isfinite(trace) & (trace > 0))
 
 
-def shape_sigma(adjustment: Adjustment, points: IntArray) -> float:
-    """Return the standard deviation of points with inner constraints on them, RMS of a coordinate.
+def shape(adjustment: Adjustment, points: IntArray) -> tuple[float, IntArray]:
+    """Return the standard deviation of the shape of points, and the motions of the network that are open.
 
     Args:
         adjustment: of the network.
-        points: index of each, three or more, (n,).
+        points: index of each, MIN_SHAPE or more, (n,).
+
+    Returns:
+        RMS of a coordinate with inner constraints on the points, object unit; how many shifts, rotations and
+        scales are open, (3,).
     """
+    m = marginal_of(adjustment)
     X = adjustment.estimate.points[points]
-    Q = marginal_of(adjustment).joint(np.zeros(0, dtype=np.int64), points)
+    Q = m.joint(np.zeros(0, dtype=np.int64), points)
     motions = similarity_motions(X, centre=X.mean(axis=0), size=float(np.ptp(X, axis=0).max()))
     H = np.linalg.qr(motions.reshape(-1, 7))[0]
-    return float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))
+    sigma = float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))
+    free = m.optimum.motions.points[points].reshape(len(Q), -1)[:, : adjustment.expected_defect]
+    along = np.linalg.lstsq(motions.reshape(-1, 7), free, rcond=None)[0]  # of the seven, (7, d)
+    turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=OPEN)) for k in (3, 6))
+    return sigma, np.array([adjustment.expected_defect - turned, turned - scaled, scaled])

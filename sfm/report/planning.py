@@ -235,18 +235,26 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
     columns = (
         *(Column("", "kind"), Column("number", "count", format=str)),
-        *(Column("gives motions", "motions", format=str), Column("gives points", "points", format=str)),
+        *(Column(None, one, format=str) for one in ("shifts", "rotations", "scale", "points")),
+        Column("gives"),
         *(Column(f"sigma {a} it", f"sigma_{a}", fine, significant, factor) for a in ("without", "with")),
         Column("gain", "gain", format=".2f"),
     )
     rows = [
-        (o.name, o.count, o.motions, o.points, o.sigma_without, o.sigma_with, o.gain)
+        (
+            *(o.name, o.count, o.shifts, o.rotations, int(o.scale), o.points, ", ".join(_given(o))),
+            *(
+                (o.sigma_without, o.sigma_with, o.gain)
+                if np.isfinite(o.gain)
+                else (*[NOT_DETERMINED] * 2, "")
+            ),
+        )
         for o in plan.contributions
     ]
     note = Note(
         "Gain: standard deviation of points without it over that with it, RMS of a coordinate, with inner "
-        "constraints for position, attitude and scale in both. Motions: how many of these seven, and points: "
-        "how many points, nothing else determines."
+        "constraints for position, attitude and scale in both. Gives: shifts, rotations and scale of the "
+        "network, and points, that nothing else gives."
     )
     return Table(columns, rows, "gain"), note
 
@@ -303,11 +311,17 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _gain_in_words(one: Contribution) -> str:
-    """Return what a kind of observations adds: points 1.30 times as precise, 1 motion."""
-    words = [f"points {one.gain:.2f} times as precise"]
-    words += [f"gives {counted(one.motions, 'motion')}"] if one.motions else []
-    words += [f"gives {counted(one.points, 'point')}"] if one.points else []
-    return ", ".join(words)
+    """Return what a kind of observations adds: points 1.30 times as precise, gives the scale."""
+    precise = f"points {one.gain:.2f} times as precise" if np.isfinite(one.gain) else "nothing without it"
+    return ", gives ".join((precise, " and ".join(_given(one)))) if _given(one) else precise
+
+
+def _given(one: Contribution) -> list[str]:
+    """Return what nothing but a kind of observations gives, in words."""
+    counts = ((one.shifts, "shift"), (one.rotations, "rotation"))
+    words = [counted(count, what) for count, what in counts if count]
+    words += ["the scale"] if one.scale else []
+    return words + ([counted(one.points, "point")] if one.points else [])
 
 
 def _summary(plan: Plan) -> dict[str, Any]:
@@ -338,7 +352,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
         "cameras": [_camera_summary(camera, found.get(camera.name)) for camera in p.cameras],
         "rigs": summary_of_rigs(rigs_of(p.adjustment)),
         "contributions": [
-            values_of(one, "name count motions points sigma_without sigma_with gain")
+            values_of(one, "name count shifts rotations scale points sigma_without sigma_with gain")
             for one in plan.contributions
         ],
         "weak_points": [{"point": w.name, "sigma": w.sigma, "reason": w.reason} for w in plan.weak],

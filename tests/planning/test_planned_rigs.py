@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation
 from sfm.files.plain_text import csv_text
@@ -17,19 +18,19 @@ from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.kind import PHOTOGRAPH, TableKind
-from sfm.planning.contributions import contributions
+from sfm.planning.contributions import contributions, shape
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import ScaleBarPlan, predict_network
 from sfm.planning.sight.image_precision import TargetImage
-from sfm.planning.sight.visibility import Seeing
+from sfm.planning.sight.visibility import Seeing, Why
 from sfm.planning.stations import arrangement
 from sfm.planning.wanted import Wanted
 from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan, rows
 from tests.rigs import make_rig
-from tests.survey.test_survey_observations import network_of_all
-from tests.synthetic import seed_of
+from tests.survey.test_survey_observations import network_of_all, observed
+from tests.synthetic import make_network, seed_of
 
 STATIONS = ("--unit", "m", "--sigma-px", "0.1", "--stations", "hemisphere:6")
 
@@ -91,15 +92,55 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
     assert "plan_without_scale" not in {one["kind"] for one in found["remarks"]}
 
 
-def test_what_only_a_kind_gives_is_counted_as_motions() -> None:
+def test_the_rig_condition_has_a_gain() -> None:
     plate = shape_object("plate", (1.0, 0.7), 30)
     _, truth = make_rig(seed_of("motions"))
     assert truth.mounts is not None
     stations = arrangement("ring:5", plate, truth.cameras[0]).with_rig(truth.mounts, truth.cameras)
     prediction = predict_network(plate, truth.cameras, stations, Seeing(sigma_px=0.1))
     (rig,) = contributions(prediction)
-    assert (rig.name, rig.count, rig.motions) == ("rig", 5, 0) and rig.gain > 1.0
+    assert (rig.name, rig.count, rig.shifts, rig.rotations, rig.scale) == ("rig", 5, 0, 0, False)
+    assert rig.gain > 1.0
     assert rig.sigma_with == pytest.approx(prediction.rms_sigma)  # both with inner constraints on all points
+
+
+@pytest.mark.parametrize(
+    ("kind", "given"),
+    [
+        ("height difference", (0, 2, True)),
+        ("coordinate difference", (0, 3, True)),
+        ("antenna position", (3, 3, True)),
+        ("zenith angle", (0, 2, False)),
+        ("rigid frame", (0, 0, True)),
+    ],
+)
+def test_what_only_one_kind_gives_is_named(kind: str, given: tuple[int, int, bool]) -> None:
+    network, truth = make_network(seed_of("gives"), images=8, points=34, free=())
+    one = observed(kind, truth, seed_of(kind))
+    a = predict(replace(network, observations=(one,)), truth)
+    every = np.arange(len(truth.points))
+    assert shape(predict(network, truth), every)[1].tolist() == [3, 3, 1]
+    fixed = np.array([3, 3, 1]) - shape(a, every)[1]
+    assert tuple(fixed) == given
+
+
+def test_a_rig_without_which_nothing_is_determined_gives_all_points() -> None:
+    """Three points in each photograph, four in each moment."""
+    plate = shape_object("plate", (1.0, 0.7), 8)
+    _, truth = make_rig(seed_of("narrow"))
+    assert truth.mounts is not None
+    cameras = truth.cameras
+    stations = arrangement("ring:6", plate, cameras[0]).with_rig(truth.mounts, cameras)
+    seeing = Seeing(sigma_px=0.1)
+    whole = predict_network(plate, cameras, stations, seeing)
+    why = whole.sight.why.copy()
+    for k in range(6):
+        for camera in (0, 1):
+            shown = (np.arange(3) + 3 * camera + k) % 8
+            why[2 * k + camera, ~np.isin(np.arange(8), shown)] = Why.OUTSIDE
+    narrow = predict_network(plate, cameras, stations, seeing, sight=replace(whole.sight, why=why))
+    (rig,) = contributions(narrow)
+    assert rig.points == narrow.determined.sum() > 0 and rig.sigma_without == np.inf
 
 
 @pytest.mark.parametrize(
