@@ -40,15 +40,7 @@ class RigidFrames(Group):
         H, about = self._by_motion(local)
         Jx = np.zeros((len(X), 3, len(X), 3))
         Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
-        if about.any():
-            root = np.sqrt(W).ravel()[:, None]
-            U, singular, _ = np.linalg.svd(root * about.reshape(len(root), -1), full_matrices=False)
-            U = U[:, singular > ON_LINE * singular[0]]
-            H, Jx = (
-                (A - U / root @ (U.T @ (root * A))).reshape(shape)
-                for A, shape in ((one.reshape(len(root), -1), one.shape) for one in (H, Jx))
-            )
-        return Fit(local - self.value, Jx, H)
+        return Fit(local - self.value, self._without(about, Jx), self._without(about, H))
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the coordinates of a mirrored system."""
@@ -58,7 +50,7 @@ class RigidFrames(Group):
         """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).
 
         Of points on a line a turn about it changes nothing but the errors of their coordinates: it is no
-        parameter, and its derivatives (p, 3, 3) are those that the second array has.
+        parameter. Its derivatives are the second array, (p, 3, 3).
 
         Args:
             local: R'(X - t), (p, 3).
@@ -69,6 +61,18 @@ class RigidFrames(Group):
         shift = np.tile(-np.eye(3), (len(local), 1, 1))
         turn, about = (found @ Vt[rows].T @ Vt[rows] for rows in (on, ~on))
         return np.concatenate([shift, turn], axis=2), about
+
+    def _without(self, about: FloatArray, A: FloatArray) -> FloatArray:
+        """Return derivatives without their part along a turn about the points, which may fix no attitude.
+
+        Args:
+            about: derivatives by turns, (p, 3, 3).
+            A: derivatives, (p, 3, ...).
+        """
+        root = np.sqrt(self.weights)[:, None]
+        U, singular, _ = np.linalg.svd(root * about.reshape(len(root), -1), full_matrices=False)
+        U, flat = U[:, singular > ON_LINE * singular[0]], A.reshape(len(root), -1)
+        return np.asarray(flat - U / root @ (U.T @ (root * flat))).reshape(A.shape)
 
 
 def _motion(source: FloatArray, target: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
