@@ -371,7 +371,3 @@ def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
         }
         for rig in rigs
     ]
-
-
-def _value(value: float, sigma: float) -> dict[str, float | None]:
-    return {"value": or_none(value), "sigma": or_none(sigma)}
