@@ -112,7 +112,7 @@ ROWS = (
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
         "the camera was moved on its rig, or photographed at another moment while rig or object moved",
         "Leave {photographs:this photograph|these photographs} out; if the camera stayed at its new place, "
-        "give the later photographs a camera of their own.",
+        "list the photographs before and after it as blocks of the rig.",
         short="a camera that moved on its rig",
     ),
     Kind(
