@@ -23,7 +23,6 @@ VARIES = "…"
 MIN_WORDS = 4  # of what the rooms below say; shorter texts are parts of sentences, keys and units
 REASONS = (
     "sfm/files/globs.py",
-    "sfm/report/findings/findings.py",
     "sfm/survey/diagnosis",
     "sfm/survey/drafting/camera_groups.py",
     "sfm/survey/measuring/other_sizes.py",

@@ -122,8 +122,8 @@ ROWS = (
         "deviations: {photographs}.",
         "a wrong mount was given, the camera moved to another place during the survey, or the cameras were "
         "not triggered together",
-        "Check the mounts that were given; give the photographs from each place of the camera a camera and "
-        "a rig of their own.",
+        "Check the mounts that were given; list the photographs from each place of the camera as blocks of "
+        "the rig.",
         short="a camera that is not where its rig has it",
     ),
     Kind(
