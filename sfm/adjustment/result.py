@@ -77,13 +77,13 @@ class ObservedResiduals:
     redundancy: float  # of all of them; NaN without covariance
 
 
-class GroupParameter(NamedTuple):
-    """A parameter that observations of a group have in common, such as an additive constant."""
+class GroupParameters(NamedTuple):
+    """Parameters that a group of observations finds, such as an additive constant or the tip of a probe."""
 
     group: str
-    name: str
-    value: float  # object unit or rad
-    sigma: float
+    names: tuple[str, ...]  # (h,)
+    value: FloatArray  # object unit, (h,)
+    covariance: FloatArray  # infinite variances where they are not determined, (h, h)
 
 
 @dataclass(frozen=True, repr=False)
@@ -158,17 +158,16 @@ class Adjustment:
         )
 
     @property
-    def group_parameters(self) -> tuple[GroupParameter, ...]:
-        """Parameters of groups of observations that a survey is made to find, with standard deviations."""
-        found: list[GroupParameter] = []
+    def group_parameters(self) -> tuple[GroupParameters, ...]:
+        """Parameters of groups of observations that a survey is made to find, with their covariance."""
+        found: list[GroupParameters] = []
         for group in self.network.observations:
             if isinstance(group, Group) and group.reported and len(group):
                 own = group.own_parameters(values_of(self.estimate))
                 J = own.J.reshape(len(own.J), -1)
                 C = self.solution.covariance_of([self.network.points[j] for j in group.point])
-                sigma = np.sqrt(np.diagonal(self.sigma0**2 * own.cofactor + J @ C @ J.T))
-                rows = zip(group.reported, own.value.tolist(), sigma.tolist(), strict=True)
-                found += [GroupParameter(group.group, *row) for row in rows]
+                C = self.sigma0**2 * own.cofactor + J @ C @ J.T
+                found.append(GroupParameters(group.group, group.reported, own.value, C))
         return tuple(found)
 
     @property

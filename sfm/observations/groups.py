@@ -34,7 +34,7 @@ class Fit(NamedTuple):
     difference: FloatArray  # computed minus observed, (r, c)
     Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
     H: FloatArray  # derivatives by the own parameters, (r, c, h)
-    own: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
+    own: FloatArray = NO_PARAMETERS  # values of the parameters, where these are reported, (h,)
 
 
 class OwnParameters(NamedTuple):
@@ -51,13 +51,17 @@ class Group(TableKind):
 
     texts: ClassVar[tuple[str, ...]] = ("group", "point")
     labelled: ClassVar[bool] = True  # whether the first of these names the group alone, and no point
-    reported: ClassVar[tuple[str, ...]] = ()  # names of own parameters that a survey is made to find
     least: ClassVar[int]  # points that a group needs to say anything
 
     group: str
     point: IntArray  # indices of the points, (p,)
     value: FloatArray  # one row for each observation, (r, c)
     sigma: FloatArray  # (r, c)
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Names of the parameters that a survey is made to find, (h,)."""
+        return ()
 
     @abstractmethod
     def fit(self, X: FloatArray) -> Fit:
@@ -94,7 +98,7 @@ class Group(TableKind):
         d = fit.difference.size
         Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
         HW = H.T * self.weights
-        flat, HQ = Jx.reshape(d, -1), H @ _inverse(HW @ H)
+        flat, HQ = Jx.reshape(d, -1), H @ inverse_of_determined(HW @ H)
         J = (flat - HQ @ (HW @ flat)).reshape(1, *Jx.shape)
         blocks = tuple(J[:, :, k] for k in range(J.shape[2]))
         return Linear(fit.difference.reshape(1, d), blocks, (HQ @ H.T)[None])
@@ -104,7 +108,7 @@ class Group(TableKind):
         fit = self.fit(values.points[self.point])
         H = fit.H.reshape(self.sigma.size, -1)
         HW = H.T * self.weights
-        inverse = _inverse(HW @ H)
+        inverse = inverse_of_determined(HW @ H)
         J = -inverse @ (HW @ fit.Jx.reshape(self.sigma.size, -1))
         return OwnParameters(fit.own, inverse, J.reshape(len(J), -1, 3))
 
@@ -185,7 +189,7 @@ class Group(TableKind):
         return cls(group, points[:, 0], value, sigma)
 
 
-def _inverse(N: FloatArray) -> FloatArray:
+def inverse_of_determined(N: FloatArray) -> FloatArray:
     """Return the inverse of the normal equations of own parameters over those that are determined, (h, h)."""
     scale = 1 / np.sqrt(np.maximum(np.diagonal(N), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(N * scale[:, None] * scale)

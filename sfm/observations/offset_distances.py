@@ -23,10 +23,14 @@ class OffsetDistances(Group):
     single: ClassVar[str] = "distances with additive constant"
     components: ClassVar[tuple[str, ...]] = ("length",)
     texts: ClassVar[tuple[str, ...]] = ("instrument", "from", "to")
-    reported: ClassVar[tuple[str, ...]] = ("additive constant",)
     least: ClassVar[int] = 3  # two distances
 
     ends: IntArray  # of each distance, which of the points, (r, 2)
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """The name of the constant."""
+        return ("additive constant",)
 
     def fit(self, X: FloatArray) -> Fit:
         """Return |X2 - X1| plus the constant less the distances; H by the constant."""

@@ -3,27 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import ClassVar, Self
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_vector, skew
-from sfm.observations.groups import Fit, Group
+from sfm.observations.groups import Fit, Group, OwnParameters, inverse_of_determined
+from sfm.observations.kind import Values
+
+if TYPE_CHECKING:
+    from sfm.network import Network
 
 ON_LINE = 1e-6  # of the largest singular value, below which a turn does not change coordinates given
 
 
+@dataclass(frozen=True)
 class RigidFrames(Group):
-    """Coordinates of points in a system of their own, known up to a motion of it."""
+    """Coordinates of points in a local system, known up to a motion of it.
+
+    Points of the frame that no photograph shows, as the tip of a probe, are parameters: they add nothing to
+    the adjustment, and follow from the motion of the frame.
+    """
 
     name: ClassVar[str] = "rigid frames"
     single: ClassVar[str] = "rigid frame"
     components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
     least: ClassVar[int] = 2
 
+    hidden: tuple[str, ...] = ()  # names of points that no photograph shows, (q,)
+    hidden_value: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # in the local system, (q, 3)
+    hidden_sigma: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (q, 3)
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """The coordinates of points that no photograph shows."""
+        return tuple(f"{name} {axis}" for name in self.hidden for axis in self.components)
+
+    def own_parameters(self, values: Values) -> OwnParameters:
+        """Return the points that no photograph shows: R l + t, and what errors of the motion do to them.
+
+        Of points on a line the turn about it is not determined, nor are points beside it: their cofactors
+        are infinite.
+        """
+        X, W = values.points[self.point], self.weights
+        R, t = self._fitted(X)
+        local = (X - t) @ R
+        H = self._by_motion(local)[0].reshape(len(W), -1)
+        Q = inverse_of_determined((H.T * W) @ H)
+        by_motion = -Q @ (H.T * W) @ np.kron(np.eye(len(X)), R.T)  # of d(local) = R' dX
+        arm = self.hidden_value - self.value.mean(axis=0)
+        A = np.concatenate([np.broadcast_to(R, (len(arm), 3, 3)), -R @ skew(arm)], axis=2).reshape(-1, 6)
+        alone = R @ (self.hidden_sigma[:, :, None] ** 2 * R.T)
+        cofactor = A @ Q @ A.T + block_diag(*alone)
+        _, about = self._axes()
+        turned = (np.abs(A[:, 3:] @ about.T) > ON_LINE * np.abs(arm).max()).any(axis=1)
+        cofactor[turned, turned] = np.inf
+        J = (A @ by_motion).reshape(len(A), -1, 3)
+        return OwnParameters((self.hidden_value @ R.T + t).ravel(), cofactor, J)
+
+    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+        """Return the coordinates as a table has them, those of points that no photograph shows last."""
+        numbers = np.hstack([self.hidden_value, self.hidden_sigma]).tolist()
+        rows = zip(self.hidden, numbers, strict=True)
+        return [*super().table_rows(network), *((self.group, name, *values) for name, values in rows)]
+
     def fit(self, X: FloatArray) -> Fit:
         """Return R'(X - t) - observed of the best motion R, t; H by it."""
+        R, t = self._fitted(X)
+        local = (X - t) @ R
+        H, about = self._by_motion(local)
+        Jx = np.zeros((len(X), 3, len(X), 3))
+        Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
+        return Fit(local - self.value, self._without(about, Jx), self._without(about, H))
+
+    def _fitted(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the motion R, t by which the frame fits its points best: X near R local + t."""
         W = self.weights.reshape(-1, 3)
         R, t = _motion(self.value, X, W.mean(axis=1))
         for _ in range(5):  # to the weights of single coordinates
@@ -36,11 +92,7 @@ class RigidFrames(Group):
             turned = R @ rotation_from_vector(step[3:])
             t = t + R @ step[:3] + (R - turned) @ centre
             R = turned
-        local = (X - t) @ R
-        H, about = self._by_motion(local)
-        Jx = np.zeros((len(X), 3, len(X), 3))
-        Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
-        return Fit(local - self.value, self._without(about, Jx), self._without(about, H))
+        return R, t
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the coordinates of a mirrored system."""
@@ -55,12 +107,17 @@ class RigidFrames(Group):
         Args:
             local: R'(X - t), (p, 3).
         """
-        given, found = (skew(x - self.value.mean(axis=0)) for x in (self.value, local))
-        _, singular, Vt = np.linalg.svd(given.reshape(-1, 3), full_matrices=False)
-        on = singular > ON_LINE * singular[0]
         shift = np.tile(-np.eye(3), (len(local), 1, 1))
-        turn, about = (found @ Vt[rows].T @ Vt[rows] for rows in (on, ~on))
+        found = skew(local - self.value.mean(axis=0))
+        turn, about = (found @ axes.T @ axes for axes in self._axes())
         return np.concatenate([shift, turn], axis=2), about
+
+    def _axes(self) -> tuple[FloatArray, FloatArray]:
+        """Return the axes of turns that change the coordinates given, (3 or 2, 3), and of any other."""
+        given = skew(self.value - self.value.mean(axis=0)).reshape(-1, 3)
+        _, singular, Vt = np.linalg.svd(given, full_matrices=False)
+        on = singular > ON_LINE * singular[0]
+        return Vt[on], Vt[~on]
 
     def _without(self, about: FloatArray, A: FloatArray) -> FloatArray:
         """Return derivatives without their part along a turn about the points, which may fix no attitude.

@@ -56,7 +56,13 @@ def given_parts(
     for kind in given.kinds:
         parts += _kind(kind, adjustment, unit)
     if found := adjustment.group_parameters:
-        rows = [(one.group, one.name, *with_exponent(one.value, one.sigma), unit) for one in found]
+        rows = [
+            (one.group, name, *with_exponent(value, sigma), unit)
+            for one in found
+            for name, value, sigma in zip(
+                one.names, one.value, np.sqrt(np.diagonal(one.covariance)), strict=True
+            )
+        ]
         heads = columns("of", "parameter", ">value", ">sigma", "unit")
         parts += [Heading("Parameters of survey observations"), Table(heads, rows, all_in="summary.json")]
     return tuple(parts)

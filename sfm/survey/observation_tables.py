@@ -20,6 +20,7 @@ from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.groups import Group
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, RowKind, TableKind
+from sfm.observations.rigid_frames import RigidFrames
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import ScaleBar
@@ -137,6 +138,15 @@ def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network
                     points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[own]
                     value, sigma = one.value[rows][own], one.sigma[rows][own]
                     made = one.of.of_group(group, points, value, sigma, number)
+                    if isinstance(made, RigidFrames):
+                        of_group = np.array([name == group for name in one.table.texts[0]], dtype=bool)
+                        rest = np.flatnonzero(of_group & ~_known(one, network))
+                        made = replace(
+                            made,
+                            hidden=tuple(one.table.texts[1][row] for row in rest),
+                            hidden_value=one.value[rest],
+                            hidden_sigma=one.sigma[rest],
+                        )
                     added.append(replace(made, group=label))
         elif len(rows):
             assert issubclass(one.of, RowKind)
@@ -160,7 +170,14 @@ def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
     """Return the remark on observations whose points or photographs are not in a network."""
-    unused = [one.name(int(row)) for one in survey.tables for row in np.flatnonzero(~_known(one, network))]
+    frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
+    hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
+    unused: list[str] = []
+    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+        for row in np.flatnonzero(~_known(one, network)):
+            names = tuple(column[row] for column in one.table.texts)
+            if (labels.get(names[0]), *names[1:]) not in hidden:
+                unused.append(one.name(int(row)))
     for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
         there = {
             kind.group for kind in network.observations if isinstance(kind, Group) and type(kind) is one.of

@@ -38,6 +38,7 @@ from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
+from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity
 from sfm.simulated_network import simulate_network
@@ -178,7 +179,8 @@ def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
         mount += dm @ np.linalg.solve(a.cofactors.mounts[1][:3, :3], dm)
         vPv.append(a.vPv)
         (constant,) = a.group_parameters
-        constants.append((constant.value - true_constant) / (constant.sigma / a.sigma0))
+        ((sigma,),) = np.sqrt(constant.covariance) / a.sigma0
+        constants.append((constant.value[0] - true_constant) / sigma)
         redundancy = a.redundancy
     for chi2 in (points, mount):
         assert stats.chi2.ppf(0.001, 150) < chi2 < stats.chi2.ppf(0.999, 150)
@@ -430,9 +432,9 @@ def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path)
     assert result.adjustment.has_scale
     stored = reported(tmp_path, result)
     (constant,) = stored["group_parameters"]
-    assert (constant["group"], constant["name"], constant["unit"]) == ("tape", "additive constant", "m")
+    assert (constant["group"], constant["names"], constant["unit"]) == ("tape", ["additive constant"], "m")
     (true,) = one.own_parameters(values_of(truth)).value + 0.1
-    assert abs(constant["value"] - true) < 5 * constant["sigma"] < 5e-3
+    assert abs(constant["values"][0] - true) < 5 * np.sqrt(constant["covariance"][0][0]) < 5e-3
     assert "additive constant" in (tmp_path / "out" / "report.html").read_text("utf-8")
     (kept,) = result.network.observations
     assert len(kept.value) == 6
@@ -461,3 +463,63 @@ def test_a_frame_alone_gives_the_scale_and_leaves_position_and_attitude_open(lin
     a = adjust(replace(network, observations=(frame,)), truth, reject="none", datum=Datum("free"))
     assert a.defect == a.expected_defect == 6 and not a.undetermined
     assert np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2)).max() < 3e-4
+
+
+def with_tip(network: Network, truth: Estimate, local: FloatArray) -> tuple[Network, FloatArray]:
+    """Return the network with a tip in its frame, known to 0.1 mm, and where the tip is."""
+    (frame,) = (kind for kind in network.observations if isinstance(kind, RigidFrames))
+    tipped = replace(frame, hidden=("tip",), hidden_value=local, hidden_sigma=np.full((1, 3), 1e-4))
+    others = tuple(kind for kind in network.observations if kind is not frame)
+    return replace(network, observations=(*others, tipped)), tipped.own_parameters(values_of(truth)).value
+
+
+def test_a_tip_that_no_photograph_shows_has_the_covariance_that_is_stated() -> None:
+    """Chi-square of 100 draws, 0.3 m from the frame."""
+    rng, sums = seed_of("tip"), []
+    network, truth = network_of("tip", ("antenna position", "rigid frame"))
+    network, tip = with_tip(*simulate_network(network, truth), np.array([[0.3, 0.2, -0.1]]))
+    for _ in range(100):
+        drawn, true = simulate_network(network, truth, rng)
+        (frame,) = (kind for kind in drawn.observations if isinstance(kind, RigidFrames))
+        wrong = replace(frame, hidden_value=frame.hidden_value + 1e-4 * rng.standard_normal((1, 3)))
+        others = tuple(kind for kind in drawn.observations if kind is not frame)
+        a = adjust(
+            replace(drawn, observations=(*others, wrong)), true, reject="none", datum="free", sigma_px=0.1
+        )
+        (found,) = a.group_parameters
+        assert found.names == ("tip X", "tip Y", "tip Z")
+        error = found.value - tip
+        sums.append(error @ np.linalg.solve(found.covariance / a.sigma0**2, error))
+    assert stats.kstest(sums, stats.chi2(3).cdf).pvalue > 0.001
+
+
+def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
+    """And no row of it is called unused; on the line of the bar it is determined."""
+    network, truth = network_of("bar", ("distance",))
+    offset = np.array([0.1, 0.2, 0.3])
+    bar = np.array([[k * 0.1, 0.0, 0.0] for k in range(3)])
+    at = 20 + np.arange(3)
+    points = truth.points.copy()
+    points[at] = bar + offset
+    network, truth = make_network(seed_of("bar"), images=8, points=34, free=(), figure=points)
+    (tape,) = network_of("bar", ("distance",))[0].observations
+    tape = tape.simulated(values_of(truth))
+    rows = [
+        f"probe,{network.points[j]},{x},0,0,1e-4,1e-4,1e-4"
+        for j, (x, _, _) in zip(at, bar.tolist(), strict=True)
+    ]
+    rows += ["probe,beside,0.3,0.1,0,1e-4,1e-4,1e-4", "probe,tip,0.4,0,0,1e-4,1e-4,1e-4"]
+    columns = TABLES["rigid frame"]
+    header = ",".join((*columns.texts, *columns.columns()))
+    (tmp_path / "probe.csv").write_text("\n".join([header, *rows]), "utf-8")
+    lines = table_of(tmp_path, network, {"distance": [tape]})
+    lines += '[[survey_observations]]\nkind = "rigid frame"\nfile = "probe.csv"\n\n'
+    result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
+    assert "observations_unused" not in {one.kind for one in result.remarks}
+    (found,) = result.adjustment.group_parameters
+    sigma = np.sqrt(np.diagonal(found.covariance))
+    assert np.isinf(sigma[:3]).any() and (sigma[3:] < 1e-3).all()
+    order = [result.network.points.index(network.points[j]) for j in at]
+    X = result.estimate.points[order]
+    assert found.value[3:] == pytest.approx(X[0] + 4 * (X[2] - X[0]) / 2, abs=2e-3)
+    assert "not determined" in text_report(findings_of(result))

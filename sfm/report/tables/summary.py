@@ -119,7 +119,16 @@ def _figures(findings: Findings) -> dict[str, Any]:
             one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")
         ],
         "further_observations": _further(given),
-        "group_parameters": [{**one._asdict(), "unit": result.length_unit} for one in a.group_parameters],
+        "group_parameters": [
+            {
+                "group": one.group,
+                "names": list(one.names),
+                "values": one.value.tolist(),
+                "covariance": [[or_none(value) for value in row] for row in one.covariance.tolist()],
+                "unit": result.length_unit,
+            }
+            for one in a.group_parameters
+        ],
         "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
         "comparison": _comparison(result),
