@@ -250,9 +250,9 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
     used = np.bincount(camera, minlength=len(cameras)).tolist()
     owners = [sorted({one.owner_of(s) for s in range(len(one.names))}) for one in cameras]
     photographs: Counter[str] = Counter()
-    for own, count in zip(owners, used, strict=True):
-        photographs.update(dict.fromkeys(own, count))
-    names = [max(own, key=lambda owner: photographs[owner]) for own in owners]
+    for of_family, count in zip(owners, used, strict=True):
+        photographs.update(dict.fromkeys(of_family, count))
+    names = [max(of_family, key=lambda owner: photographs[owner]) for of_family in owners]
     # two cameras without anything in common may have one name in another program's files
     keys = [(name, -1 if one.shared else a) for a, (name, one) in enumerate(zip(names, cameras, strict=True))]
     families = list(dict.fromkeys(keys))

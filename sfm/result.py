@@ -176,21 +176,21 @@ class SurveyResult:
     def seen_targets(self) -> SeenTargets:
         """Targets measured and candidates rejected in the photographs of the result."""
         index = {name: i for i, name in enumerate(self.network.images)}
-        own = [one for one in self.photographs if one.image in index]
-        own.sort(key=lambda one: index[one.image])
+        of_index = [one for one in self.photographs if one.image in index]
+        of_index.sort(key=lambda one: index[one.image])
         nothing = np.full((0, 3), np.nan)
         return SeenTargets(
             np.array(
-                [index[one.image] for one in own for _ in range(len(one.xy) + len(one.rejected_xy))],
+                [index[one.image] for one in of_index for _ in range(len(one.xy) + len(one.rejected_xy))],
                 dtype=np.int64,
             ),
-            np.vstack([np.zeros((0, 2)), *(part for one in own for part in (one.xy, one.rejected_xy))]),
+            np.vstack([np.zeros((0, 2)), *(part for one in of_index for part in (one.xy, one.rejected_xy))]),
             np.vstack(
                 [
                     nothing,
                     *(
                         part
-                        for one in own
+                        for one in of_index
                         for part in (
                             np.column_stack([one.semi_axes, one.angle]),
                             np.full((len(one.rejected_xy), 3), np.nan),
@@ -200,7 +200,7 @@ class SurveyResult:
             ),
             tuple(
                 words
-                for one in own
+                for one in of_index
                 for words in (*[""] * len(one.xy), *(_reason(int(flag)) for flag in one.rejected_flag))
             ),
         )

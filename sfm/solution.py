@@ -179,8 +179,8 @@ class Solution:
         if not len(photographs) and self.covariance is not None:
             kept = self.covariance_rows(rows)
             if (kept >= 0).all():
-                own = (3 * kept[:, None] + np.arange(3)).ravel()
-                return np.asarray(self.covariance[np.ix_(own, own)])
+                columns = (3 * kept[:, None] + np.arange(3)).ravel()
+                return np.asarray(self.covariance[np.ix_(columns, columns)])
         if len(rows) == 1 and not len(photographs) and self.point_covariance is not None:
             return np.asarray(self.point_covariance[rows[0]])
         if len(photographs) == 1 and not len(rows) and self.exterior_covariance is not None:

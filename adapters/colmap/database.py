@@ -225,12 +225,12 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             _refuse_other_tables(path, database)
             damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
             if damage != "ok":
-                raise SurveyFileError(f"{path}: the database is damaged, {_told(damage)}")
+                raise SurveyFileError(f"{path}: the database is damaged, {_one_line(damage)}")
             yield database
         finally:
             database.close()
     except (sqlite3.Error, OverflowError) as error:
-        raise SurveyFileError(f"{path}: not a readable COLMAP database, {_told(error)}") from error
+        raise SurveyFileError(f"{path}: not a readable COLMAP database, {_one_line(error)}") from error
 
 
 def _refuse_other_files(path: Path) -> int:
@@ -404,5 +404,5 @@ def _shown(value: object) -> str:
     return as_plain(str(value)[:MAX_NAME]) if isinstance(value, str) else f"{value!r:.40}"
 
 
-def _told(error: object) -> str:
+def _one_line(error: object) -> str:
     return as_plain(" ".join(str(error).split())[:200])

@@ -63,8 +63,8 @@ def open_model(folder: Path) -> OpenModel:
     camera_ids, image_ids = sorted(scene.cameras), sorted(scene.images)
     same = [camera_of(scene.camera(i)) for i in camera_ids]
     cameras = tuple(
-        camera if camera.model == own.model else replace(own, name=camera.name)
-        for own, camera in zip(same, estimate.cameras, strict=True)
+        camera if camera.model == one.model else replace(one, name=camera.name)
+        for one, camera in zip(same, estimate.cameras, strict=True)
     )
     slots = [
         np.array([k for k, p in enumerate(scene.image(i).points2D) if p.has_point3D()], dtype=np.int64)
@@ -140,13 +140,13 @@ def key_points_of(model: OpenModel) -> tuple[int, float]:
     scene, count, squares = model.scene, 0, 0.0
     for i in scene.reg_image_ids():
         image = scene.image(i)
-        own = [p for p in image.points2D if p.has_point3D()]
-        if own:
+        used = [p for p in image.points2D if p.has_point3D()]
+        if used:
             pose = image.cam_from_world().matrix()
-            xyz = np.array([scene.point3D(p.point3D_id).xyz for p in own]) @ pose[:, :3].T + pose[:, 3]
-            v = scene.camera(image.camera_id).img_from_cam(xyz) - np.array([p.xy for p in own])
+            xyz = np.array([scene.point3D(p.point3D_id).xyz for p in used]) @ pose[:, :3].T + pose[:, 3]
+            v = scene.camera(image.camera_id).img_from_cam(xyz) - np.array([p.xy for p in used])
             squares += float(np.nansum(v**2))  # COLMAP projects nothing that is behind a photograph
-            count += len(own)
+            count += len(used)
     return count, float(np.sqrt(squares / (2 * max(count, 1))))
 
 

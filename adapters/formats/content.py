@@ -138,7 +138,7 @@ def _joint(content: Content) -> FloatArray:
 
 def _interior_sigmas(content: Content) -> FloatArray:
     sigmas = content.result.interior_sigma or ()
-    rows = [(k, s, v) for k, own in enumerate(sigmas) for s, v in enumerate(own.tolist()) if np.isfinite(v)]
+    rows = [(k, s, v) for k, one in enumerate(sigmas) for s, v in enumerate(one.tolist()) if np.isfinite(v)]
     return np.array(rows, dtype=float).reshape(-1, 3)
 
 

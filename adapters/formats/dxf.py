@@ -95,8 +95,8 @@ def write_dxf(
         put((0, "LINE"), (8, _layer(line.layer)), *place(10, line.start), *place(11, line.end))
     for circle in circles:
         n = circle.normal / np.linalg.norm(circle.normal)
-        own = _axes(n).T @ circle.centre  # in the entity's own axes
-        put((0, "CIRCLE"), (8, _layer(circle.layer)), *place(10, own), (40, float(circle.radius)))
+        centre = _axes(n).T @ circle.centre  # in the entity's own axes
+        put((0, "CIRCLE"), (8, _layer(circle.layer)), *place(10, centre), (40, float(circle.radius)))
         put(*place(210, n))
     for layer, text, at in texts:
         put((0, "TEXT"), (8, _layer(layer)), *place(10, at), (40, 1.5 * height), (1, _text(text)))

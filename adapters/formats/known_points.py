@@ -85,10 +85,10 @@ def _of_control(path: Path, network: Network) -> tuple[ObjectPoints, ObjectPoint
 
     def chosen(part: BoolArray) -> ObjectPoints:
         rows = np.flatnonzero(there & part.any(axis=1))
-        own = C[rows] * (part[rows][:, :, None] & part[rows][:, None, :])
-        own[:, range(3), range(3)] = np.where(part[rows], sigma[rows] ** 2, np.inf)
+        covariance = C[rows] * (part[rows][:, :, None] & part[rows][:, None, :])
+        covariance[:, range(3), range(3)] = np.where(part[rows], sigma[rows] ** 2, np.inf)
         point = np.array([index[names[k]] for k in rows], dtype=np.int64)
-        return ObjectPoints(point, np.where(part[rows], xyz[rows], 0.0), own)
+        return ObjectPoints(point, np.where(part[rows], xyz[rows], 0.0), covariance)
 
     return chosen(known & ~only), chosen(known & only)
 
@@ -101,20 +101,21 @@ def write_known_points(
     for one, flag in ((control, False), (checks, True)):
         for j, xyz, C in zip(one.point.tolist(), one.xyz, one.covariance, strict=True):
             known = np.isfinite(np.diagonal(C))
-            row, own, check = found.setdefault(j, (np.full(6, np.nan), np.zeros(3), np.zeros(3, dtype=bool)))
+            unknown = (np.full(6, np.nan), np.zeros(3), np.zeros(3, dtype=bool))
+            row, between, check = found.setdefault(j, unknown)
             row[:3][known], row[3:][known] = xyz[known], np.sqrt(np.diagonal(C)[known])
-            own += [C[r, c] if known[r] and known[c] else 0.0 for r, c in PAIRS]
+            between += [C[r, c] if known[r] and known[c] else 0.0 for r, c in PAIRS]
             check |= known & flag
-    correlated = any(own.any() for _, own, _ in found.values())
+    correlated = any(between.any() for _, between, _ in found.values())
     checked = any(check.any() for _, _, check in found.values())
     rows = [
         (
             points[j],
             *("" if np.isnan(v) else v for v in row.tolist()),
-            *(own.tolist() if correlated else ()),
+            *(between.tolist() if correlated else ()),
             *(check.astype(int).tolist() if checked else ()),
         )
-        for j, (row, own, check) in found.items()
+        for j, (row, between, check) in found.items()
     ]
     header = ("id", *AXES, *SIGMAS, *(COVARIANCES if correlated else ()), *(CHECKS if checked else ()))
     path.write_text(csv_text(header, rows), encoding="utf-8", newline="")

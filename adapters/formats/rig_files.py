@@ -231,7 +231,7 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
             end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # after the word that it begins in
             for a, name in together.items():
                 found[a].add(name.removesuffix(end))
-    if any(len(own) != 1 for own in found.values()):
+    if any(len(one) != 1 for one in found.values()):
         return folders
     prefixes = [next(iter(found[a])) for a in on]
     mixed = any(

@@ -188,19 +188,23 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
                 f"{PLAIN} or {WITH_COVARIANCE} each are needed"
             )
         for p in range(n):
-            own = values[4 + p * width : 4 + (p + 1) * width]
-            if not 0 <= own[0] < frames:
-                raise SurveyFileError(f"{path}, line {number}: frame {own[0]:g}, there are {frames} cameras")
-            image.append(int(own[0]))
-            point.append(len(xyz) // 3)
-            if width == WITH_COVARIANCE and not _is_covariance(own[3:7]):
+            projection = values[4 + p * width : 4 + (p + 1) * width]
+            if not 0 <= projection[0] < frames:
                 raise SurveyFileError(
-                    f"{path}, line {number}: covariance {own[3:7]} of frame {own[0]:g} is not symmetric and "
-                    "positive definite"
+                    f"{path}, line {number}: frame {projection[0]:g}, there are {frames} cameras"
                 )
-            xy.extend(own[1:3])
+            image.append(int(projection[0]))
+            point.append(len(xyz) // 3)
+            if width == WITH_COVARIANCE and not _is_covariance(projection[3:7]):
+                raise SurveyFileError(
+                    f"{path}, line {number}: covariance {projection[3:7]} of frame {projection[0]:g} "
+                    "is not symmetric and positive definite"
+                )
+            xy.extend(projection[1:3])
             stated.append(width == WITH_COVARIANCE)
-            covariance.extend(own[3:7] if width == WITH_COVARIANCE else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2))
+            covariance.extend(
+                projection[3:7] if width == WITH_COVARIANCE else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2)
+            )
         xyz.extend(values[:3])
         if len(image) + len(xyz) // 3 > MAX_IMAGE_POINTS:
             raise SurveyFileError(

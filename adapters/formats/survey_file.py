@@ -44,8 +44,8 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
     if result.unit in METRES:
         unit = f"unit = {_text(result.unit)}"
     lines = ["[survey]", f"name = {_text(title)}", unit, ""]
-    for camera, images, own in _families(network, estimate):
-        lines += [*_camera(camera, images, _weighted(network, estimate, camera), own), ""]
+    for camera, images, varying in _families(network, estimate):
+        lines += [*_camera(camera, images, _weighted(network, estimate, camera), varying), ""]
     lines += _rigs(folder, network, estimate)
     lines += ["[observations]", 'file = "image_points.csv"', ""]
     lines += [
@@ -102,7 +102,7 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
     Cameras that share parameters and are of one photograph each are one camera.
     """
     images = [
-        [name for name, own in zip(network.images, network.camera, strict=True) if own == k]
+        [name for name, a in zip(network.images, network.camera, strict=True) if a == k]
         for k in range(len(estimate.cameras))
     ]
     groups: dict[str, list[int]] = {}
@@ -112,14 +112,14 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
         groups.setdefault(group if alone else f"{camera.name}\n{k}", []).append(k)
     for group, members in groups.items():
         camera = estimate.cameras[members[0]]
-        own: tuple[str, ...] = ()
+        varying: tuple[str, ...] = ()
         if "\n" not in group:
             pairs = zip(camera.names, camera.shared, camera.free, strict=True)
-            own = tuple(name for name, one, free in pairs if free and not one)
+            varying = tuple(name for name, one, free in pairs if free and not one)
             camera = replace(camera, name=group)
         names = [name for k in members for name in images[k]]
         if names:
-            yield camera, names, own
+            yield camera, names, varying
 
 
 def _weighted(network: Network, estimate: Estimate, camera: Camera) -> dict[str, tuple[float, float]]:
@@ -147,7 +147,7 @@ def _exterior(network: Network) -> str:
 
 
 def _camera(
-    camera: Camera, images: list[str], weighted: dict[str, tuple[float, float]], own: tuple[str, ...]
+    camera: Camera, images: list[str], weighted: dict[str, tuple[float, float]], varying: tuple[str, ...]
 ) -> Iterator[str]:
     """Yield the section of a camera; values of free parameters come from cameras.csv."""
     yield "[[camera]]"
@@ -161,8 +161,8 @@ def _camera(
     adjusted = [name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free]
     free = [name for name in adjusted if name not in weighted]
     yield f"free = [{', '.join(_text(name) for name in free)}]"
-    if own:
-        yield f"per_photograph = [{', '.join(_text(name) for name in own)}]"
+    if varying:
+        yield f"per_photograph = [{', '.join(_text(name) for name in varying)}]"
     free = [*free, *weighted]
     held = [(n, v) for n, v in zip(camera.names, camera.parameters.tolist(), strict=True) if n not in free]
     held = [(name, value) for name, value in held if value and name != "c"]

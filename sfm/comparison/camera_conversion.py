@@ -196,10 +196,10 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"y0": -(camera.value("cy") - centre[1]) * pixel[1]}
             values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
         if MODELS[model].corrects and same:
-            own = _as_full_opencv(camera)
-            K = _reversed(*_power_series(own))
+            opencv = _as_full_opencv(camera)
+            K = _reversed(*_power_series(opencv))
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
-            values |= {"P1": -own["p2"] / c, "P2": own["p1"] / c}
+            values |= {"P1": -opencv["p2"] / c, "P2": opencv["p1"] / c}
     if to_opencv:
         values |= {"f": (values["fx"] + values["fy"]) / 2, "k": values.get("k1", 0.0)}
     known = tuple((name, values[name]) for name in MODELS[model].names if name in values)
@@ -237,13 +237,13 @@ def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:
 
 def _as_full_opencv(camera: Camera) -> dict[str, float]:
     """Parameters of full_opencv, 0 where a camera in a model with a part of them has none."""
-    own = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
-    return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | own
+    values = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
+    return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | values
 
 
-def _power_series(own: dict[str, float]) -> tuple[float, float, float]:
+def _power_series(values: dict[str, float]) -> tuple[float, float, float]:
     """First three coefficients of the radial term of full_opencv, the fraction divided out."""
-    k1, k2, k3, d1, d2, d3 = (own[f"k{i}"] for i in range(1, 7))
+    k1, k2, k3, d1, d2, d3 = (values[f"k{i}"] for i in range(1, 7))
     s1 = k1 - d1
     s2 = k2 - d2 - d1 * s1
     return s1, s2, k3 - d3 - d2 * s1 - d1 * s2

@@ -205,8 +205,8 @@ def _fits(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost
 def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntArray:
     """Return which point of b each point of a is: by its name where that fits, else by its place, (n,)."""
     every = np.ones(len(pairs.a), dtype=bool)
-    own = np.flatnonzero(given)
-    found = nearest_places((pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([own, own], axis=1))
+    rows = np.flatnonzero(given)
+    found = nearest_places((pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1))
     other = np.where(given, np.arange(len(every)), -1)
     other[found[:, 0]] = found[:, 1]
     return np.asarray(other)

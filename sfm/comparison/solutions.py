@@ -197,8 +197,8 @@ def reprojection(network: Network, estimate: Estimate) -> FloatArray:
     seen = network.image_points
     use = estimate.oriented[seen.image] & estimate.determined[seen.point]
     v = np.zeros((len(seen), 2))
-    for i, own in enumerate(rows_of(seen.image, len(network.images))):
-        rows = own[use[own]]
+    for i, of_photograph in enumerate(rows_of(seen.image, len(network.images))):
+        rows = of_photograph[use[of_photograph]]
         if not len(rows):
             continue
         computed = project(

@@ -160,9 +160,9 @@ def _rows(points: IntArray, m: int) -> IntArray:
 
 def _remove(P: FloatArray, w: FloatArray, rows: IntArray | slice) -> None:
     """Give points displacements of their own: their rows of P and of w = P d become 0."""
-    own = np.linalg.solve(P[rows][:, rows], P[rows])
-    w -= own.T @ w[rows]
-    P -= P[:, rows] @ own
+    by_rows = np.linalg.solve(P[rows][:, rows], P[rows])
+    w -= by_rows.T @ w[rows]
+    P -= P[:, rows] @ by_rows
 
 
 def in_datum(
@@ -205,8 +205,8 @@ def tests_in_datum(
     n, m = difference.shape
     H, d = _motion_in_datum(difference, G, weight)
     A = covariance @ H.T
-    of_point, own = G.reshape(n, m, -1), A.reshape(n, m, -1)
-    mixed = np.einsum("niu,nju->nij", of_point, own)
+    of_point, by_coordinates = G.reshape(n, m, -1), A.reshape(n, m, -1)
+    mixed = np.einsum("niu,nju->nij", of_point, by_coordinates)
     spread = np.einsum("niu,uv,njv->nij", of_point, H @ A, of_point)
     return _tests_of_blocks(d, point_blocks(covariance, m) - mixed - np.swapaxes(mixed, 1, 2) + spread)
 
@@ -318,6 +318,6 @@ def _weights(Q: FloatArray, basis: FloatArray) -> FloatArray:
 def _drops(P: FloatArray, w: FloatArray, left: BoolArray, m: int) -> FloatArray:
     """Return what Omega drops by without each of the points that are left, over m."""
     drops = np.full(len(left), np.nan)
-    own, w = point_blocks(P, m)[left], w.reshape(-1, m)[left]
-    drops[left] = np.einsum("ki,ki->k", w, np.linalg.solve(own, w[..., None])[..., 0]) / m
+    blocks, w = point_blocks(P, m)[left], w.reshape(-1, m)[left]
+    drops[left] = np.einsum("ki,ki->k", w, np.linalg.solve(blocks, w[..., None])[..., 0]) / m
     return drops

@@ -214,10 +214,10 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
     numbers: dict[Callable[..., None], list[int]] = {}
     for number, model in enumerate(models):
         numbers.setdefault(model.function, []).append(number)
-    for function, own in numbers.items():
-        name = models[own[0]].name
+    for function, numbers_of in numbers.items():
+        name = models[numbers_of[0]].name
         names[name] = function
-        test = " or ".join(f"number == {number}" for number in own)
+        test = " or ".join(f"number == {number}" for number in numbers_of)
         lines.append(f"    {'elif' if len(lines) > 1 else 'if'} {test}: {name}({arguments})")
     exec(compile("\n".join(lines), __file__, "exec"), names)
     function_of_all: Callable[..., None] = names["observe"]

@@ -130,11 +130,11 @@ def block_motion(
     redundancy = found.differences.redundancy
     names = tuple(name for _, group_of in parts for name in group_of)
     tests, at = [], 0
-    for part, own in parts:
-        block = slice(at, at + len(own))
-        statistic = float(value[block] @ np.linalg.solve(cofactor[block, block], value[block])) / len(own)
-        tests.append(Part(part, statistic, critical_value(alpha, len(own), redundancy)))
-        at += len(own)
+    for part, members in parts:
+        block = slice(at, at + len(members))
+        statistic = float(value[block] @ np.linalg.solve(cofactor[block, block], value[block])) / len(members)
+        tests.append(Part(part, statistic, critical_value(alpha, len(members), redundancy)))
+        at += len(members)
     return BlockMotion(
         name=name,
         points=tuple(found.differences.points[j] for j in chosen),

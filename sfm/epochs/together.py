@@ -107,7 +107,7 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
     )
     for camera in cameras:
         if not camera.same:
-            raise GeometryError(_words_of_change(camera, alone))
+            raise GeometryError(_describe_change(camera, alone))
     out = []
     correction = cho_solve(factor, w)
     for one, U, A, p in zip(alone, left, given, sizes, strict=True):
@@ -192,13 +192,13 @@ def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
         for camera in a.estimate.cameras
         for parameter, value in zip(camera.names, camera.parameters.tolist(), strict=True)
     }
-    own = replace(
+    alone = replace(
         epoch,
         result=replace(result, estimate=a.estimate, covariance_points=points),
         sigma0=a.sigma0,
     )
     given = {}
-    for key, (gradient, sigma, value) in given_observations(own):
+    for key, (gradient, sigma, value) in given_observations(alone):
         column = sum((joint[:, len(wanted) + k] * g for k, g in gradient), start=np.zeros(len(joint)))
         given[key] = (column / (sigma * a.sigma0), value)
     for camera, parameter, value, sigma in epoch.interior:
@@ -206,7 +206,7 @@ def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
             column = joint[:, wanted.index((camera, parameter))]
             given[f"{parameter} of camera {camera}"] = (column / (sigma * a.sigma0), value)
     found = np.array([values[one] for one in wanted])
-    return _Alone(own, points, found, tuple(wanted), joint, given)
+    return _Alone(alone, points, found, tuple(wanted), joint, given)
 
 
 def _network_of(epoch: Epoch) -> Network:
@@ -308,7 +308,7 @@ def _tested(
     )
 
 
-def _words_of_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
+def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
     """Say of a camera that changed which parameter did so most."""
     first, worst, which, where = None, 0.0, "", ""
     for one in alone:

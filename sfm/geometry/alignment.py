@@ -62,8 +62,8 @@ class Alignment:
             if points.correlated_among(self.points):
                 place = np.full(len(points.names), -1)
                 place[sample] = np.arange(len(sample))
-                own = replace(self, points=place[self.points])
-                known = own._moved_covariance(points.sample_covariance, xyz[sample])
+                of_sample = replace(self, points=place[self.points])
+                known = of_sample._moved_covariance(points.sample_covariance, xyz[sample])
                 assert covariance is not None  # a sample is of points that are known each by itself
                 covariance[sample] = [known[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(sample))]
             else:  # the system itself rests on points that are not known together with the others
@@ -231,8 +231,8 @@ def align_points(
             f"alignment: {counted(len(common), 'nominal point')} measured, a best fit needs 3"
         )
     rows = np.array([points.index(name) for name in common], dtype=np.int64)
-    own = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
-    target = nominal.xyz[own]
+    nominal_rows = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
+    target = nominal.xyz[nominal_rows]
     fixed = None if scale else 1.0
     if weights == "network" and points.covariance is None and nominal.covariance is None:
         raise GeometryError(
@@ -241,12 +241,12 @@ def align_points(
         )
     blocks = np.nan_to_num(points.blocks[rows])
     if nominal.covariance is not None:
-        blocks = blocks + nominal.covariance[own]
+        blocks = blocks + nominal.covariance[nominal_rows]
     used = np.ones(len(rows), dtype=bool)
     if robust:
         used = _agreeing(points.xyz[rows], target, fixed, blocks if weights == "network" else None)
     first = fit_similarity(points.xyz[rows[used]], target[used], scale=fixed)
-    Qn = None if nominal.covariance is None else nominal.covariance[own[used]]
+    Qn = None if nominal.covariance is None else nominal.covariance[nominal_rows[used]]
     T, linear, of_nominal, omega = _refine(points, rows[used], target[used], Qn, first, scale, weights)
     difference = T.apply(points.xyz[rows]) - target
     redundancy = 3 * int(used.sum()) - (7 if scale else 6)
@@ -361,17 +361,17 @@ def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, in
         entities: place or direction, whether it is a direction, and the axis along which it is held.
     """
     held = joined([one for one, _, _ in entities])
-    moves, own = np.zeros((6, 7)), np.zeros((6, len(held.value)))
+    moves, by_places = np.zeros((6, 7)), np.zeros((6, len(held.value)))
     for k, (one, is_direction, axis) in enumerate(entities):
         value = T.rotation @ one.value if is_direction else T.apply(one.value)
         motions = similarity_motions(value[None], centre=np.zeros(3))[0]
         if is_direction:
             motions = motions * np.array([0.0, 0, 0, 1, 1, 1, 0])
         moves[k] = motions[axis]
-        own[k, 3 * k : 3 * k + 3] = T.rotation[axis]
+        by_places[k, 3 * k : 3 * k + 3] = T.rotation[axis]
     # a coordinate that is held does not change: moves dT + own dx = 0
     linear = np.zeros((7, held.jacobian.shape[1]))
-    linear[:6] = -np.linalg.solve(moves[:, :6], own @ held.jacobian)
+    linear[:6] = -np.linalg.solve(moves[:, :6], by_places @ held.jacobian)
     return Alignment(method, T, held.points, linear, np.zeros((7, 7)), False)
 
 

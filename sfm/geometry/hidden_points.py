@@ -45,19 +45,19 @@ def with_hidden_point(
     u = d.value / length
     along = distance * (np.eye(3) - np.outer(u, u)) / length
     found = joined([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
-    own = sigma**2 * np.outer(u, u) + points.covariance_between([found])
+    of_hidden = sigma**2 * np.outer(u, u) + points.covariance_between([found])
     Q = points.covariance
     if Q is not None and Q.ndim == 3:
-        Q = np.concatenate([Q, own[None]])
+        Q = np.concatenate([Q, of_hidden[None]])
     elif Q is not None:
         cross = found.jacobian @ Q[coordinates_of(found.points)]
-        Q = np.block([[Q, cross.T], [cross, own]])
+        Q = np.block([[Q, cross.T], [cross, of_hidden]])
     sample, known = points.sample, points.sample_covariance
     if sample is not None and known is not None and points.correlated_among(found.points):
         place = np.full(len(points.names), -1)
         place[sample] = np.arange(len(sample))
         cross = found.jacobian @ known[coordinates_of(place[found.points])]
-        known = np.block([[known, cross.T], [cross, own]])
+        known = np.block([[known, cross.T], [cross, of_hidden]])
         sample = np.append(sample, len(points.names))
     return replace(
         points,

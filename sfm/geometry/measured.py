@@ -95,10 +95,10 @@ class MeasuredPoints:
         """
         chosen = np.zeros(len(self.names), dtype=bool)
         for pattern in patterns:
-            own = np.array([matches(name, pattern) for name in self.names], dtype=bool)
-            if not own.any():
+            matched = np.array([matches(name, pattern) for name in self.names], dtype=bool)
+            if not matched.any():
                 raise GeometryError(f"{what}: '{pattern}' is the name of no point, and no pattern of any")
-            chosen |= own
+            chosen |= matched
         return np.flatnonzero(chosen)
 
     def covariance_of(self, points: IntArray) -> FloatArray:
@@ -121,8 +121,8 @@ class MeasuredPoints:
             place = np.full(len(self.names), -1)
             place[self.sample] = np.arange(len(self.sample))
             known = np.flatnonzero(place[points] >= 0)
-            rows, own = coordinates_of(known), coordinates_of(place[points[known]])
-            Q[np.ix_(rows, rows)] = self.sample_covariance[np.ix_(own, own)]
+            rows, of_sample = coordinates_of(known), coordinates_of(place[points[known]])
+            Q[np.ix_(rows, rows)] = self.sample_covariance[np.ix_(of_sample, of_sample)]
         return Q
 
     def covariance_between(self, functions: Sequence[Function]) -> FloatArray:

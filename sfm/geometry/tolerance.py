@@ -78,11 +78,11 @@ def deviations_from_points(
     if not common:
         raise GeometryError(f"tolerance {name}: no nominal point was measured")
     rows = np.array([points.index(one) for one in common], dtype=np.int64)
-    own = np.array([nominal.names.index(one) for one in common], dtype=np.int64)
-    d = points.xyz[rows] - nominal.xyz[own]
+    of_nominal = np.array([nominal.names.index(one) for one in common], dtype=np.int64)
+    d = points.xyz[rows] - nominal.xyz[of_nominal]
     Q = points.blocks[rows]
     if nominal.covariance is not None:
-        Q = Q + nominal.covariance[own]
+        Q = Q + nominal.covariance[of_nominal]
     length = np.linalg.norm(d, axis=1)
     u = np.divide(d, length[:, None], out=np.zeros_like(d), where=length[:, None] > 0)
     sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", u, Q, u), 0.0))

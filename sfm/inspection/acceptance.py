@@ -170,8 +170,8 @@ def accept_result(
     # |error| against its own limit of each length: scaled, all limits are 1
     decision = decide(np.abs(error) / limit, lengths.sigma / limit, -np.inf, 1.0, coverage)
     if diagonal is None:  # of the smaller box: along the axes of the system, or along those of the object
-        _, _, own = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)
-        boxes = [np.ptp(points.xyz @ axes.T, axis=0) for axes in (np.eye(3), own)]
+        _, _, principal = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)
+        boxes = [np.ptp(points.xyz @ axes.T, axis=0) for axes in (np.eye(3), principal)]
         diagonal = float(min(np.linalg.norm(box) for box in boxes))
     directions = np.array(
         [

@@ -61,14 +61,14 @@ class ConjugatePoints:
 
     def rows(self, some: BoolArray) -> ConjugatePoints:
         """Return the marked points only, (k,)."""
-        return self._changed(lambda own: own[some])
+        return self._changed(lambda column: column[some])
 
     def with_rows(self, rows: IntArray, others: ConjugatePoints) -> ConjugatePoints:
         """Return the points with those of some numbers replaced by others, in order."""
 
-        def put(own: AnyArray, new: AnyArray) -> AnyArray:
-            own[rows] = new
-            return own
+        def put(column: AnyArray, new: AnyArray) -> AnyArray:
+            column[rows] = new
+            return column
 
         return self._changed(put, others)
 
@@ -76,12 +76,12 @@ class ConjugatePoints:
         """Return the points with all columns changed by a function of a copy and of those of others."""
         columns: dict[str, Any] = {"method": self.method}
         for field in fields(self):
-            own = [getattr(one, field.name) for one in (self, *others)]
+            parts = [getattr(one, field.name) for one in (self, *others)]
             if field.name == "reason":
-                changed = change(*(np.array(one, dtype=object) for one in own))
+                changed = change(*(np.array(one, dtype=object) for one in parts))
                 columns["reason"] = tuple(changed.tolist())
             elif field.name != "method":
-                columns[field.name] = change(own[0].copy(), *own[1:])
+                columns[field.name] = change(parts[0].copy(), *parts[1:])
         return ConjugatePoints(**columns)
 
 

@@ -56,8 +56,10 @@ def match_turned(
     )
     second = np.where(is_other, np.fmax(lesser, second), second)
     if not given:
-        own = match_ncc(left, left, xy_left, xy_left, template_px=by.template_px, search_px=2 * OWN_PX + 1)
-        second = np.fmax(second, own.second)
+        to_left = match_ncc(
+            left, left, xy_left, xy_left, template_px=by.template_px, search_px=2 * OWN_PX + 1
+        )
+        second = np.fmax(second, to_left.second)
     pixels = independent_pixels(grey_of(left), xy_left, by.template_px)
     doubt = one.good | other.good
     doubt &= ambiguous(r, second, pixels)

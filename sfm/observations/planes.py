@@ -25,8 +25,8 @@ class Planes(Group):
     def met(self, values: Values) -> FloatArray:
         """Return the points at their offsets from the plane."""
         points, fit = values.points.copy(), self.fit(values.points[self.point])
-        own = np.arange(len(self.point))
-        points[self.point] -= fit.difference * fit.Jx[own, 0, own]
+        every = np.arange(len(self.point))
+        points[self.point] -= fit.difference * fit.Jx[every, 0, every]
         return points
 
     def fit(self, X: FloatArray) -> Fit:

@@ -21,8 +21,8 @@ def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera
         cameras: interior orientations.
     """
     uv = np.full((len(seen), 2), np.nan)
-    for one, own in zip(cameras, rows_of(camera[seen.image], len(cameras)), strict=True):
-        uv[own] = tangents_from_pixel(one, seen.xy[own])
+    for one, of_camera in zip(cameras, rows_of(camera[seen.image], len(cameras)), strict=True):
+        uv[of_camera] = tangents_from_pixel(one, seen.xy[of_camera])
     return uv
 
 

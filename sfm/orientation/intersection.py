@@ -131,21 +131,21 @@ def _intersect_all(
     N, b, dx = np.empty((3, 3)), np.empty(3), np.empty(3)
     total = 0.0
     for j in range(len(xyz)):
-        own = ray[start[j] : start[j + 1]]
-        m = len(own)
+        of_point = ray[start[j] : start[j + 1]]
+        m = len(of_point)
         if m < 2:
             continue
         for i in range(m):
-            _direction(rays, own[i], direction[i])
+            _direction(rays, of_point[i], direction[i])
         for i in range(m):
-            used[own[i]] = True
-        found = _nearest_to_rays(rays, own, direction, used, N, b, X)
+            used[of_point[i]] = True
+        found = _nearest_to_rays(rays, of_point, direction, used, N, b, X)
         if np.isinf(limit) or m == 2:
             if not found:
-                _drop(own, used)
+                _drop(of_point, used)
                 continue
-        elif not found or _sum_of_squares(rays, own, X) > limit:
-            score = _best_pair(rays, own, direction, limit, used, N, b, X, best_X)
+        elif not found or _sum_of_squares(rays, of_point, X) > limit:
+            score = _best_pair(rays, of_point, direction, limit, used, N, b, X, best_X)
             if np.isinf(score):
                 continue
             X[:] = best_X
@@ -154,14 +154,14 @@ def _intersect_all(
             if not np.isinf(limit):
                 count = 0
                 for i in range(m):
-                    k = own[i]
+                    k = of_point[i]
                     used[k] = _square(rays, k, X) <= limit
                     count += used[k]
                 if count < 2:
                     ok = False
                     break
             best_X[:] = X
-            ok = _least_squares(rays, own, used, X, N, b, dx)
+            ok = _least_squares(rays, of_point, used, X, N, b, dx)
             if not ok:
                 X[:] = best_X
                 break
@@ -169,7 +169,7 @@ def _intersect_all(
         count = 0
         if ok:
             for i in range(m):
-                k = own[i]
+                k = of_point[i]
                 square = _square(rays, k, X)
                 if np.isinf(square) and used[k]:
                     ok = False
@@ -178,16 +178,16 @@ def _intersect_all(
                     continue
                 count += 1
                 for h in range(i):
-                    if used[own[h]]:
+                    if used[of_point[h]]:
                         c = 0.0
                         for d in range(3):
                             c += direction[i, d] * direction[h, d]
                         smallest = min(smallest, c)
         if not ok or count < 2 or smallest > cos_limit:
-            _drop(own, used)
+            _drop(of_point, used)
             continue
         for i in range(m):
-            k = own[i]
+            k = of_point[i]
             _residual(rays, k, X, residuals[k])
             if used[k]:
                 ru, rv = residuals[k, 0], residuals[k, 1]
@@ -201,10 +201,10 @@ def _intersect_all(
 
 
 @compiled
-def _drop(own: IntArray, used: BoolArray) -> None:
+def _drop(of_point: IntArray, used: BoolArray) -> None:
     """Mark rays as not taking part."""
-    for i in range(len(own)):
-        used[own[i]] = False
+    for i in range(len(of_point)):
+        used[of_point[i]] = False
 
 
 @compiled
@@ -219,7 +219,7 @@ def _direction(rays: _Rays, ray: int, out: FloatArray) -> None:
 @compiled
 def _nearest_to_rays(
     rays: _Rays,
-    own: IntArray,
+    of_point: IntArray,
     direction: FloatArray,
     used: BoolArray,
     N: FloatArray,
@@ -229,10 +229,10 @@ def _nearest_to_rays(
     """Fill the point with the least squared distances from the rays in use; False if there is none."""
     N[:] = 0.0
     b[:] = 0.0
-    for i in range(len(own)):
-        if not used[own[i]]:
+    for i in range(len(of_point)):
+        if not used[of_point[i]]:
             continue
-        C = rays.positions[rays.image[own[i]]]
+        C = rays.positions[rays.image[of_point[i]]]
         along = direction[i, 0] * C[0] + direction[i, 1] * C[1] + direction[i, 2] * C[2]
         for a in range(3):
             for c in range(3):
@@ -245,7 +245,7 @@ def _nearest_to_rays(
 @compiled
 def _best_pair(
     rays: _Rays,
-    own: IntArray,
+    of_point: IntArray,
     direction: FloatArray,
     limit: float,
     used: BoolArray,
@@ -255,7 +255,7 @@ def _best_pair(
     best_X: FloatArray,
 ) -> float:
     """Fill the two-ray point with the least truncated squares over all rays; return them (inf: none)."""
-    m = len(own)
+    m = len(of_point)
     best = np.inf
     stride = max(1, (m * (m - 1) // 2) // MAX_PAIRS)
     pair = -1
@@ -264,13 +264,13 @@ def _best_pair(
             pair += 1
             if pair % stride:
                 continue
-            _drop(own, used)
-            used[own[i]] = used[own[h]] = True
-            if not _nearest_to_rays(rays, own, direction, used, N, b, X):
+            _drop(of_point, used)
+            used[of_point[i]] = used[of_point[h]] = True
+            if not _nearest_to_rays(rays, of_point, direction, used, N, b, X):
                 continue
             score = 0.0
             fits = 0
-            for k in own:
+            for k in of_point:
                 square = _square(rays, k, X)
                 fits += square <= limit
                 score += min(square, limit)
@@ -279,19 +279,19 @@ def _best_pair(
             if score < best and fits >= 2:
                 best = score
                 best_X[:] = X
-    _drop(own, used)
+    _drop(of_point, used)
     return best
 
 
 @compiled
-def _sum_of_squares(rays: _Rays, own: IntArray, X: FloatArray) -> float:
+def _sum_of_squares(rays: _Rays, of_point: IntArray, X: FloatArray) -> float:
     """Return the sum of the squared image residuals of rays.
 
     Up to the limit of a single ray no point has smaller truncated squares than the least squares of all
     rays: to give up a ray costs as much.
     """
     total = 0.0
-    for k in own:
+    for k in of_point:
         total += _square(rays, k, X)
     return total
 
@@ -322,7 +322,13 @@ def _residual(rays: _Rays, ray: int, X: FloatArray, residual: FloatArray) -> Non
 
 @compiled
 def _least_squares(
-    rays: _Rays, own: IntArray, used: BoolArray, X: FloatArray, N: FloatArray, b: FloatArray, dx: FloatArray
+    rays: _Rays,
+    of_point: IntArray,
+    used: BoolArray,
+    X: FloatArray,
+    N: FloatArray,
+    b: FloatArray,
+    dx: FloatArray,
 ) -> bool:
     """Move X by Gauss-Newton on the image residuals of the rays in use; leave N; False if it fails."""
     A = np.empty((2, 3))
@@ -330,8 +336,8 @@ def _least_squares(
         N[:] = 0.0
         b[:] = 0.0
         distance = 0.0
-        for i in range(len(own)):
-            k = own[i]
+        for i in range(len(of_point)):
+            k = of_point[i]
             if not used[k]:
                 continue
             C, R = rays.positions[rays.image[k]], rays.rotations[rays.image[k]]

@@ -273,6 +273,6 @@ def _evaluate(
     residuals = np.abs(coplanarity_residuals(uv1, uv2, base, rotation)[0])
     sigma0, N = np.nan, np.full((5, 5), np.nan)
     if redundancy > 0:
-        own, N = coplanarity_residuals(uv1[inliers], uv2[inliers], base, rotation)
-        sigma0 = float(np.sqrt(np.sum(own**2) / redundancy))
+        v, N = coplanarity_residuals(uv1[inliers], uv2[inliers], base, rotation)
+        sigma0 = float(np.sqrt(np.sum(v**2) / redundancy))
     return RelativeOrientation(kind, base, rotation, normal, inliers, residuals, sigma0, redundancy, N)

@@ -191,13 +191,13 @@ def _paint_face(
     lamp = _lamp(scene, face)
     surface = faces.value[face], faces.texture[face], faces.grain[face]
     fill_face(value, cover, box, rays, H, rectangle, *surface, face, lamp, n)
-    own = np.flatnonzero(marks.face == face)
-    kinds = (marks.kind[own] == DISC, marks.kind[own] == ARC)
-    reach = np.select(kinds, marks.shape[own, :2].T, np.hypot(*marks.shape[own, :2].T))
-    parts = windows(marks.centre[own], np.column_stack([reach, reach]))
+    on_face = np.flatnonzero(marks.face == face)
+    kinds = (marks.kind[on_face] == DISC, marks.kind[on_face] == ARC)
+    reach = np.select(kinds, marks.shape[on_face, :2].T, np.hypot(*marks.shape[on_face, :2].T))
+    parts = windows(marks.centre[on_face], np.column_stack([reach, reach]))
     parts[:, ::2] = np.maximum(parts[:, ::2], box[::2])
     parts[:, 1::2] = np.minimum(parts[:, 1::2], box[1::2])
-    for k, part in zip(own, parts, strict=True):
+    for k, part in zip(on_face, parts, strict=True):
         kind = int(marks.kind[k])
         paint_mark(value, box, part, rays, H, kind, marks.centre[k], marks.shape[k], marks.value[k], lamp, n)
     cover_with(fine, box, value, cover)
@@ -396,7 +396,7 @@ def project_targets(
     front = np.einsum("fi,fi->f", normal, position - faces.centre)[targets.face] > 0
     seen = outline.reshape(n, OUTLINE, 3)[:, :: OUTLINE // RIM]
     hidden = np.array(
-        [_hidden(scene, position, points, own) for points, own in zip(seen, targets.face, strict=True)],
+        [_hidden(scene, position, points, face) for points, face in zip(seen, targets.face, strict=True)],
         dtype=bool,
     )
     across = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2)
@@ -404,13 +404,13 @@ def project_targets(
     return ProjectedTargets(centre, _centre_of_area(outline_px), diameter, inside & front & ~hidden)
 
 
-def _hidden(scene: Scene, position: FloatArray, points: FloatArray, own: int) -> bool:
+def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -> bool:
     """Return whether any face stands between the camera and any of the points of one face."""
     faces = scene.faces
     direction = points - position
     for f, normal in enumerate(faces.normals()):
         height = float(normal @ (position - faces.centre[f]))
-        if f == own or height <= 0:
+        if f == face or height <= 0:
             continue
         with np.errstate(divide="ignore", invalid="ignore"):
             part = -height / (direction @ normal)

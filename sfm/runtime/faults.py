@@ -49,8 +49,8 @@ def error_in_words(error: Exception) -> str:
     message = one_line(error)[:MAX_LETTERS]
     at_work = ", ".join(getattr(error, "__notes__", ()))
     if _is_out_of_memory(error):
-        own = "" if message == type(error).__name__ else f" ({message})"
-        return f"not enough memory{f' for {at_work}' if at_work else ''}{own}"
+        reason = "" if message == type(error).__name__ else f" ({message})"
+        return f"not enough memory{f' for {at_work}' if at_work else ''}{reason}"
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     kind = type(error).__name__

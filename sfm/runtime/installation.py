@@ -47,11 +47,11 @@ def load_adapters() -> None:
     Raises:
         InstallationError: another package of that name is imported already.
     """
-    own = os.path.join(ROOT, "adapters")
+    installed = os.path.join(ROOT, "adapters")
     loaded = sys.modules.get("adapters")
     if loaded is not None:
         folders = list(getattr(loaded, "__path__", ()))
-        if [os.path.realpath(folder) for folder in folders] == [os.path.realpath(own)]:
+        if [os.path.realpath(folder) for folder in folders] == [os.path.realpath(installed)]:
             return
         from sfm.errors import InstallationError
 
@@ -60,9 +60,9 @@ def load_adapters() -> None:
             f"{where}: a package called adapters is imported, and Kolinear has one of that name; rename yours"
         )
     spec = spec_from_file_location(
-        "adapters", os.path.join(own, "__init__.py"), submodule_search_locations=[own]
+        "adapters", os.path.join(installed, "__init__.py"), submodule_search_locations=[installed]
     )
     if spec is None or spec.loader is None:
-        raise ImportError(f"{own}: not a package", name="adapters")
+        raise ImportError(f"{installed}: not a package", name="adapters")
     sys.modules["adapters"] = package = module_from_spec(spec)
     spec.loader.exec_module(package)

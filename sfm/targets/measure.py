@@ -177,10 +177,10 @@ def _shrink_gain(
     if len(theta) >= MIN_FOR_SHADING:
         w = gain_variance**-2
         tau2 = max(float((w * (gain**2 - gain_variance)).sum() / w.sum()), NO_GAIN**2)
-        own = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * (gain_variance + tau2), axis=1)
+        distinct = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * (gain_variance + tau2), axis=1)
         prior = (tau2 * length**2 / variance)[:, None, None] * np.eye(2)
         K = cofactor[:, :, gains] @ np.linalg.inv(prior + cofactor[:, gains, gains])
-        K[own] = 0.0
+        K[distinct] = 0.0
         theta = theta - np.einsum("kij,kj->ki", K, theta[:, gains])
         cofactor = cofactor - K @ cofactor[:, gains]
     return theta, variance[:, None, None] * cofactor[:, :GAIN_X, :GAIN_X], shaded

@@ -105,11 +105,11 @@ def _resected(
     """Start of every photograph by resection on its control points."""
     positions, rotations = np.empty((m, 3)), np.empty((m, 3, 3))
     for i, rows in enumerate(rows_of(image, m)):
-        own = rows[known[point[rows]]]
-        result = resect_robust(uv[own], control[point[own]], tolerance=START_TOLERANCE)
+        used = rows[known[point[rows]]]
+        result = resect_robust(uv[used], control[point[used]], tolerance=START_TOLERANCE)
         if not result.found:
             raise GeometryError(f"direct orientation: photograph {i}: {result.reason}")
-        adjusted = resect_least_squares(uv[own], control[point[own]], result.position, result.rotation)
+        adjusted = resect_least_squares(uv[used], control[point[used]], result.position, result.rotation)
         positions[i], rotations[i] = adjusted.position, adjusted.rotation
     return positions, rotations
 
@@ -149,10 +149,10 @@ def _reduced(
     n_vector = -np.einsum("kia,ki->a", wide, v)
     parts = []
     for j in np.unique(point[~known[point]]):
-        own = point == j
-        C = np.einsum("kia,kib->ab", wide[own], B[own])
-        inverse = np.linalg.inv(np.einsum("kia,kib->ab", B[own], B[own]))
-        b = -np.einsum("kia,ki->a", B[own], v[own])
+        of_point = point == j
+        C = np.einsum("kia,kib->ab", wide[of_point], B[of_point])
+        inverse = np.linalg.inv(np.einsum("kia,kib->ab", B[of_point], B[of_point]))
+        b = -np.einsum("kia,ki->a", B[of_point], v[of_point])
         N = N - C @ inverse @ C.T
         n_vector = n_vector - C @ inverse @ b
         parts.append((j, C, inverse, b))

@@ -111,8 +111,8 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
     c_px = float(np.mean([camera.c_px for camera in cameras]))
     centred = camera_from_values("centred", "brown", (1, 1), (1.0, 1.0), c_mm=c_px)
     seen = [
-        _seen_by(centred, R, camera, own, _border(camera))
-        for camera, own in zip(cameras, rotation, strict=True)
+        _seen_by(centred, R, camera, turned, _border(camera))
+        for camera, turned in zip(cameras, rotation, strict=True)
     ]
     if not all(np.isfinite(part).all() for part in seen):
         raise GeometryError(f"normal images: {first} or {second} looks along the base, or behind it")

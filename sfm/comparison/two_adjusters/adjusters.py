@@ -209,13 +209,13 @@ def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tu
         cameras: interior orientations, some parameters of which may be shared.
     """
     groups = [[camera.group_of(s) for s in range(len(camera.names))] for camera in cameras]
-    members = Counter(group for own in groups for group in set(own) if group)
+    members = Counter(group for of_camera in groups for group in set(of_camera) if group)
     alone: list[Camera] = []
     held: dict[str, tuple[str, ...]] = dict.fromkeys(members, ())
-    for camera, own in zip(cameras, groups, strict=True):
-        shared = np.array([members[group] > 1 for group in own]) & camera.free
+    for camera, of_camera in zip(cameras, groups, strict=True):
+        shared = np.array([members[group] > 1 for group in of_camera]) & camera.free
         for s in np.flatnonzero(shared):
-            held[own[s]] = tuple(dict.fromkeys((*held[own[s]], camera.names[s])))
+            held[of_camera[s]] = tuple(dict.fromkeys((*held[of_camera[s]], camera.names[s])))
         alone.append(replace(camera, free=camera.free & ~shared, shared=()))
     words = tuple(
         f"{', '.join(names)} of {group}, shared by {counted(members[group], 'camera')}"

@@ -50,23 +50,23 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     if not more or not compared.converged:
         return None
     start = replace(compared.estimate, cameras=own_cameras)
-    own = _adjusted(network, start, survey.sigma_px, covariance=False)
-    freed = own.redundancy - compared.redundancy
-    if not own.converged or freed <= 0 or compared.redundancy <= 0:
+    freer = _adjusted(network, start, survey.sigma_px, covariance=False)
+    freed = freer.redundancy - compared.redundancy
+    if not freer.converged or freed <= 0 or compared.redundancy <= 0:
         return None
-    F = (own.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
-    found = BetterFit(own.rms_px, compared.rms_px, more)
+    F = (freer.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
+    found = BetterFit(freer.rms_px, compared.rms_px, more)
     if f_isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
         return None
-    tested = contradicted_parameters(_adjusted(network, own.estimate, survey.sigma_px, covariance=True))
+    tested = contradicted_parameters(_adjusted(network, freer.estimate, survey.sigma_px, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
     return replace(found, free=clear or more)
 
 
-def _held_there(own: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
+def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
     """Return the parameters that the survey holds and the comparison has free under another name."""
     names: dict[str, None] = {}
-    for ours, theirs in zip(own, compared, strict=True):
+    for ours, theirs in zip(cameras, compared, strict=True):
         free = corresponding_free(theirs, ours.model) & ~ours.free
         names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
     return tuple(names)

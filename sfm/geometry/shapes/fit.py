@@ -79,8 +79,8 @@ class ShapeFit:
     @property
     def form_error(self) -> float:
         """Largest minus smallest distance of the points that were used; of a curve twice the largest."""
-        own = self.deviation[self.used]
-        return float(2 * own.max() if self.distances.shape[1] == 2 else np.ptp(own))
+        deviations = self.deviation[self.used]
+        return float(2 * deviations.max() if self.distances.shape[1] == 2 else np.ptp(deviations))
 
     @property
     def fits(self) -> bool | None:
@@ -205,10 +205,10 @@ def _fit(
     statistic = critical = np.nan
     if weights == "network":
         assert Q is not None
-        own = Q
+        of_used = Q
         if not used.all():
-            own = Q[used] if Q.ndim == 3 else Q[np.ix_(np.repeat(used, 3), np.repeat(used, 3))]
-        fit = refine_weighted(shape, x[used], own, free=free, offset=off, size=size, placed=placed)
+            of_used = Q[used] if Q.ndim == 3 else Q[np.ix_(np.repeat(used, 3), np.repeat(used, 3))]
+        fit = refine_weighted(shape, x[used], of_used, free=free, offset=off, size=size, placed=placed)
         shape, converged = fit.shape, fit.converged
         linear[:, used] = fit.linear.reshape(A.shape[1], -1, 3)
         C = _product(linear.reshape(len(linear), -1), Q) / size**2
@@ -264,8 +264,8 @@ def _product(J: FloatArray, Q: FloatArray) -> FloatArray:
     """Return J Q J' of a covariance of all coordinates, or of each point's by itself."""
     if Q.ndim == 2:
         return np.asarray(J @ Q @ J.T)
-    own = J.reshape(len(J), -1, 3)
-    return np.asarray(np.einsum("uni,nij,vnj->uv", own, Q, own))
+    blocks = J.reshape(len(J), -1, 3)
+    return np.asarray(np.einsum("uni,nij,vnj->uv", blocks, Q, blocks))
 
 
 def _lengths(kind: Kind, size: float) -> FloatArray:
@@ -334,11 +334,11 @@ def _best_start(
     first[6:] = form != 0
     for start in start_shapes(kind, some, origin=origin, axis=axis)[:STARTS]:
         shape = with_held(start, origin, np.full(len(form), np.nan))
-        for own in (first, free) if (first != free).any() else (free,):
+        for freed in (first, free) if (first != free).any() else (free,):
             shape, cost, _ = refine_orthogonal(
-                shape, some, free=own, offset=offset, placed=placed, iterations=START_STEPS
+                shape, some, free=freed, offset=offset, placed=placed, iterations=START_STEPS
             )
-            if own is not free:
+            if freed is not free:
                 shape = with_held(shape, origin, form)
         if np.isfinite(cost) and np.isfinite(shape.form).all():
             found.append((cost, len(found), shape))
@@ -382,14 +382,14 @@ def _sigma_of_distances(
     if Q is None:
         return np.full(n, np.nan)
     if Q.ndim == 3:
-        own = constraint_covariance(Q, B)
+        of_points = constraint_covariance(Q, B)
         cross = np.einsum("nci,nij,unj->ncu", B, Q, linear)
     else:
         blocks = np.stack([Q[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])
-        own = np.einsum("nai,nij,nbj->nab", B, blocks, B)
+        of_points = np.einsum("nai,nij,nbj->nab", B, blocks, B)
         cross = np.einsum("nci,niu->ncu", B, (Q @ linear.reshape(u, -1).T).reshape(n, 3, u))
     half = np.einsum("ncu,nku->nck", cross, A)
-    S = own + half + half.transpose(0, 2, 1) + np.einsum("ncu,uv,nkv->nck", A, C, A)
+    S = of_points + half + half.transpose(0, 2, 1) + np.einsum("ncu,uv,nkv->nck", A, C, A)
     if c == 1:
         return np.asarray(np.sqrt(np.maximum(S[:, 0, 0], 0.0)))
     length = np.linalg.norm(d, axis=1, keepdims=True)
@@ -450,11 +450,11 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     for k, name in enumerate(kind.form):
         if kind.name == "cone" and name == "radius":
             continue  # that abreast of the centroid is nobody's dimension
-        own = np.zeros((1, 6 + q))
-        own[0, 6 + k] = 1.0
-        rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], own))
+        derivatives = np.zeros((1, 6 + q))
+        derivatives[0, 6 + k] = 1.0
+        rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives))
         if name == "radius" and kind.name in WITH_DIAMETER:
-            rows.append(("diameter", "length", 2 * form[k : k + 1], 2 * own))
+            rows.append(("diameter", "length", 2 * form[k : k + 1], 2 * derivatives))
     names = tuple(name for name, _, value, _ in rows for _ in value)
     axes = tuple(axis for _, _, value, _ in rows for axis in ("XYZ" if len(value) == 3 else ("",)))
     kinds = tuple(kind for _, kind, value, _ in rows for _ in value)

@@ -163,17 +163,17 @@ class _Blocks:
     def __init__(self, Qw: FloatArray, AU: FloatArray) -> None:
         self.inverse = np.linalg.inv(Qw)
         self.AU = AU
-        own = self._own(AU)
-        self.core = np.linalg.inv(np.eye(AU.shape[1]) + AU.T @ own)
-        self.own = own
+        weighted = self._weighted(AU)
+        self.core = np.linalg.inv(np.eye(AU.shape[1]) + AU.T @ weighted)
+        self.weighted = weighted
 
-    def _own(self, b: FloatArray) -> FloatArray:
+    def _weighted(self, b: FloatArray) -> FloatArray:
         n, c, _ = self.inverse.shape
         return np.asarray(np.einsum("nab,nbk->nak", self.inverse, b.reshape(n, c, -1)).reshape(n * c, -1))
 
     def __call__(self, b: FloatArray) -> FloatArray:
-        x = self._own(b)
-        x = x - self.own @ (self.core @ (self.AU.T @ x))
+        x = self._weighted(b)
+        x = x - self.weighted @ (self.core @ (self.AU.T @ x))
         return x[:, 0] if b.ndim == 1 else x
 
 
@@ -215,13 +215,13 @@ def _tests(k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: Floa
     """Return of each point the root of k' Q_kk^-1 k over its constraints: Baarda's w of one, (n,)."""
     c = len(k) // n
     if isinstance(solve, _Blocks):
-        AU = solve.own.reshape(n, c, -1)
+        AU = solve.weighted.reshape(n, c, -1)
         blocks = solve.inverse - np.einsum("nau,uv,nbv->nab", AU, solve.core, AU)
     else:
         blocks = solve.inverse_blocks(n, c)
     scale = np.einsum("naa->n", blocks)[:, None]
-    own = PA.reshape(n, c, -1)
-    blocks = blocks - np.einsum("nau,uv,nbv->nab", own, inverse, own)
+    by_point = PA.reshape(n, c, -1)
+    blocks = blocks - np.einsum("nau,uv,nbv->nab", by_point, inverse, by_point)
     ks = k.reshape(n, c)
     values, vectors = np.linalg.eigh(blocks)
     along = np.einsum("nab,na->nb", vectors, ks)

@@ -61,11 +61,11 @@ def match_where_plane(
     chosen, off = _largest_that_agrees(found), np.zeros((len(matches), 2))
     columns = {field.name: getattr(matches, field.name).copy() for field in fields(matches)}
     for number in range(1, len(sides)):
-        own = np.flatnonzero(chosen == number)
+        of_size = np.flatnonzero(chosen == number)
         for name, column in columns.items():
-            column[rows[own]] = getattr(found[number], name)[own]
-        moved = found[number].xy[own] - found[0].xy[own]
-        off[rows[own]] = moved * sides[number] ** 2 / (sides[0] ** 2 - sides[number] ** 2)
+            column[rows[of_size]] = getattr(found[number], name)[of_size]
+        moved = found[number].xy[of_size] - found[0].xy[of_size]
+        off[rows[of_size]] = moved * sides[number] ** 2 / (sides[0] ** 2 - sides[number] ** 2)
     return LsmMatches(**columns), off
 
 

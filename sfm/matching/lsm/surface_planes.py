@@ -96,9 +96,9 @@ def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful
 
 def _others(near: IntArray) -> IntArray:
     """Return the neighbours of each point without itself, of (k, NEIGHBOURS + 1) with it, in any place."""
-    own = near == np.arange(len(near))[:, None]
-    own[~own.any(axis=1), -1] = True  # several in one place
-    return np.asarray(near[~own].reshape(len(near), -1))
+    itself = near == np.arange(len(near))[:, None]
+    itself[~itself.any(axis=1), -1] = True  # several in one place
+    return np.asarray(near[~itself].reshape(len(near), -1))
 
 
 def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -264,8 +264,8 @@ def measure_tracks(
     reference = _middle_scale(tracks.point, scale, n)
     place = xy[reference].copy()
     for i, one in enumerate(natural):
-        own = np.flatnonzero(tracks.image[reference] == i)
-        place[own] = _snapped(place[own], one.corners)
+        of_reference = np.flatnonzero(tracks.image[reference] == i)
+        place[of_reference] = _snapped(place[of_reference], one.corners)
     place = np.rint(place)  # a template of whole pixels needs no resampling
     ref = reference[tracks.point]
     offset = (place - xy[reference])[tracks.point]

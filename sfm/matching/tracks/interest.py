@@ -79,9 +79,9 @@ def foerstner_points(
     grey = grey_of(photograph)
     weight, is_round = np.empty_like(grey), np.empty(grey.shape, dtype=np.bool_)
     for first, end, begin, gx, gy in _strips(grey, side // 2):
-        own = slice(first - begin, end - begin)
+        inner = slice(first - begin, end - begin)
         part, roundness = _texture(gx, gy, side)
-        weight[first:end], is_round[first:end] = part[own], roundness[own] >= MIN_ROUNDNESS
+        weight[first:end], is_round[first:end] = part[inner], roundness[inner] >= MIN_ROUNDNESS
     top = np.asarray(cv2.dilate(weight, np.ones((3, 3), np.uint8)) <= weight)
     good = top & is_round & (weight > WEIGHT_OF_MEAN * weight.mean()) & (weight > 0)
     margin = max(border_px, side // 2 + REACH_PX)

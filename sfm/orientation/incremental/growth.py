@@ -165,17 +165,17 @@ class Growth:
         residuals = self.residuals_px()
         of_image, added = rows_of(seen.image, len(position)), 0
         for i in images:
-            own = of_image[i][known[of_image[i]]]
-            result = self.resection(i, own, uv[own])
+            rows = of_image[i][known[of_image[i]]]
+            result = self.resection(i, rows, uv[rows])
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
                 if not np.isfinite(position[i]).all():
                     fitting = int(result.inliers.sum())
-                    self.reasons[i] = _too_few(fitting, len(own), result.needed)
+                    self.reasons[i] = _too_few(fitting, len(rows), result.needed)
                 continue
             if np.isfinite(position[i]).all():
                 limit = self.tolerance_px[self.network.camera[i]] ** 2
-                old = np.minimum(residuals[own] ** 2, limit).sum()
+                old = np.minimum(residuals[rows] ** 2, limit).sum()
                 new = np.minimum(np.sum((result.residuals * camera.c_px) ** 2, axis=1), limit)
                 if not np.nansum(np.where(np.isnan(new), limit, new)) < old:
                     continue
@@ -187,18 +187,18 @@ class Growth:
         report_step("photographs oriented", int(self.estimate.oriented.sum()), len(position))
         return added
 
-    def resection(self, i: int, own: IntArray, uv: FloatArray) -> RobustResection:
+    def resection(self, i: int, rows: IntArray, uv: FloatArray) -> RobustResection:
         """Return a photograph resected on the present points.
 
         Args:
             i: the photograph.
-            own: some of its image points, all of determined points, (k,).
+            rows: some of its image points, all of determined points, (k,).
             uv: their tangents, (k, 2).
         """
         camera = self.network.camera[i]
         return resect_robust(
             uv,
-            self.estimate.points[self.network.image_points.point[own]],
+            self.estimate.points[self.network.image_points.point[rows]],
             tolerance=float(self.tolerance_px[camera] / self.estimate.cameras[camera].c_px),
             seed=self.seed + i,
             min_inliers=self.min_points,
@@ -324,9 +324,9 @@ class Growth:
         residuals = self.residuals_px()
         tolerance = self.tolerance_px.copy()
         for index, rows in enumerate(rows_of(camera, len(tolerance))):
-            own = residuals[rows][np.isfinite(residuals[rows])]
-            if len(own):
-                spread = MAD_TO_SIGMA * float(np.median(own))
+            finite = residuals[rows][np.isfinite(residuals[rows])]
+            if len(finite):
+                spread = MAD_TO_SIGMA * float(np.median(finite))
                 tolerance[index] = np.clip(
                     TOLERANCE_FACTOR * spread, final_px, self.start_tolerance_px[index]
                 )
@@ -348,11 +348,11 @@ def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
     order = np.argsort(seen.image, kind="stable")
     bounds = np.searchsorted(seen.image[order], np.arange(len(network.images) + 1))
     for i in np.flatnonzero(estimate.oriented):
-        own = order[bounds[i] : bounds[i + 1]]
+        rows = order[bounds[i] : bounds[i + 1]]
         camera = estimate.cameras[network.camera[i]]
-        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[own]])
-        length = np.linalg.norm(xy - seen.xy[own], axis=1)
-        out[own] = np.where(np.isfinite(length), length, np.inf)
+        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
+        length = np.linalg.norm(xy - seen.xy[rows], axis=1)
+        out[rows] = np.where(np.isfinite(length), length, np.inf)
     return out
 
 
@@ -362,10 +362,10 @@ def _staged(camera: Camera, network: Network, index: int) -> Camera:
     What the image points of the camera leave after the exterior orientations must exceed its free parameters
     several times, and so must the redundancy of the network.
     """
-    own = network.camera == index
+    of_camera = network.camera == index
     n, m = len(network.points), len(network.images)
     redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
-    surplus = min(2 * int(own[network.image_points.image].sum()) - 6 * int(own.sum()), redundancy)
+    surplus = min(2 * int(of_camera[network.image_points.image].sum()) - 6 * int(of_camera.sum()), redundancy)
     early = camera.free & _determined_early(camera)
     if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
         return camera

@@ -90,11 +90,11 @@ def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected
         turned_over: whether left and right of its image points are exchanged.
     """
     seen, camera = growth.network.image_points, growth.estimate.cameras[growth.network.camera[i]]
-    own = np.flatnonzero((seen.image == i) & growth.estimate.determined[seen.point])
-    xy = seen.xy[own]
+    rows = np.flatnonzero((seen.image == i) & growth.estimate.determined[seen.point])
+    xy = seen.xy[rows]
     uv = tangents_from_pixel(camera, (camera.size_px[0] - 1, 0) + xy * (-1, 1) if turned_over else xy)
     known = np.isfinite(uv).all(axis=1)
-    found = growth.resection(i, own[known], uv[known])
+    found = growth.resection(i, rows[known], uv[known])
     if not found.found:
         return _Resected(np.inf, 0)
     lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px

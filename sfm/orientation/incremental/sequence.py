@@ -284,7 +284,7 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
     if growth.estimate.oriented.sum() < 2:
         raise GeometryError(
             f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "
-            f"oriented, at least 2 are needed: {_words_of_failures(_failures(growth))}"
+            f"oriented, at least 2 are needed: {_list_failures(_failures(growth))}"
         )
     if start.pair is not None and len(control) >= 3:
         known = growth.estimate.determined[control.point]
@@ -315,7 +315,7 @@ def _failures(growth: Growth) -> tuple[tuple[str, Remark], ...]:
     )
 
 
-def _words_of_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
+def _list_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
     """Return the reasons with the photographs that they are of, each reason once."""
     of_reason: dict[str, list[str]] = {}
     for name, reason in failures:

@@ -86,12 +86,12 @@ def best_start(
     a third photograph the false plane does not fit. All solutions of all promising pairs are tried and
     compared by the truncated squares over the photographs that share most points with them.
     """
-    own = _sorted_rows(network, tangents)
-    pairs = _promising_pairs(network, own)
+    of_photograph = _sorted_rows(network, tangents)
+    pairs = _promising_pairs(network, of_photograph)
     if not pairs:
         raise GeometryError(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
-            f"common: {_words_of_common(network, own)}"
+            f"common: {_list_common(network, of_photograph)}"
         )
     found: list[_Candidate] = []  # of the pair with the best of them
     holds = False  # whether most points of any pair fit an orientation
@@ -100,7 +100,7 @@ def best_start(
         if tried == BARREN_PAIRS and not holds:
             break
         report_step("starting pairs tried", tried, len(pairs))
-        points, first, second = _common(network, tangents, own[i], own[j])
+        points, first, second = _common(network, tangents, of_photograph[i], of_photograph[j])
         limit = float(max(tolerance[i], tolerance[j]))
         try:
             solutions = relative_orientations(
@@ -117,7 +117,7 @@ def best_start(
             widest = max(widest, angle)
             if start is None or angle < least_angle:
                 continue
-            score, resected = _support(network, tangents, tolerance, own, start, seed)
+            score, resected = _support(network, tangents, tolerance, of_photograph, start, seed)
             of_pair.append(_Candidate(start, score, resected, solution.kind == solutions[0].kind))
         if of_pair and (not found or _best_of(of_pair).score > _best_of(found).score):
             found = of_pair
@@ -145,8 +145,8 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
     Source: Ma et al. (2004), An Invitation to 3-D Vision, sec. 5.3.3 (the two solutions of a plane).
     """
     tangents = image_tangents(network.image_points, network.camera, estimate.cameras)
-    own = _sorted_rows(network, tangents)
-    points, first, second = _common(network, tangents, own[0], own[1])
+    of_photograph = _sorted_rows(network, tangents)
+    points, first, second = _common(network, tangents, of_photograph[0], of_photograph[1])
     tolerance = tolerance_px / min(camera.c_px for camera in estimate.cameras)
     solutions: list[RelativeOrientation] = []
     for within in (tolerance, AS_A_PLANE):
@@ -193,11 +193,11 @@ def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
     return [usable[rows] for rows in rows_of(seen.image[usable], len(network.images))]
 
 
-def _words_of_common(network: Network, own: list[IntArray]) -> str:
+def _list_common(network: Network, of_photograph: list[IntArray]) -> str:
     """Say for each photograph with which other it has most points in common."""
     usable = np.zeros(len(network.image_points), dtype=bool)
-    usable[np.concatenate(own)] = True
-    most, partner = np.zeros(len(own), dtype=np.int64), np.zeros(len(own), dtype=np.int64)
+    usable[np.concatenate(of_photograph)] = True
+    most, partner = np.zeros(len(of_photograph), dtype=np.int64), np.zeros(len(of_photograph), dtype=np.int64)
     for first, second, count in network.common_points(usable):
         for one, other in ((first, second), (second, first)):
             order = np.lexsort((-other, count, one))  # of each photograph the last one has most
@@ -206,21 +206,23 @@ def _words_of_common(network: Network, own: list[IntArray]) -> str:
             most[one[better]], partner[one[better]] = count[better], other[better]
     words = []
     for i, name in enumerate(network.images):
-        if not len(own[i]):
+        if not len(of_photograph[i]):
             words.append(f"{name}: no points")
         elif not most[i]:
-            words.append(f"{name}: none of its {counted(len(own[i]), 'point')} is in another photograph")
+            words.append(
+                f"{name}: none of its {counted(len(of_photograph[i]), 'point')} is in another photograph"
+            )
         else:
             shared = counted(int(most[i]), "point")
             words.append(f"{name}: {shared} in common with {network.images[partner[i]]}")
     return listed(words, most=10, separator="; ")
 
 
-def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, int]]:
+def _promising_pairs(network: Network, of_photograph: list[IntArray]) -> list[tuple[int, int]]:
     """Pairs with at least four common points, those with most first, spread over the photographs."""
-    m = len(own)
+    m = len(of_photograph)
     usable = np.zeros(len(network.image_points), dtype=bool)
-    usable[np.concatenate(own)] = True
+    usable[np.concatenate(of_photograph)] = True
     pairs = np.zeros(1, dtype=np.int64)  # by the number of common points
     for _, _, count in network.common_points(usable):
         now = np.bincount(count, minlength=len(pairs))
@@ -289,7 +291,7 @@ def _support(
     network: Network,
     tangents: FloatArray,
     tolerance: FloatArray,
-    own: list[IntArray],
+    of_photograph: list[IntArray],
     start: Start,
     seed: int,
 ) -> tuple[float, int]:
@@ -302,8 +304,8 @@ def _support(
     """
     seen = network.image_points
     determined = np.asarray(np.isfinite(start.points).all(axis=1))
-    rows = [one[determined[seen.point[one]]][:SCREEN_POINTS] for one in own]
-    sharing = sorted(range(len(own)), key=lambda i: (-len(rows[i]), i))
+    rows = [one[determined[seen.point[one]]][:SCREEN_POINTS] for one in of_photograph]
+    sharing = sorted(range(len(of_photograph)), key=lambda i: (-len(rows[i]), i))
     position, rotation = start.position.copy(), start.rotation.copy()
     for i in [i for i in sharing if i not in (start.pair or ())][:SCREEN_PHOTOGRAPHS]:
         result = resect_robust(

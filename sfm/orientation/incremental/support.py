@@ -85,14 +85,14 @@ def _amidst(network: Network, estimate: Estimate) -> BoolArray:
         camera = estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], points)
         xy = xy[((xy >= 0) & (xy < camera.size_px)).all(axis=1)]
-        own = of_image[i]
-        if len(xy) < 3 or not len(own):
+        rows = of_image[i]
+        if len(xy) < 3 or not len(rows):
             continue
         try:
             lines = ConvexHull(xy).equations
         except QhullError:  # all on one line
             continue
-        out[own] = (seen.xy[own] @ lines[:, :2].T + lines[:, 2] <= 0).all(axis=1)
+        out[rows] = (seen.xy[rows] @ lines[:, :2].T + lines[:, 2] <= 0).all(axis=1)
     return out
 
 

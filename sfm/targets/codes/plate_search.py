@@ -137,11 +137,11 @@ def search_april_grids(tried: Sequence[AnyArray], others: Sequence[AnyArray] = (
     grids, shown = list[PlateFamily](), list[set[int]]()
     while (grid := _april_grid(photographs, seen)) is not None:
         of_grid = [(number >= grid.first_tag) & (number <= grid.last_tag) for number, _ in seen]
-        showing = {k for k, own in enumerate(of_grid) if own.sum() >= MIN_TAGS_OF_BOARD}
+        showing = {k for k, on in enumerate(of_grid) if on.sum() >= MIN_TAGS_OF_BOARD}
         if not grids or any(showing & one for one in shown):
             grids.append(grid)
             shown.append(showing)
-        seen = [(number[~own], quads[~own]) for (number, quads), own in zip(seen, of_grid, strict=True)]
+        seen = [(number[~on], quads[~on]) for (number, quads), on in zip(seen, of_grid, strict=True)]
     return tuple(grids)
 
 
@@ -165,9 +165,9 @@ def _april_grid(
         row, column = np.divmod(np.arange(across * down), across)
         middle = np.stack([column, -row], axis=1).astype(float)
         parts = [
-            (number[own] - first, quads[own])
+            (number[in_grid] - first, quads[in_grid])
             for number, quads in seen
-            for own in [number < first + down * across]
+            for in_grid in [number < first + down * across]
         ]
         shares = [share for one in parts if (share := _tag_share(*one, middle))]
         if len(shares) < 2:

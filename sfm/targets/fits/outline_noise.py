@@ -110,10 +110,10 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[Float
     Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression" (2004);
     Phipson et al., "Robust hyperparameter estimation protects against hypervariable genes" (2016).
     """
-    own = ratio[sound & (ratio > 0)]
+    ratios = ratio[sound & (ratio > 0)]
     prior, prior_freedom = 1.0, float(freedom)
-    if len(own) >= MIN_POPULATION:
-        z = np.log(own) - digamma(freedom / 2) + np.log(freedom / 2)
+    if len(ratios) >= MIN_POPULATION:
+        z = np.log(ratios) - digamma(freedom / 2) + np.log(freedom / 2)
         middle = np.median(z)
         half = _inverse_trigamma((MAD * np.median(np.abs(z - middle))) ** 2 - polygamma(1, freedom / 2))
         prior_freedom, prior = 2 * half, np.exp(middle + digamma(half) - np.log(half))

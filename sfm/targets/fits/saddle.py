@@ -147,8 +147,8 @@ def _blur(gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: floa
         return math.nan
     C2 = contrast * contrast
     s = 4 * half * C2 / (2 * math.sqrt(math.pi) * squares + 4.514 * C2)
-    own = s * s - SMOOTHING_PX**2 - 1 / 3  # without that of the filters
-    return math.sqrt(max(own, MIN_BLUR_PX**2))
+    of_edge = s * s - SMOOTHING_PX**2 - 1 / 3  # without that of the filters
+    return math.sqrt(max(of_edge, MIN_BLUR_PX**2))
 
 
 @compiled
