@@ -17,14 +17,14 @@ from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page import Banner
 from sfm.report.phrases import (
+    describe_calibration,
+    describe_check,
+    describe_neighbours,
+    describe_precision,
+    describe_rigs,
+    describe_sigma0,
+    describe_test,
     words_left_out,
-    words_of_calibration,
-    words_of_check,
-    words_of_neighbours,
-    words_of_precision,
-    words_of_rigs,
-    words_of_sigma0,
-    words_of_test,
 )
 from sfm.result import SurveyResult
 
@@ -33,7 +33,7 @@ COLUMN_GAP = 2  # characters between columns
 STYLES: dict[Severity, str] = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
-def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
+def print_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
     """Print the summary: verdict, figures with their units, what failed, where the report is.
 
     Returns:
@@ -50,7 +50,7 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     for name, value in rows:
         table.add_row(Text(name, style="dim"), Text(wrapped(value, room)))
     console.print(table)
-    tell_remarks(console, verdict.lines)
+    print_remarks(console, verdict.lines)
     for line in _failures(findings):
         console.print(Text(f"  {line}"), soft_wrap=True)
     if verbose:
@@ -68,14 +68,14 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     return verdict.level != "bad"
 
 
-def tell_verdict(verdict: Verdict | Banner) -> None:
+def print_verdict(verdict: Verdict | Banner) -> None:
     """Print a verdict: its headline in its colour, then its remarks."""
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
-    tell_remarks(console, verdict.lines)
+    print_remarks(console, verdict.lines)
 
 
-def tell_remarks(console: Console, lines: Iterable[Line]) -> None:
+def print_remarks(console: Console, lines: Iterable[Line]) -> None:
     """Print remarks: errors and warnings behind `!`, then notes; remedies but of notes on nothing lost."""
     for line in lines:
         is_note = line.severity == "note"
@@ -112,12 +112,12 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
-    told = words_of_precision(typical, largest, result.length_unit)
+    told = describe_precision(typical, largest, result.length_unit)
     if not math.isfinite(typical):
         told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
         *_cameras(findings),
-        *words_of_rigs(findings.rigs, findings.result.length_unit),
+        *describe_rigs(findings.rigs, findings.result.length_unit),
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
             "object points",
@@ -128,16 +128,16 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
         (
             "sigma0",
-            f"{', '.join(words_of_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
+            f"{', '.join(describe_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
     ]
     if a.error_correlation is not None:
-        rows.append(("correlation", words_of_neighbours(a)))
+        rows.append(("correlation", describe_neighbours(a)))
     if not findings.calibrated:
         rows.append(("point precision", told))
     if result.control_check is not None:
-        rows.append(("check at control", words_of_check(result.control_check, result.length_unit)))
+        rows.append(("check at control", describe_check(result.control_check, result.length_unit)))
     both = result.comparison
     if both is not None:
         word: str = "stopped early, same optimum" if both.stopped_early else both.outcome
@@ -170,7 +170,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
 def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
     """Yield what a calibration is for: the cameras, where no coordinate was adjusted."""
     for one in findings.calibrated[:MAX_LISTED]:
-        values, sigmas, within, projection = words_of_calibration(one)
+        values, sigmas, within, projection = describe_calibration(one)
         yield f"camera {one.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
         yield "  projection", projection
     if len(findings.calibrated) > MAX_LISTED:
@@ -187,7 +187,7 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
          f"{counted(counts.scale_bars, 'scale bar')}, {counts.further} further; "
          f"{counted(counts.constraints, 'constraint')}, "
          f"{counted(a.unknowns, 'unknown')}"),
-        *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
+        *(("global test", describe_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity
     if found is not None:

@@ -85,8 +85,8 @@ def _figures(found: ResultComparison, known: list[str]) -> Table:
     }[found.alignment]
     rows = (
         ("aligned by", aligned, ""),
-        ("scale", words_of_scale(found), ""),
-        ("common points", words_of_pairing(found), ""),
+        ("scale", describe_scale(found), ""),
+        ("common points", describe_pairing(found), ""),
         length("RMS difference of a point coordinate", _rms(found.point_difference)),
         length("largest difference of a point", _longest(found.point_difference)),
         ("common photographs", len(found.images), ""),
@@ -178,7 +178,7 @@ def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
     }
 
 
-def words_of_pairing(found: ResultComparison) -> str:
+def describe_pairing(found: ResultComparison) -> str:
     """Return in words how many points are common and by what they were recognised."""
     pairing = found.pairing
     ways = [
@@ -190,7 +190,7 @@ def words_of_pairing(found: ResultComparison) -> str:
     return f"{counted(len(found.points), 'common point')}{f' ({said})' if said else ''}"
 
 
-def words_of_scale(found: ResultComparison) -> str:
+def describe_scale(found: ResultComparison) -> str:
     """Return in words what became of the scale in the alignment."""
     if found.alignment == "none":
         return "not aligned"

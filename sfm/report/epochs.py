@@ -176,7 +176,7 @@ def _section(pair: EpochPair, number: int) -> Section:
         " to ".join(d.names),
         Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
         shared if d.shared else None,
-        Paragraph(words_of_stable(found)),
+        Paragraph(describe_stable(found)),
         _steps(found),
         test,
         _picture(found, number),
@@ -205,7 +205,7 @@ def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
     limits = [Column(name, format=significant, unknown="") for name in ("T", "critical value")]
     return (
         Heading(block.name),
-        Paragraph(f"{words_of_block(block)}."),
+        Paragraph(f"{describe_block(block)}."),
         Table((Column("parameter"), *numbers, Column("unit")), rows),
         Table((Column(), *limits, Column()), tests),
     )
@@ -229,7 +229,7 @@ def _mounts(pair: EpochPair, factor: float, unit: str) -> tuple[Part, ...]:
     return Heading("Mounts of rigs"), Table(columns, rows)
 
 
-def words_of_stable(found: Displacements) -> str:
+def describe_stable(found: Displacements) -> str:
     """Return in words which points carry the datum, and how they were found."""
     if not found.agreed:
         return (
@@ -256,7 +256,7 @@ def words_of_stable(found: Displacements) -> str:
     )
 
 
-def words_of_block(block: BlockMotion) -> str:
+def describe_block(block: BlockMotion) -> str:
     """Return in words how a group moved."""
     parts = [part.name for part in block.parts if part.significant]
     how = " and ".join(parts) if parts else "nothing significant"

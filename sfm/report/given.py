@@ -24,7 +24,7 @@ from sfm.report.page import (
     columns,
     columns_of,
 )
-from sfm.report.phrases import words_of_check
+from sfm.report.phrases import describe_check
 from sfm.result import ControlCheck
 
 HEADINGS = {
@@ -88,7 +88,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
     length = np.linalg.norm(check.differences, axis=1)
     rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, length, strict=True)]
     rms = ("RMS", *(significant(factor * one) for one in check.rms), float(np.linalg.norm(check.rms)))
-    words = Paragraph(words_of_check(check, unit))
+    words = Paragraph(describe_check(check, unit))
     return Heading("Check at the control"), words, note, Table(heads, rows, total=rms)
 
 

@@ -315,7 +315,7 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
     }
 
 
-def words_of_measured(found: Measurement) -> str:
+def describe_measured(found: Measurement) -> str:
     """Return in one line how much was measured, and how many deviations are decided in which way."""
     if not found.tolerances:
         parts = [counted(len(found.points.names), "point")]

@@ -21,14 +21,14 @@ from sfm.result import ControlCheck, SurveyResult
 NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that 95 % of its errors are within
 
 
-def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
+def describe_sigma0(sigma0: Sigma0) -> tuple[str, str]:
     """Return sigma0 and what it is to the stated one, with the image points where they show another."""
     times = f"{sigma0.px / sigma0.stated_px:.3f} times the {significant(sigma0.stated_px)} px expected"
     alone = f"image points by themselves {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
     return f"{sigma0.px:.4f} px", f"{times}; {alone}" if sigma0.differs else times
 
 
-def words_of_neighbours(a: Adjustment) -> str:
+def describe_neighbours(a: Adjustment) -> str:
     """Return how far the errors of neighbouring image points agree; empty where they are independent."""
     found = a.error_correlation
     if found is None:
@@ -40,7 +40,7 @@ def words_of_neighbours(a: Adjustment) -> str:
     )
 
 
-def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
+def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
     """Return what a global test says, with what would fit where the stated values are too cautious.
 
     Args:
@@ -76,7 +76,7 @@ def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
     return f"{significant(factor)} times the stated standard deviations"
 
 
-def words_of_weights(result: SurveyResult) -> str:
+def describe_weights(result: SurveyResult) -> str:
     """Return which weights the image points have, and what follows for the tests; empty if nothing chose."""
     factor = result.adjustment.weight_factor
     if result.weights == "stated":
@@ -91,7 +91,7 @@ def words_of_weights(result: SurveyResult) -> str:
     )
 
 
-def words_of_check(found: ControlCheck, unit: str) -> str:
+def describe_check(found: ControlCheck, unit: str) -> str:
     """Return how far the placed points are from control that took no part.
 
     Args:
@@ -109,7 +109,7 @@ def words_of_check(found: ControlCheck, unit: str) -> str:
     )
 
 
-def words_of_limiting(precision: Precision) -> str:
+def describe_limiting(precision: Precision) -> str:
     """Return why a limiting standard deviation is above the achieved one; empty where none is.
 
     With the cameras held, shift, rotation and scale of the points are theirs; inner constraints on the
@@ -123,7 +123,7 @@ def words_of_limiting(precision: Precision) -> str:
     )
 
 
-def words_of_precision(typical: float, largest: float, unit: str) -> str:
+def describe_precision(typical: float, largest: float, unit: str) -> str:
     """Return the precision of the points: one standard deviation, and what 95 % of the errors are within.
 
     Args:
@@ -138,7 +138,7 @@ def words_of_precision(typical: float, largest: float, unit: str) -> str:
     return f"{sigmas}; 95 % {rms_95} {finer} RMS, {most_95} {finer} at most"
 
 
-def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
+def describe_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     """Return c and principal point, their 1 sigma, their 95 %, and the projection uncertainty."""
     values, sigmas, within = [], [], []
     for one in camera.parameters:
@@ -158,7 +158,7 @@ def words_of_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     return ", ".join(values), ", ".join(sigmas), ", ".join(within), projection
 
 
-def words_of_fixed(precision: Precision) -> str:
+def describe_fixed(precision: Precision) -> str:
     """Say that fixed coordinates do not count; empty where there are none."""
     count = precision.fixed_points
     return f"without the fixed coordinates of {counted(count, 'point')}" if count else ""
@@ -185,7 +185,7 @@ def words_left_out(findings: Findings) -> str:
     return f"without {listed(left_out)}" if left_out else ""
 
 
-def words_of_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
+def describe_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
     """Yield each rig and where one of its cameras is mounted: base and angles with standard deviations."""
     for rig in rigs:
         for mount in rig.mounts:

@@ -50,7 +50,7 @@ from sfm.report.page import (
     plain,
     values_of,
 )
-from sfm.report.phrases import NORMAL_95, words_of_rigs
+from sfm.report.phrases import NORMAL_95, describe_rigs
 from sfm.report.tables.summary import summary_of_rigs
 from sfm.report.viewer.product_scenes import plan_viewer
 
@@ -303,7 +303,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             f"{len(plan.coded)} give every photograph five, or all that it shows, and name what is observed",
         ),
     ]
-    rows += words_of_rigs(rigs_of(a), plan.unit)
+    rows += describe_rigs(rigs_of(a), plan.unit)
     rows += [(f"gain by {one.name}", _gain_in_words(one)) for one in plan.contributions]
     if a.undetermined:
         rows.append(("not determined", _first(a.undetermined)))
@@ -382,11 +382,13 @@ def _observed(plan: Plan) -> dict[str, Any]:
             sigma |= dict(zip(one.camera.tolist(), deviations, strict=True))
     values = np.hstack([mounts.position, angles_from_rotation(mounts.rotation)])
     for a, camera in enumerate(plan.prediction.cameras):
-        own = {
+        mount = {
+            "camera": camera.name,
+            "rig": mounts.rig[a],
             "value": plain(IN_FILES * values[a]),
             "sigma": plain(IN_FILES * sigma[a]) if a in sigma else None,
         }
-        found["mounts"].append({"camera": camera.name, "rig": mounts.rig[a], **own})
+        found["mounts"].append(mount)
     return found
 
 

@@ -32,7 +32,7 @@ class Numbers:
     written_px: float = 0.0  # their RMS per coordinate by COLMAP
 
 
-def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
+def describe_key_points(found: Refinement, numbers: Numbers) -> str:
     """Return the line of the RMS that COLMAP finds in the files, and why it is larger than that adjusted."""
     kept = numbers.written - found.refined
     return (

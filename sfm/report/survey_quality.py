@@ -41,11 +41,11 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import (
     NORMAL_95,
-    words_of_fixed,
-    words_of_limiting,
-    words_of_neighbours,
-    words_of_test,
-    words_of_weights,
+    describe_fixed,
+    describe_limiting,
+    describe_neighbours,
+    describe_test,
+    describe_weights,
 )
 from sfm.report.tables.csv_files import component_rows
 
@@ -82,14 +82,14 @@ def precision_parts(f: Findings) -> Iterator[Part]:
     ]
     yield Table(columns("standard deviation", ">X, omega", ">Y, phi", ">Z, kappa", ">all", "unit"), shown)
     if adjusted and p.fixed_points:
-        yield Paragraph(f"RMS {words_of_fixed(p)}.")
-    if words := words_of_limiting(p):
+        yield Paragraph(f"RMS {describe_fixed(p)}.")
+    if words := describe_limiting(p):
         yield Paragraph(words)
     yield Note(
         f"Standard deviations are a posteriori and in the datum of the adjustment ({a.datum}); in a free "
         "network they state how the points lie to one another, not in an outer frame."
     )
-    if words := words_of_neighbours(a):
+    if words := describe_neighbours(a):
         yield Paragraph(f"By the residuals, {words}.")
     size = f"{general(f.object_size, 5)} {unit}"
     yield Paragraph(f"The object is {size} across (diagonal of the box around its points).")
@@ -195,8 +195,8 @@ def image_point_parts(f: Findings) -> Iterator[Part]:
         ("longest residual vector among the accepted", fixed(a.max_residual_px, 4), "px"),
     )
     yield Table(columns("", ">value", "unit"), rows)
-    yield facts([("global test", words_of_test(test, a)) for test in s.global_tests])
-    if words := words_of_weights(f.result):
+    yield facts([("global test", describe_test(test, a)) for test in s.global_tests])
+    if words := describe_weights(f.result):
         yield Paragraph(words)
     yield Note(
         "The global test asks whether the standard deviations stated beforehand are those of the residuals. "

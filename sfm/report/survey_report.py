@@ -40,10 +40,10 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import (
     NORMAL_95,
+    describe_calibration,
+    describe_fixed,
+    describe_sigma0,
     words_left_out,
-    words_of_calibration,
-    words_of_fixed,
-    words_of_sigma0,
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.tables.csv_files import left_out_rows
@@ -118,7 +118,7 @@ def _tiles(f: Findings) -> Iterator[Tile]:
     """Yield the figures that a reader sees first."""
     result, a = f.result, f.result.adjustment
     for one in f.calibrated[:2]:
-        values, sigmas, within, projection = words_of_calibration(one)
+        values, sigmas, within, projection = describe_calibration(one)
         yield Tile(f"Camera {one.name}", values, f"1 sigma {sigmas}; 95 % {within}", wide=True)
         rms = f"{significant(one.projection_rms_px)} px"
         yield Tile(f"Projection uncertainty of {one.name}", rms, projection)
@@ -128,7 +128,7 @@ def _tiles(f: Findings) -> Iterator[Tile]:
     if not f.calibrated:
         yield _precision_tile(f)
     yield Tile("RMS residual", f"{fixed(a.rms_px, 4)} px", "per image coordinate")
-    sigma0, times = words_of_sigma0(f.sigma0)
+    sigma0, times = describe_sigma0(f.sigma0)
     yield Tile("Sigma0", sigma0, f"{times}, redundancy {a.redundancy}")
     if both := result.comparison:
         left_out, better = words_left_out(f), both.better
@@ -144,7 +144,7 @@ def _precision_tile(f: Findings) -> Tile:
     if not typical > 0:
         return Tile("Precision of a point", "fixed" if f.precision.fixed_points else "not known")
     factor, unit = finer_unit(f.result.length_unit, typical)
-    without = words_of_fixed(f.precision)
+    without = describe_fixed(f.precision)
     return Tile(
         "Precision of a point",
         f"{significant(typical * factor)} {unit}",
@@ -218,7 +218,7 @@ def _calibrated(f: Findings) -> Iterator[Part]:
     if f.calibrated:
         rows = []
         for one in f.calibrated:
-            values, sigmas, within, projection = words_of_calibration(one)
+            values, sigmas, within, projection = describe_calibration(one)
             rows += [(one.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"), ("projection", projection)]
         yield Heading("Calibrated cameras")
         yield facts(rows)

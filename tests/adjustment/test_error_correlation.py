@@ -21,7 +21,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.report.numbers import significant
-from sfm.report.phrases import words_of_neighbours
+from sfm.report.phrases import describe_neighbours
 from sfm.survey.adjusting.solution import solve_survey
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
@@ -201,12 +201,12 @@ def test_surveys_of_texture_have_common_errors_in_their_covariance(scene: tuple[
     matched = Correspondences(network, truth, np.full(len(network.points), 3))
     of_targets = solve_survey(survey, matched).adjustment
     textured = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).adjustment
-    assert of_targets.error_correlation is None and words_of_neighbours(of_targets) == ""
+    assert of_targets.error_correlation is None and describe_neighbours(of_targets) == ""
     assert textured.error_correlation is not None
     assert sigma_of_centres(textured) > 1.5 * sigma_of_centres(of_targets)
     alone, common = textured.error_correlation.sigmas_px(textured.sigma0_px)
     assert alone == pytest.approx(SIGMA_PX * np.sqrt(0.7), rel=0.2)
-    assert f"{significant(common)} px in common" in words_of_neighbours(textured)
+    assert f"{significant(common)} px in common" in describe_neighbours(textured)
 
 
 @pytest.mark.parametrize("length_px", [150.0, 300.0])

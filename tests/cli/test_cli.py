@@ -102,7 +102,7 @@ codes = [0, 11, 0, 0]
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is told of compiling, whether or not this is the first run after a change."""
-    monkeypatch.setattr(starting, "_tell_of_compiling", lambda: None)
+    monkeypatch.setattr(starting, "_announce_compiling", lambda: None)
 
 
 @pytest.fixture(scope="module")

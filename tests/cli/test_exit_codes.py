@@ -57,7 +57,7 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(starting, "_tell_of_compiling", lambda: None)
+    monkeypatch.setattr(starting, "_announce_compiling", lambda: None)
 
 
 def kolinear(

@@ -19,7 +19,7 @@ from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, kinds_of, remark
-from sfm.report.differences import words_of_scale
+from sfm.report.differences import describe_scale
 from sfm.solution import Solution
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
@@ -137,11 +137,11 @@ def test_a_change_of_size_is_a_change_where_both_have_a_scale() -> None:
     longer = epoch(3, "free", bar=1.01)
     found = compare_results(epoch(2, "free"), longer)
     assert found.changed is True and found.a_from_b.scale == 1.0
-    assert words_of_scale(found) == "scale kept: both results have one"
+    assert describe_scale(found) == "scale kept: both results have one"
     unscaled = compare_results(epoch(2, "free"), replace(longer, unit=""))
     assert unscaled.changed is False and unscaled.scale_estimated
     assert unscaled.a_from_b.scale == pytest.approx(1 / 1.01, rel=1e-3)
-    assert words_of_scale(unscaled).startswith("scale estimated, 0.99")
+    assert describe_scale(unscaled).startswith("scale estimated, 0.99")
 
 
 def test_units_are_carried_over() -> None:

@@ -16,7 +16,7 @@ from sfm.epochs.findings import remarks_of_pair, verdict_of_epochs
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, kinds_of
-from sfm.report.epochs import words_of_stable
+from sfm.report.epochs import describe_stable
 from sfm.report.pages import write_page
 from tests.epochs.scenes import POINTS, epoch
 
@@ -67,12 +67,12 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
 def test_words() -> None:
     still, moved, _ = (pair.displacements for pair in series().pairs)
     assert tuple(remarks_of_pair(still)) == ()
-    assert words_of_stable(still) == "All 60 points of reference agree."
+    assert describe_stable(still) == "All 60 points of reference agree."
     (one,) = remarks_of_pair(moved)
     assert one.kind == "displaced" and one.names("points") == ("5", "17", "22", "41")
     assert abs(one.number("distance") - 0.01) < 1e-3 and one.number("tested") == 60
     assert verdict_of_epochs(series()).level == "fair"
-    assert "56 of 60 points of reference are proposed as stable" in words_of_stable(moved)
+    assert "56 of 60 points of reference are proposed as stable" in describe_stable(moved)
 
 
 def test_refusals_are_one_line() -> None:

@@ -18,7 +18,7 @@ from sfm.errors import KolinearError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.remarks.remark import kinds_of
-from sfm.report.measurement import words_of_measured
+from sfm.report.measurement import describe_measured
 from sfm.report.pages import write_page
 from sfm.solution import Solution
 from tests.inspection.benches import (
@@ -144,7 +144,7 @@ def test_everything_is_measured_within_its_standard_deviations(tmp_path: Path) -
     assert [one.count("in") for one in found.tolerances] == [25, 85, 25]
     assert found.tolerances[1].missing == ("nowhere",) and found.verdict.level == "fair"
     assert kinds_of(found.verdict.remarks) == ("nominal_missing",)
-    assert words_of_measured(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
+    assert describe_measured(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
     groups = dict(found.groups)
     assert len(groups["plate"]) == 25 and found.group_of(int(groups["plate"][0])) == "plate"
 
@@ -229,7 +229,7 @@ def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
 
 def test_a_result_without_features_gives_its_points(tmp_path: Path) -> None:
     found = measure_result(one_bench())
-    assert words_of_measured(found) == "85 points." and found.verdict.level == "good"
+    assert describe_measured(found) == "85 points." and found.verdict.level == "good"
     page = write_page(found, tmp_path / "out", result=one_bench())
     assert page.is_file()
 

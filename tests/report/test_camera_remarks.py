@@ -18,7 +18,7 @@ from sfm.remarks.verdict import Verdict
 from sfm.report.findings import camera_remarks
 from sfm.report.findings.calibrated_cameras import camera_is_result
 from sfm.report.findings.findings import findings_of
-from sfm.report.phrases import words_of_calibration
+from sfm.report.phrases import describe_calibration
 from sfm.result import SeenPlate, SurveyResult
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -200,7 +200,7 @@ def test_a_parameter_that_a_null_vector_leaves_open_has_no_standard_deviation() 
     assert found.verdict.level == "bad" and np.isinf(found.calibrated[0].projection_rms_px)
     assert "camera_not_determined" in kinds_of(found.verdict.remarks)
     assert "camera_not_calibrated" not in kinds_of(found.verdict.remarks)
-    _, sigmas, _, projection = words_of_calibration(found.calibrated[0])
+    _, sigmas, _, projection = describe_calibration(found.calibrated[0])
     assert sigmas.startswith("not determined") and projection == "not determined"
 
 

@@ -20,7 +20,7 @@ import sfm.report.findings.checks as checks
 import sfm.report.findings.findings as findings_module
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.cli.console import tell_result
+from sfm.cli.console import print_result
 from sfm.report.findings.findings import findings_of
 from sfm.report.log import SurveyLog
 from sfm.report.output import write_result
@@ -64,7 +64,7 @@ def test_every_number_of_a_survey_is_computed_once(
     findings = findings_of(result)
     with SurveyLog() as log:
         page = write_result(findings, tmp_path / "out", finish=lambda part: log.close_into(part, findings))
-    tell_result(findings, page, seconds=1.0, verbose=True)
+    print_result(findings, page, seconds=1.0, verbose=True)
     assert findings.verdict.headline in capsys.readouterr().out
     assert calls == dict.fromkeys((name for _, name in COMPUTED), 1)
 

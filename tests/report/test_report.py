@@ -19,7 +19,7 @@ from markupsafe import escape
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.cli.console import tell_result
+from sfm.cli.console import print_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import bound, counted
@@ -45,7 +45,7 @@ from sfm.report.numbers import (
 from sfm.report.output import WRITTEN, plot_data, write_result
 from sfm.report.page import Paragraph, Section
 from sfm.report.pages import html_of, page_of
-from sfm.report.phrases import words_left_out, words_of_precision
+from sfm.report.phrases import describe_precision, words_left_out
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
@@ -417,7 +417,7 @@ def test_precision_is_told_as_one_sigma_and_as_what_95_of_100_are_within(
     found = findings_of(result)
     factor, _ = finer_unit(result.length_unit, float(found.precision.largest[3]))
     within = significant(1.959964 * factor * float(found.precision.rms[3]))
-    tell_result(found, Path("page"), seconds=1.0, verbose=False)
+    print_result(found, Path("page"), seconds=1.0, verbose=False)
     for told in (capsys.readouterr().out, html_of(found), text_report(found)):
         assert "1 sigma" in told and "95 %" in told and within in told
 
@@ -509,7 +509,7 @@ def test_every_remark_is_shown_once_by_every_renderer(
     text = text_report(findings)
     assert max(map(len, text.splitlines())) <= WIDTH
     words = " ".join(text.split())
-    tell_result(findings, Path("report.html"), seconds=1.0, verbose=False)
+    print_result(findings, Path("report.html"), seconds=1.0, verbose=False)
     told, page = capsys.readouterr().out, html_of(findings)
     for one in findings.verdict.remarks:
         assert words.count(one.text) == 1 and told.count(one.text) == 1
@@ -695,7 +695,7 @@ def test_the_comparison_says_what_of_the_survey_it_leaves_out(
         fixed,
         result=replace(fixed.result, comparison=both),
     )
-    tell_result(fixed, Path("page"), seconds=1.0, verbose=False)
+    print_result(fixed, Path("page"), seconds=1.0, verbose=False)
     for shown in (" ".join(capsys.readouterr().out.split()), html_of(fixed)):
         assert told in shown
 
@@ -710,7 +710,7 @@ def test_the_terminal_says_once_why_photographs_are_lost(
         group = remark("not_connected", photographs=explained, oriented=8, needed=4)
         board = remark("checkerboard_not_found", photographs=explained, size="7 x 9")
         said = replace(result, failed=lost, remarks=(group, board) if explained else ())
-        tell_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
+        print_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
         told = [line.strip() for line in capsys.readouterr().out.splitlines()]
         ends = tuple(f"{one.text} {one.remedy}" for one in (few, apart))
         reasons = [line for line in told if line.startswith("lost") and line.endswith(ends)]
@@ -728,10 +728,10 @@ def test_numbers_of_one_quantity_are_written_alike(
 ) -> None:
     assert alike([9.15e-7, 1.56e-6]) == ("9.15e-07", "1.56e-06")
     assert alike([9.15e-3, 1.56e-2, np.nan]) == ("0.00915", "0.0156", "not known")
-    told = words_of_precision(9.15e-7, 1.56e-6, "network units")
+    told = describe_precision(9.15e-7, 1.56e-6, "network units")
     assert told.count("× 10⁻⁶ network units") == 4 and "0.915" in told and "1.56" in told
     monkeypatch.setenv("COLUMNS", "60")
-    tell_result(findings_of(result), Path("page"), seconds=1.0, verbose=True)
+    print_result(findings_of(result), Path("page"), seconds=1.0, verbose=True)
     for line in capsys.readouterr().out.splitlines():
         assert not re.match(r" +(?:%|px|mm|m|deg)(?:[ ,;]|$)", line), line
     page = html_of(findings_of(result))

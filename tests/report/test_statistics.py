@@ -48,11 +48,11 @@ from sfm.report.numbers import signed
 from sfm.report.output import plot_data
 from sfm.report.pages import html_of
 from sfm.report.phrases import (
-    words_of_check,
-    words_of_fixed,
-    words_of_sigma0,
-    words_of_test,
-    words_of_weights,
+    describe_check,
+    describe_fixed,
+    describe_sigma0,
+    describe_test,
+    describe_weights,
 )
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
@@ -211,7 +211,7 @@ def test_fixed_coordinates_do_not_make_the_points_look_more_precise(fixed: int) 
         1: "without the fixed coordinates of 1 point",
         4: "without the fixed coordinates of 4 points",
     }
-    assert words_of_fixed(precision_of(a)) == words[fixed]
+    assert describe_fixed(precision_of(a)) == words[fixed]
     assert ("without the fixed" in text_report(findings_of(result))) == (fixed > 0)
     assert ("without the fixed" in html_of(findings_of(result))) == (fixed > 0)
 
@@ -385,7 +385,7 @@ def test_control_that_contradicts_is_told_apart_from_the_image_points(
     own = sigma0_of(result).image_points_px
     assert a.sigma0_px > 1.05 * own
     assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
-    figure, words = words_of_sigma0(sigma0_of(result))
+    figure, words = describe_sigma0(sigma0_of(result))
     assert figure == f"{a.sigma0_px:.4f} px"
     assert f"image points by themselves {own:.4f} px" in words
     page = " ".join(html_of(findings_of(result)).split())
@@ -396,7 +396,7 @@ def test_control_that_contradicts_is_told_apart_from_the_image_points(
         NOISE_PX
     )
     free = result_of(adjust(network, truth, datum=Datum("free")))
-    assert "by themselves" not in " ".join(words_of_sigma0(sigma0_of(free)))
+    assert "by themselves" not in " ".join(describe_sigma0(sigma0_of(free)))
 
 
 def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(
@@ -416,12 +416,12 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
         text = " ".join(text_report(findings_of(result)).split())
         page, written = html_of(findings_of(result)), summary(findings_of(result))["statistics"]
         for test, one in zip((image, bars), written["global_tests"], strict=True):
-            words = words_of_test(test)
+            words = describe_test(test)
             assert words in text and escape(words) in page and words == one["words"]
             assert one["passed"] is test.passed
             assert ("better than stated" in words) == (test is image and factor < 1)
             assert ("worse than stated" in words) == (test is image and factor > 1)
-        words = words_of_weights(result)
+        words = describe_weights(result)
         assert (words == "") == (factor == 1)
         assert words in text and words in page and words == written["weights"]
         assert written["sigma0_by_kind"]["image points"] == pytest.approx(written["sigma0_ratio"], rel=1e-6)
@@ -440,11 +440,11 @@ def test_the_global_test_of_an_m_estimator_is_left_out_with_the_reason(
         result = result_of(adjust(one, truth, datum=Datum("free"), reject=reject))
         first, *other = statistics_of(result).global_tests
         assert first.passed is None and all(test.passed for test in other)
-        assert words_of_test(first) == f"{of}: {reason}"
+        assert describe_test(first) == f"{of}: {reason}"
         written = summary(findings_of(result))["statistics"]["global_tests"][0]
-        assert written["passed"] is None and written["words"] == words_of_test(first)
-        assert words_of_test(first) in " ".join(text_report(findings_of(result)).split())
-        assert escape(words_of_test(first)) in html_of(findings_of(result))
+        assert written["passed"] is None and written["words"] == describe_test(first)
+        assert describe_test(first) in " ".join(text_report(findings_of(result)).split())
+        assert escape(describe_test(first)) in html_of(findings_of(result))
         assert len(other) == len(one.scale_bars) // 2
         assert findings_of(result).verdict.level == "good"
 
@@ -469,7 +469,7 @@ def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate])
     barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
     page = " ".join(html_of(findings_of(barred)).split())
     assert "the control says lengths are 1.0025 times those of the scale bars" in page
-    words = words_of_check(check, "m")
+    words = describe_check(check, "m")
     assert "largest 173 µm" in words and words in page and words in text_report(findings_of(barred))
     assert "A single bar gives the scale" in page
 
@@ -740,7 +740,7 @@ def test_the_text_report_has_the_figures_of_the_adjustment(synthetic: tuple[Netw
     values = (f"{a.sigma0_px:.5f}", f"{w_test(a).critical:.2f};", f"{tau_test(a).critical:.2f};")
     assert {*map(str, counts), *values} <= set(words)
     for test in component_tests(by_kind(a)):
-        assert " ".join(words_of_test(test).split()) in " ".join(words)
+        assert " ".join(describe_test(test).split()) in " ".join(words)
     assert f"{np.nansum(a.redundancy_numbers):.1f}" in words
     assert text == text_report(findings_of(result_of(a)))
 

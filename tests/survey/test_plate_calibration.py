@@ -12,7 +12,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
-from sfm.cli.console import tell_result
+from sfm.cli.console import print_result
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
@@ -20,7 +20,7 @@ from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.numbers import significant
 from sfm.report.pages import html_of
-from sfm.report.phrases import words_of_calibration
+from sfm.report.phrases import describe_calibration
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
@@ -67,12 +67,12 @@ def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.Capt
     assert result.failed == () and result.adjustment.converged and result.adjustment.datum == "control"
     findings = findings_of(result)
     assert findings.verdict.level == "good"
-    tell_result(findings, tmp_path / "report.html", seconds=0, verbose=False)
+    print_result(findings, tmp_path / "report.html", seconds=0, verbose=False)
     told = capsys.readouterr().out
     (camera,) = findings.calibrated
     assert [one.name for one in camera.parameters] == ["c", "x0", "y0"]
     assert camera.projection_rms_px < camera.projection_largest_px < 1
-    for words in words_of_calibration(camera)[:3]:
+    for words in describe_calibration(camera)[:3]:
         assert all(part in told for part in words.split()[:2])
     assert significant(camera.projection_largest_px) in told and "point precision" not in told
     text, page = text_report(findings), html_of(findings)

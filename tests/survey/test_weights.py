@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.pipeline import run_survey
 from sfm.report.findings.checks import Sigma0
 from sfm.report.findings.findings import findings_of
-from sfm.report.phrases import words_of_sigma0, words_of_weights
+from sfm.report.phrases import describe_sigma0, describe_weights
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
@@ -31,7 +31,7 @@ def test_stated_weights_have_one_sigma0_for_all(weights: str) -> None:
     adjust = {"sigma_px": 0.3, "reject": "none", "weights": weights}
     survey = survey_of(network, truth, control=control, datum={"kind": "control"}, adjust=adjust)
     result = run_survey(survey)
-    a, said = result.adjustment, words_of_weights(result)
+    a, said = result.adjustment, describe_weights(result)
     assert a.sigma0_px == pytest.approx(0.1, rel=0.15)
     if weights == "stated":
         assert (a.image_sigma_factor == 1).all() and "those stated for all observations" in said
@@ -57,5 +57,5 @@ def test_a_few_weak_points_do_not_change_sigma0_in_px() -> None:
     a = adjust(weak, truth, datum=Datum("free"), reject="none")
     assert a.stated_px == pytest.approx(0.1)
     assert a.sigma0_px == pytest.approx(plain.sigma0_px, rel=0.02)
-    figure, words = words_of_sigma0(Sigma0(0.12, 1.195, 0.1))
+    figure, words = describe_sigma0(Sigma0(0.12, 1.195, 0.1))
     assert figure == "0.1200 px" and words == "1.200 times the 0.100 px expected"  # both of all observations

@@ -67,11 +67,11 @@ def epochs(
     Congruency test, the points that are stable, displacements with their tests, and motion of groups.
     """
     with loading():
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.epochs.findings import verdict_of_epochs
         from sfm.epochs.series import analyse_epochs
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.epochs import words_of_block, words_of_stable
+        from sfm.report.epochs import describe_block, describe_stable
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -98,12 +98,12 @@ def epochs(
             together=together,
         )
     page = write_page(found, out)
-    tell_verdict(verdict_of_epochs(found))
+    print_verdict(verdict_of_epochs(found))
     for pair in found.pairs:
         print(" to ".join(pair.displacements.differences.names))
-        print(f"  {words_of_stable(pair.displacements)}")
+        print(f"  {describe_stable(pair.displacements)}")
         for block in pair.blocks:
-            print(f"  {words_of_block(block)}")
+            print(f"  {describe_block(block)}")
     print(f"Report: {page}")
 
 

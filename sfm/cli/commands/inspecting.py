@@ -47,11 +47,11 @@ def measure(
     with loading():
         from adapters.formats.mesh import read_mesh
         from adapters.formats.registry import read_comparable
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.features_file import read_features_file
         from sfm.inspection.measure import measure_result
-        from sfm.report.measurement import parameter_rows, quantity_table, words_of_measured
+        from sfm.report.measurement import describe_measured, parameter_rows, quantity_table
         from sfm.report.numbers import with_sigma
         from sfm.report.pages import write_page
 
@@ -61,8 +61,8 @@ def measure(
         result = read_comparable(source, from_format)
         found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
     page = write_page(found, out, also=partial(_write_drawings, found), result=result)
-    tell_verdict(found.verdict)
-    print(words_of_measured(found))
+    print_verdict(found.verdict)
+    print(describe_measured(found))
     for fit in found.shapes:
         said = [
             f"{name} {' +- '.join(with_sigma(value, sigma))} {unit}"
@@ -112,7 +112,7 @@ def accept(
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.acceptance import accept_result, read_lengths
         from sfm.report.pages import write_page
@@ -133,7 +133,7 @@ def accept(
         diagonal=diagonal,
     )
     page = write_page(found, out)
-    tell_verdict(found.verdict)
+    print_verdict(found.verdict)
     print(f"largest error of a length: {found.largest:.4g} {found.unit}")
     print(f"Report: {page}")
     if found.verdict.level == "bad":

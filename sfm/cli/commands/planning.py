@@ -229,7 +229,7 @@ def network_command(
     unit of --unit.
     """
     with loading():
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.conventions import METRES
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.design.candidates import Allowed
@@ -302,7 +302,7 @@ def network_command(
             )
             found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
     page = write_page(found, out)
-    tell_verdict(verdict_of_plan(found))
+    print_verdict(verdict_of_plan(found))
     for what, value in figures(found):
         print(f"  {what}: {value}")
     for weak in found.weak[:MAX_WEAK]:

@@ -80,7 +80,7 @@ def more_command(
 
         from adapters.formats.given_table import read_given
         from adapters.formats.result_tables import read_result
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.errors import GeometryError
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.further import further_photographs
@@ -107,6 +107,6 @@ def more_command(
         )
     page = page_of(found, result=stored)
     path = write_declared(page, out)
-    tell_verdict(page.verdict)
+    print_verdict(page.verdict)
     print(page.text)
     print(f"Report: {path}")

@@ -71,7 +71,7 @@ def refine(
         )
         from sfm.files.whole_files import refuse_unwritable, whole_folder
         from sfm.report.pages import page_of, texts_of
-        from sfm.report.refinement import Numbers, words_of_key_points
+        from sfm.report.refinement import Numbers, describe_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import read_survey
         from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
@@ -115,7 +115,7 @@ def refine(
         write_scene(folder, opened.scene)
         for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
-    print(words_of_key_points(found, numbers))
+    print(describe_key_points(found, numbers))
     print(f"Model: {out}")
     print(f"Report: {out / 'refinement.html'}")
     if not found.dependable:

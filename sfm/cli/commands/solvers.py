@@ -31,7 +31,7 @@ def validate(
     with loading():
         from adapters.colmap.adjuster import load_pycolmap
         from adapters.colmap.validation_backend import ColmapBackend
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.pages import page_of, write_declared
@@ -43,7 +43,7 @@ def validate(
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = page_of(found)
     path = write_declared(page, out)
-    tell_verdict(page.verdict)
+    print_verdict(page.verdict)
     print(page.text)
     print(f"Report: {path}")
     if not found.passed:
@@ -73,11 +73,11 @@ def compare(
     """
     with loading():
         from adapters.formats.registry import read_comparable
-        from sfm.cli.console import tell_verdict
+        from sfm.cli.console import print_verdict
         from sfm.comparison.findings import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.differences import largest_difference, words_of_pairing, words_of_scale
+        from sfm.report.differences import describe_pairing, describe_scale, largest_difference
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -93,10 +93,10 @@ def compare(
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_page(found, out, xyz=xyz)
     print(
-        f"{words_of_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
-        f"{words_of_scale(found)}"
+        f"{describe_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
+        f"{describe_scale(found)}"
     )
-    tell_verdict(verdict_of_comparison(found))
+    print_verdict(verdict_of_comparison(found))
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")

@@ -36,7 +36,7 @@ def loading() -> Iterator[None]:
         signal.signal(signal.SIGINT, _end)
     try:
         yield
-        _tell_of_compiling()
+        _announce_compiling()
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -77,7 +77,7 @@ def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) 
     os._exit(INTERRUPTED)
 
 
-def _tell_of_compiling() -> None:
+def _announce_compiling() -> None:
     """Say on stderr when kernels are compiled, for as long as the command runs; numba is loaded."""
     if "numba" in sys.modules and not _told:
         from sfm.kernels.compiling import COMPILING, when_compiling

@@ -198,7 +198,7 @@ def _run_survey(
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
-        from sfm.cli.console import tell_result
+        from sfm.cli.console import print_result
         from sfm.files.globs import nearest_name
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
@@ -278,7 +278,7 @@ def _run_survey(
             progress=log,
             plot_process=plots,
         )
-    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not print_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
     return folder
 

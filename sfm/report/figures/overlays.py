@@ -146,8 +146,8 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
     _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
     if not crowded:
-        for name, xy, own in zip(names, seen, colour, strict=True):
-            _label(picture, name, xy, scale, own)
+        for name, xy, one in zip(names, seen, colour, strict=True):
+            _label(picture, name, xy, scale, one)
     return picture
 
 
@@ -212,9 +212,9 @@ def _drawn(xy: FloatArray, scale: float) -> AnyArray:
 def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]], scale: float) -> None:
     """Draw lines of no length, as thick as the dots: all of one colour at once."""
     at = np.repeat(_drawn(xy, scale)[:, None], 2, axis=1)
-    for own in dict.fromkeys(colour):
-        dots = at[[one == own for one in colour]]
-        cv2.polylines(picture, list(dots), False, own, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
+    for one_colour in dict.fromkeys(colour):
+        dots = at[[one == one_colour for one in colour]]
+        cv2.polylines(picture, list(dots), False, one_colour, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
 
 
 def _outlines(
@@ -224,11 +224,11 @@ def _outlines(
     remarks = _remarks(photograph)
     for k, at in enumerate(_drawn(photograph.xy, scale).tolist()):
         colours = [colour[k], *(second for remark, second in REMARK_COLOURS if remarks[k] & remark.value)]
-        for n, own in enumerate(colours, start=1):
+        for n, one_colour in enumerate(colours, start=1):
             semi = photograph.semi_axes[k] * scale + 2 * n
             axes = np.round(semi * (1 << SHIFT)).astype(int).tolist()
             degrees = float(np.degrees(photograph.angle[k]))
-            cv2.ellipse(picture, at, axes, degrees, 0, 360, own, 1, cv2.LINE_AA, SHIFT)
+            cv2.ellipse(picture, at, axes, degrees, 0, 360, one_colour, 1, cv2.LINE_AA, SHIFT)
 
 
 def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) -> None:

@@ -140,11 +140,12 @@ def network_figure(shown: PlotData) -> Figure:
         across, up = plane
         panel.plot(points[:, across], points[:, up], ".", color=GREY, markersize=4)
         for k, camera in enumerate(shown.cameras):
-            own = np.flatnonzero(shown.camera == k)
+            of_camera = np.flatnonzero(shown.camera == k)
             colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
-            edges = _pyramids(shown, own, camera, size) @ axes_from_object.T
+            edges = _pyramids(shown, of_camera, camera, size) @ axes_from_object.T
             panel.add_collection(LineCollection(list(edges[:, :, plane]), colors=colour, linewidths=0.8))
-            panel.plot(*position[own][:, plane].T, "o", color=colour, markersize=4, label=_plain(camera.name))
+            label = _plain(camera.name)
+            panel.plot(*position[of_camera][:, plane].T, "o", color=colour, markersize=4, label=label)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.1)  # for the names of the photographs
         panel.autoscale_view()
@@ -257,8 +258,8 @@ def residual_figure(shown: PlotData) -> Figure:
     panels = figure.subplots(rows, 2, squeeze=False)
     owner = shown.camera[shown.image]
     for k, camera in enumerate(shown.cameras):
-        own = owner == k
-        xy, v = shown.xy[own], shown.residuals[own]
+        of_owner = owner == k
+        xy, v = shown.xy[of_owner], shown.residuals[of_owner]
         width, height = camera.size_px
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))

@@ -24,7 +24,7 @@ from sfm.report.findings.given_residuals import Given
 from sfm.report.findings.precision import point_sigma
 from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of
-from sfm.report.phrases import words_of_test, words_of_weights
+from sfm.report.phrases import describe_test, describe_weights
 from sfm.result import SurveyResult
 
 
@@ -152,13 +152,13 @@ def _statistics(findings: Findings) -> dict[str, Any]:
         "sigma0_ratio": or_none(sigma0.ratio),
         **values_of(sigma0, "image_points_px stated_px"),
         "weight_factor": result.adjustment.weight_factor,
-        "weights": words_of_weights(result),
+        "weights": describe_weights(result),
         "global_tests": [
             {
                 "of": test.of,
                 "vPv": or_none(test.statistic),
                 **values_of(test, "redundancy lower upper passed"),
-                "words": words_of_test(test, result.adjustment),
+                "words": describe_test(test, result.adjustment),
             }
             for test in found.global_tests
         ],

@@ -115,14 +115,14 @@ def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     n = len(xyz)
     Q = covariance.reshape(n, 3, n, 3)
-    own = Q[np.arange(n), :, np.arange(n), :]
+    of_points = Q[np.arange(n), :, np.arange(n), :]
     rows = []
     for i in range(n - 1):
         u = xyz[i + 1 :] - xyz[i]
         length = np.linalg.norm(u, axis=1, keepdims=True)
         u = np.divide(u, length, out=np.full_like(u, np.nan), where=length > 0)
         cross = Q[i].transpose(1, 0, 2)[i + 1 :]
-        of_difference = own[i] + own[i + 1 :] - cross - cross.transpose(0, 2, 1)
+        of_difference = of_points[i] + of_points[i + 1 :] - cross - cross.transpose(0, 2, 1)
         variance = np.einsum("ja,jab,jb->j", u, of_difference, u)
         rows.append(np.sqrt(np.maximum(variance, 0.0)))
     return np.concatenate(rows) if rows else np.zeros(0)
