@@ -40,7 +40,7 @@ class Circles:
 
 @dataclass(frozen=True)
 class CircleViews:
-    """What the photographs show of circular targets; one row for each image point."""
+    """Circular targets as the photographs show them; one row for each image point."""
 
     point: IntArray  # index of the target, (k,)
     shape: FloatArray  # measured ellipses, S of (x - m)' S^-1 (x - m) = 1, px^2, (k, 2, 2)

@@ -31,8 +31,8 @@ def intersect_image_points(
 ) -> Intersection:
     """Return the object points that most rays of oriented photographs support; see `intersect`.
 
-    Rays of wide-angle cameras are compared by their angles: each is taken as the axis of a photograph of its
-    own. Their tangents would weigh a pixel at 70 degrees off the axis as much as eight in the middle.
+    Rays of wide-angle cameras are compared by their angles: each is taken as the axis of a separate
+    photograph. Their tangents would weigh a pixel at 70 degrees off the axis as much as eight in the middle.
 
     Args:
         seen: image points.

@@ -27,7 +27,7 @@ from sfm.orientation.homography import (
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.candidates import rotation_from_position
 
-SPATIAL_POINTS = 6  # five points give up to ten solutions, the sixth tells them apart
+SPATIAL_POINTS = 6  # five points give up to ten solutions, the sixth decides between them
 PLANAR_SHARE = 0.8  # share of the pairs that must lie on one homography for a planar solution
 INFINITE_SHARE = 0.1  # of the tolerance: residuals of a mere rotation below which a base means nothing
 BASE_EXPLAINS = 5.0  # ratio of sigma0 without and with a base; distortion, which both lack, does not reach it
@@ -86,7 +86,7 @@ def relative_orientations(
         max_trials: most samples of five points that are tried.
 
     Returns:
-        The kind of the first tells what the scene is. Infinite: a rotation explains the rays. Planar: both
+        The kind of the first describes the scene. Infinite: a rotation explains the rays. Planar: both
         solutions of the homography (they fit equally well; more photographs decide), then the
         spatial one if there is one. Spatial: one orientation, adjusted by coplanarity, then the planar ones
         if the points are near enough to a plane for them to be possible within the tolerance.
@@ -95,7 +95,7 @@ def relative_orientations(
         GeometryError: fewer than four pairs, or none that fit one geometry.
 
     Source: Nister (2004), IEEE PAMI 26(6), five-point start (cv2.findEssentialMat); Ma, Soatto, Kosecka,
-    Sastry (2004), An Invitation to 3-D Vision, alg. 5.2 for the plane; the kinds are told apart by
+    Sastry (2004), An Invitation to 3-D Vision, alg. 5.2 for the plane; the kinds are distinguished by
     F tests of the residual variances.
     """
     uv1 = np.ascontiguousarray(first, dtype=float).reshape(-1, 2)
@@ -185,7 +185,7 @@ def _is_planar(H: FloatArray, uv1: FloatArray, uv2: FloatArray, spatial: Relativ
     off = transfer_residuals(H, uv1, uv2)[used]
     if not np.isfinite(off).all():
         return False
-    # a transfer residual holds the errors of both photographs
+    # a transfer residual contains the errors of both photographs
     variance = float(np.sum(off**2)) / (2 * n - 8) / 2
     ratio = variance / max(spatial.sigma0**2, np.finfo(float).tiny)
     return bool(ratio <= fdtri(2 * n - 8, spatial.redundancy, CONFIDENCE))
@@ -228,7 +228,7 @@ def _nearest_to_coplanar(
     """Return the orientation with the smallest residuals, of that found first and those of a plane adjusted.
 
     Both orientations of a plane fit the rays of a shallow relief within a wide tolerance, and random samples
-    take whichever comes first: the adjustment from it ends in a minimum of its own, with larger residuals.
+    take whichever comes first: the adjustment from it ends in another minimum, with larger residuals.
     """
     found = [spatial]
     found += [_adjusted(one.base, one.rotation, uv1, uv2, one.inliers, tolerance) for one in planar]

@@ -33,7 +33,7 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
     """Complete given values and adjust them; None where they do not fit the image points.
 
     Args:
-        growth: begun with given values; holds the adjusted network afterwards.
+        growth: begun with given values; contains the adjusted network afterwards.
         refine: the caller's adjustment.
         final_tolerance_px: below this no image point is put aside, px.
     """

@@ -26,7 +26,7 @@ MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
 MIN_SHARE = 0.5  # of the rays of a point must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
-WEAK_PER_ROUND = 20  # of so many unsupported photographs one is let go before the others are judged anew
+WEAK_PER_ROUND = 20  # of so many unsupported photographs one is removed before the others are judged anew
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 
 Refine = Callable[[Network, Estimate], Estimate]
@@ -334,7 +334,7 @@ class Growth:
 
 
 def has_given_values(network: Network, estimate: Estimate) -> bool:
-    """Return whether an estimate holds more than cameras and the coordinates of control."""
+    """Return whether an estimate has more than cameras and the coordinates of control."""
     control = network.control.complete
     other = estimate.determined
     other[control.point] &= (estimate.points[control.point] != control.xyz).any(axis=1)
@@ -359,8 +359,8 @@ def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
 def _staged(camera: Camera, network: Network, index: int) -> Camera:
     """Free as many interior parameters as the photographs can determine: none, the first few, or all.
 
-    What the image points of the camera leave after the exterior orientations must exceed its free parameters
-    several times, and so must the redundancy of the network.
+    The redundancy of the camera's image points after the exterior orientations must exceed its free
+    parameters several times, and so must the redundancy of the network.
     """
     of_camera = network.camera == index
     n, m = len(network.points), len(network.images)

@@ -17,7 +17,7 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     """Intersect the points that are still missing; return (name, reason) of those that have no place.
 
     Nothing is oriented on them any more, so that a small angle does no harm: their standard deviations
-    tell it. Rays that are parallel within their own precision, or within the tolerance of the orientation,
+    show it. Rays that are parallel within their precision, or within the tolerance of the orientation,
     have no point of intersection.
 
     Args:

@@ -1,9 +1,9 @@
 """Solutions that a network could have in place of the first one found, and which of them fits best.
 
 A flat object photographed at moderate angles is almost the same as itself turned inside out in depth; a start
-tolerance of some tens of pixels hardly tells the two apart, for all photographs or for a part of them, and
-an adjustment ends in the minimum that it starts nearest to. Whether a first solution is in doubt, its own
-reversal in depth tells: where the rays are strong the reversal fits a hundred times worse or not at all. A
+tolerance of some tens of pixels hardly separates the two, for all photographs or for a part of them, and
+an adjustment ends in the minimum that it starts nearest to. The reversal in depth of a first solution shows
+whether it is in doubt: where the rays are strong the reversal fits a hundred times worse or not at all. A
 solution in doubt is followed from smaller start tolerances too, and the one with the smallest residuals is
 kept.
 

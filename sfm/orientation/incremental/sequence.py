@@ -193,8 +193,8 @@ def _best_of_rivals(
 ) -> tuple[Growth, Start]:
     """Return the solution with the smallest residuals, of that found first and, if in doubt, of its rivals.
 
-    In doubt is what its own reversal in depth hardly fits worse than, what leaves residuals beyond the final
-    tolerance, and what a photograph had to leave.
+    A solution is in doubt if its reversal in depth fits hardly worse, if it leaves residuals beyond the final
+    tolerance, or if a photograph had to leave it.
 
     Args:
         growth: with the first solution.
@@ -210,8 +210,8 @@ def _best_of_rivals(
         return growth, start
     image = growth.network.image_points.image
     found, first = [(growth, start)], growth.residuals_px()
-    nobody = np.zeros(len(oriented), dtype=bool)
-    other_side = reversed_growth(growth, begin(values, 1.0), refine, nobody)
+    none_dropped = np.zeros(len(oriented), dtype=bool)
+    other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
     loose = bool((growth.tolerance_px > final_tolerance_px).any() or growth.dropped.any())
     if not loose and not casts_doubt(first, other_side.residuals_px()):
         return growth, start
@@ -232,7 +232,7 @@ def _best_of_rivals(
 
 
 def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judge: Judge | None) -> Start:
-    """Start, resect and intersect until nothing more comes, and let go what does not belong."""
+    """Start, resect and intersect until nothing more comes, and remove what does not belong."""
     start = growth.begin(judge)
     adjusted = 0
     for _ in range(MAX_ROUNDS):
@@ -252,10 +252,10 @@ def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judg
 
 
 def _settle(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> bool:
-    """Settle a network, and what is left of it after the others let go what they do not hold up.
+    """Settle a network, and the rest of it once photographs that the others do not support are removed.
 
     Returns:
-        Whether a photograph was let go, now or before.
+        Whether a photograph was removed, now or before.
     """
     _settle_oriented(growth, refine, final_tolerance_px)
     dropped = growth.drop_unsupported() > 0

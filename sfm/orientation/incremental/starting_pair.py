@@ -76,13 +76,13 @@ def best_start(
         tangents: of all image points, shape (k, 2).
         tolerance: largest residual in each photograph, tangents, shape (m,).
         seed: of the random samples.
-        judge: misfit of a start with what else is known, where no third photograph tells the two of a plane
-            apart; what is clearly smaller (TWOFOLD) is taken.
+        judge: misfit of a start with what else is known, where no third photograph decides between the two of
+            a plane; the clearly smaller one (TWOFOLD) is taken.
 
     Raises:
-        GeometryError: no two photographs have four points in common, or none of their geometries holds.
+        GeometryError: no two photographs have four points in common, or no geometry fits them.
 
-    Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be told apart in a pair; in
+    Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be distinguished in a pair; in
     a third photograph the false plane does not fit. All solutions of all promising pairs are tried and
     compared by the truncated squares over the photographs that share most points with them.
     """
@@ -94,10 +94,10 @@ def best_start(
             f"common: {_list_common(network, of_photograph)}"
         )
     found: list[_Candidate] = []  # of the pair with the best of them
-    holds = False  # whether most points of any pair fit an orientation
+    fits = False  # whether most points of any pair fit an orientation
     widest, least_angle = 0.0, MIN_MEDIAN_ANGLE_DEG if len(network.images) > 2 else MIN_ANGLE_OF_TWO_DEG
     for tried, (i, j) in enumerate(pairs):
-        if tried == BARREN_PAIRS and not holds:
+        if tried == BARREN_PAIRS and not fits:
             break
         report_step("starting pairs tried", tried, len(pairs))
         points, first, second = _common(network, tangents, of_photograph[i], of_photograph[j])
@@ -110,7 +110,7 @@ def best_start(
             continue
         of_pair = []
         for solution in solutions:
-            holds = holds or bool(solution.inliers.mean() > 0.5)
+            fits = fits or bool(solution.inliers.mean() > 0.5)
             if solution.kind == "infinite":
                 continue
             start, angle = _model(network, (i, j), points, first, second, solution)
@@ -167,7 +167,7 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
 
 
 def _choose(found: list[_Candidate], judge: Judge | None) -> Start:
-    """Return the start with the best score, or of two that no other photograph tells apart the judge's."""
+    """Return the start with the best score; of two that no other photograph distinguishes, the judge's."""
     best = _best_of(found)
     if best.resected:
         return best.start
@@ -300,7 +300,7 @@ def _support(
     An image point counts 1 - squared residual in tolerances.
 
     The photographs that share most points with the model are resected on it, then the points are
-    intersected again from all of them, which tells a true plane from a bent one.
+    intersected again from all of them, which separates a true plane from a bent one.
     """
     seen = network.image_points
     determined = np.asarray(np.isfinite(start.points).all(axis=1))

@@ -16,7 +16,7 @@ RELATIVE_UNKNOWNS = 5  # of a relative orientation
 
 @dataclass(frozen=True)
 class Support:
-    """What speaks for and against the orientation of every photograph."""
+    """Evidence for and against the orientation of every photograph."""
 
     fitting: IntArray  # image points within the tolerance, (m,)
     known: IntArray  # image points of determined points, (m,)
@@ -29,8 +29,8 @@ class Support:
     def doubtful(self) -> BoolArray:
         """Photographs of whose image points fewer than half are where the network says, (m,).
 
-        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be told from its contrary if
-        more than half of what it rests on contradicts it.
+        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be distinguished from its contrary
+        if more than half of what it rests on contradicts it.
         """
         return np.asarray(self.confirmed < self.against)
 
@@ -45,7 +45,7 @@ def photograph_support(
     these the relative orientation takes up (Luhmann et al. 2020, sec. 4.3.3); the surplus confirms. An image
     point in the midst of the network that has no place in it contradicts: a
     mirrored photograph fits, seen from behind, the few coplanar codes that a mirror leaves as they are, and
-    all its other codes nobody else has seen. Outside the network nothing is expected of the others.
+    no other photograph shows the rest of its codes. Outside the network nothing is expected of the others.
 
     Args:
         network: k image points of m photographs and n points.

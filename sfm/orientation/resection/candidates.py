@@ -1,4 +1,4 @@
-"""One exterior orientation found by a resection, with what tells good ones from bad ones."""
+"""One exterior orientation found by a resection, with the figures that separate good ones from bad ones."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ NEWTON_STEPS = 20
 NEWTON_CONVERGED = 1e-10  # relative step; the error after it is its square
 FITS = 1e-9  # misfit of the squared sides, relative to the largest, below which legs are a solution
 SAME = 1e-9  # relative difference of legs below which two solutions are one
-NEAR = 1e-6  # relative misfit above which the second root for the third leg is no solution of its own
+NEAR = 1e-6  # relative misfit above which the second root for the third leg is no separate solution
 
 
 @dataclass(frozen=True)
