@@ -353,7 +353,7 @@ def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
 
 
 def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, int]]) -> Alignment:
-    """Return the alignment that holds one coordinate each of six places or directions.
+    """Return the alignment that keeps one coordinate each of six places or directions.
 
     Args:
         method: its name.
@@ -369,7 +369,7 @@ def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, in
             motions = motions * np.array([0.0, 0, 0, 1, 1, 1, 0])
         moves[k] = motions[axis]
         by_places[k, 3 * k : 3 * k + 3] = T.rotation[axis]
-    # a coordinate that is held does not change: moves dT + own dx = 0
+    # a coordinate that is held does not change: moves dT + by_places dx = 0
     linear = np.zeros((7, held.jacobian.shape[1]))
     linear[:6] = -np.linalg.solve(moves[:, :6], by_places @ held.jacobian)
     return Alignment(method, T, held.points, linear, np.zeros((7, 7)), False)

@@ -54,7 +54,7 @@ class MeasuredPoints:
     xyz: FloatArray  # object unit, (n, 3)
     covariance: FloatArray | None  # of all together (3 n, 3 n), or of each by itself (n, 3, 3), object unit^2
     unit: str = ""  # of lengths, as people call it
-    datum: str = ""  # free | minimal | control | aligned; empty where nobody knows
+    datum: str = ""  # free | minimal | control | aligned; empty where it is not known
     has_scale: bool = True  # whether lengths are in a known unit
     redundancy: int | None = None  # of the variances; None where they count as known
     sample: IntArray | None = None  # points that are known together where `covariance` is of each alone, (s,)
@@ -105,7 +105,7 @@ class MeasuredPoints:
         """Return the covariance of some points together, object unit^2, (3 m, 3 m).
 
         Raises:
-            GeometryError: nobody knows it.
+            GeometryError: it is not known.
         """
         if self.covariance is None:
             raise GeometryError("covariance: that of the points is not known")
@@ -126,7 +126,7 @@ class MeasuredPoints:
         return Q
 
     def covariance_between(self, functions: Sequence[Function]) -> FloatArray:
-        """Return the covariance of the values of some functions together; NaN where nobody knows it.
+        """Return the covariance of the values of some functions together; NaN where it is not known.
 
         Args:
             functions: of the coordinates, q values in all.

@@ -4,7 +4,7 @@ Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surf
 Wrobel (2016), Photogrammetric Computer Vision, secs. 4.8 and 10.6; Luhmann et al. (2020), Close-Range
 Photogrammetry and 3D Imaging, sec. 2.3.
 
-The parameters of shapes as people want them, and their derivatives by a shape's own motions and form.
+The parameters of shapes as people want them, and their derivatives by the motions and form of a shape.
 """
 
 from __future__ import annotations
@@ -418,8 +418,8 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         shape: in object units.
 
     Returns:
-        What they are, their values (p,), and their derivatives by shifts and rotations in the shape's own
-        axes and by its form, (p, 6 + q).
+        Their names, their values (p,), and their derivatives by shifts and rotations in the axes of the
+        shape and by its form, (p, 6 + q).
     """
     kind, R, form = shape.kind, shape.rotation, shape.form
     q = len(form)
@@ -449,7 +449,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         rows.append(("focus", "coordinate", shape.origin + form[0] * R[:, 2], by_focus))
     for k, name in enumerate(kind.form):
         if kind.name == "cone" and name == "radius":
-            continue  # that abreast of the centroid is nobody's dimension
+            continue  # that abreast of the centroid is of no use
         derivatives = np.zeros((1, 6 + q))
         derivatives[0, 6 + k] = 1.0
         rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives))

@@ -1,6 +1,6 @@
-"""The kinds of shapes: orthogonal distance of points in the shape's own axes, with its derivatives.
+"""The kinds of shapes: orthogonal distance of points in the axes of the shape, with its derivatives.
 
-Each shape stands in its own axes y = R' (x - c): its axis or normal is y3. A kind says which of the six
+Each shape has its axes y = R' (x - c): its axis or normal is y3. A kind lists which of the six
 motions of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form
 parameters it has, and one function: the signed distance d of points, its gradient g by the point, a unit
 vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and off

@@ -1,4 +1,4 @@
-"""A shape in space: its kind, its own axes and its form, and how distances change with each of them."""
+"""A shape in space: its kind, its axes and its form, and how distances change with each of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Shape:
 
     kind: Kind
     origin: FloatArray  # c, object unit, (3,)
-    rotation: FloatArray  # R, the shape's own axes as columns, (3, 3)
+    rotation: FloatArray  # R, the axes of the shape as columns, (3, 3)
     form: FloatArray  # values of kind.form, object unit, rad, (q,)
 
     @property
@@ -37,7 +37,7 @@ class Shape:
             xyz: points, object unit, (n, 3).
 
         Returns:
-            Distances, normals, and derivatives by shifts and rotations of the shape in its own axes and by
+            Distances, normals, and derivatives by shifts and rotations of the shape in its axes and by
             its form, (n, c, 6 + q).
         """
         y = (xyz - self.origin) @ self.rotation
@@ -48,7 +48,7 @@ class Shape:
         """Return the shape after a step, its origin abreast of a point where it may be anywhere.
 
         Args:
-            step: shifts and rotations in the shape's own axes, and of the form, (6 + q,).
+            step: shifts and rotations in the axes of the shape, and of the form, (6 + q,).
             centroid: of the points, (3,).
         """
         origin = self.origin + self.rotation @ step[:3]
