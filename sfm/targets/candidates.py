@@ -159,7 +159,7 @@ def find_parts_of_codes(
     """Return which candidates lie in the code ring of another target, hence are parts of its code.
 
     Codes are taken from the most confident to those that could not be read, and a part of one code does not
-    count afterwards: an arc that resembles a dot does not take the dot of its own ring away. About a dot
+    count afterwards: an arc that resembles a dot does not take the dot of the same ring away. About a dot
     whose code was not read only what is clearly smaller than the dot is a part.
     """
     inside = np.zeros(len(fit.xy), dtype=bool)
@@ -181,7 +181,7 @@ def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: Fl
     """Return which candidates are counters: the white inside of letters such as o, e and 8.
 
     It looks like a target on the stroke of the letter. The background of a counter is a closed stroke, behind
-    which the paper begins again, and next to a letter there are others. A target in a dark rim of its own is
+    which the paper begins again, and next to a letter there are others. A target with its own dark rim is
     not like that: its rim is thinner than half its radius, or the surroundings of the rim are free. Nor is a
     dot in the ring of a code, which always has clear cells.
 

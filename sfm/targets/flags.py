@@ -18,7 +18,7 @@ class Flag(IntFlag):
     # remarks: the target is measured and kept
     SATURATED = 1 << 0  # pixels at the end of the scale were censored
     CODE_UNREADABLE = 1 << 1  # something like a code surrounds the dot, but no valid code was read
-    SHADED = 1 << 2  # the gain changes by more than its own 3 sigma across the target
+    SHADED = 1 << 2  # the gain changes by more than 3 sigma of it across the target
     CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because something else is there
     CORNER = 1 << 4  # the corner of a square tag, no circle
     HALO = 1 << 5  # the background falls off from the edge: light scattered about a retro-reflective target

@@ -17,8 +17,8 @@ from sfm.targets.flags import Flag
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12
-# From so many targets on, the shading of a photograph is estimated from them; a target whose own gain is more
-# than so many sigma away from that keeps its own.
+# From so many targets on, the shading of a photograph is estimated from them; a target whose gain differs
+# from that by more than so many sigma keeps its own.
 MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 # A halo is above this share of the contrast (9 of 10 of the retro-panel are below) and so many of its
 # sigmas. Flare is a background of which more than this share is saturated, that has glare behind it on more
@@ -35,7 +35,7 @@ class EllipseFit:
     xy: FloatArray
     """centres, px, shape (k, 2)"""
     full_covariance: FloatArray
-    """covariance of centre, shape, background, contrast and blur in this order from the fit, its own
+    """covariance of centre, shape, background, contrast and blur in this order from the fit, its
     residuals and the outlines of the photograph, nan where it failed, shape (k, 8, 8)"""
     shape: FloatArray
     """(p, q, r) of S, which turns image vectors into radii, 1/px, shape (k, 3)"""
@@ -162,7 +162,7 @@ def _shrink_gain(
 
     A gradient of the gain inside a target and a shift of its centre look alike, so that estimating the gain
     costs up to a third of the precision of a bright target. The variance tau^2 of the gains over the targets
-    is estimated (minus that of their own errors, weighted), and "gain = 0 with variance tau^2" is added to
+    is estimated (minus that of their errors, weighted), and "gain = 0 with variance tau^2" is added to
     each target as an observation: without shading this is the fit without gain, with shading the fit with it.
 
     Source: DerSimonian and Laird (1986), moment estimate of the variance between units; empirical Bayes.

@@ -105,7 +105,7 @@ def find_outlines(
 
 
 def estimate_noise(photograph: AnyArray) -> float:
-    """Return the standard deviation of the noise of a photograph in its own units.
+    """Return the standard deviation of the noise of a photograph in its units.
 
     Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 annuls planes; the
     median over a part of the rows is used, so that edges do not count.

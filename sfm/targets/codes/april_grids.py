@@ -26,7 +26,7 @@ OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
 WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
 # Of the range of intensities in the window, below which it is dark: midway to the half where squares touch.
 DARK_FRACTION = 0.25
-MIN_MODULE_PX = 2.0  # of a tag that is read: no less tells one black module and one clear one apart (Nyquist)
+MIN_MODULE_PX = 2.0  # of a tag that is read: no less separates one black module from one clear one (Nyquist)
 SPACING = 0.2  # of the side of a tag, between crossings at first
 CELL_PX = 8  # side of a module where a tag is read
 MIN_TAGS = 2  # that show how tags are turned

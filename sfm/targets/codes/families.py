@@ -4,7 +4,7 @@ A family of rings with a table in a file needs that file only. One that follows 
 `ring_patterns` is a row in `rings.RINGS`, one of all necklaces in `rings.NECKLACES`, a dictionary of square
 tags a row in `tags.DICTIONARIES`, concentric rings a row in `concentric.WIDTHS`. Another kind of code is a
 module beside these with a type for its families, a row below, and its reading in `sfm.targets.detect`, behind
-that of rings (numbers for measured dots) or of tags (points of its own).
+that of rings (numbers for measured dots) or of tags (points that it defines).
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
     """
     grey = as_bytes(photograph, scale)
-    # OpenCV's own search for inverted tags loses upright ones, so that the photograph is inverted instead.
+    # OpenCV's search for inverted tags loses upright ones, so that the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
     found = [_detect_all(picture, family) for picture in pictures]
     quads = np.concatenate([corners for corners, _ in found])

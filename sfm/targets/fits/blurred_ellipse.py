@@ -19,7 +19,7 @@ from sfm.kernels.options import compiled_fast, inlined_fast
 # Unknowns of the fit in their order: x0, y0, p, q, r, B, A, s, gx, gy.
 UNKNOWNS = 10
 X0, Y0, P, Q, R, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
-# So many pixels are worked on together. A block holds the derivatives by one unknown after the other, and
+# So many pixels are worked on together. A block contains the derivatives by one unknown after the other, and
 # behind them the residuals and the weights.
 BLOCK = 256
 RESIDUAL, WEIGHT = UNKNOWNS * BLOCK, (UNKNOWNS + 1) * BLOCK

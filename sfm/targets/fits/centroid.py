@@ -45,7 +45,7 @@ def measure_centroids(
     With g the intensity above the background (below it for dark targets), the weights are 1 where g exceeds
     half of the step to the target (binary), or g - 3 sigma or its square where that is positive. A shaded
     background, a neighbour in the window or a start that is off by more than 2 px shifts a centroid; the fit
-    of an ellipse bears all of them.
+    of an ellipse tolerates all of them.
 
     Args:
         photograph: intensities, shape (H, W).

@@ -23,7 +23,7 @@ MAX_STEPS = 30
 LAST_STEP_PX = 5e-3
 # Background taken into the fit: so many px and this share of the mean semi-axis, at most.
 MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
-# Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest tells nothing.
+# Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest adds nothing.
 LARGE_PX, BAND_PX = 25.0, 15.0
 # Blur of the edge at the start and its limits.
 BLUR_START, MIN_BLUR = 0.9, 0.25
@@ -194,7 +194,7 @@ def _fit_one(
 def _skirt(blur: float) -> float:
     """Return how far before the rise to a neighbour the background is undisturbed, px.
 
-    As beside the own edge, few thousandths of the step are left there. Rays find a rise up to a step late.
+    As beside the edge itself, few thousandths of the step are left there. Rays find a rise up to a step late.
     """
     return (goodness.EDGE_ENDS_BLURS - RISE_BLURS) * blur + STEP_PX
 

@@ -104,8 +104,8 @@ def judge_outlines(
 def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[FloatArray, BoolArray]:
     """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,).
 
-    What is too large for the population is not drawn to it; which that is comes second. Few targets are drawn
-    half way to 1.
+    Ratios too large for the population are not drawn to it; a mask of them is returned second. Few targets
+    are drawn half way to 1.
 
     Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression" (2004);
     Phipson et al., "Robust hyperparameter estimation protects against hypervariable genes" (2016).

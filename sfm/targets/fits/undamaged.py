@@ -47,7 +47,7 @@ MIN_CURVATURE_BLURS = 2.0
 # curvature and each part of 1 that the short axis is shorter than the long one. It is exact for circles.
 # Rendered ellipses with a ratio of the axes of 0.26 to 0.4 and blurs of 0.77 to 3.6 px need 0.032 to 0.042.
 MISFIT = 0.045
-# Smaller targets have too few pixels to tell damage from another shape.
+# Smaller targets have too few pixels to separate damage from another shape.
 MIN_RADIUS_PX = 4.0
 # Sizes are apart where no targets lie within this of the logarithm: 15 % of the radius.
 SIZE_STEP = 0.14
@@ -260,8 +260,9 @@ def _deviations(
 def _has_marks(fits: EllipseFits, column: int, sound: BoolArray) -> BoolArray:
     """Return where residuals that lie together are significant and larger than in sound targets, shape (k,).
 
-    The level is divided by the number of squares of one blur in all targets. What the model lacks is no mark.
-    The usual spread is that of most targets: damage makes its own larger, compression here and there smaller.
+    The level is divided by the number of squares of one blur in all targets. Misfits of the model are no
+    marks. The usual spread is that of most targets: damage makes that of a target larger, compression here
+    and there smaller.
     """
     blur, contrast = np.maximum(fits.theta[:, BLUR], 1.0), np.maximum(np.abs(fits.theta[:, CONTRAST]), 1e-9)
     spread = fits.statistics[:, goodness.SPREAD]
