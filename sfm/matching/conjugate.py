@@ -30,7 +30,7 @@ from sfm.matching.turned_templates import match_turned
 MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
 BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
 MIN_TEMPLATE_PX = 7  # smaller ones look like anything once they are turned and scaled
-REACH_SIGMAS = 3.0  # of the place that key points tell
+REACH_SIGMAS = 3.0  # of the place that key points predict
 MIN_REACH_PX = 4  # of that search
 # Reasons for a larger template, which shows more: a second place is as good, or there is hardly texture.
 TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, LsmFlag.FLAT_TEXTURE))

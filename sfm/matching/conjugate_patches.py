@@ -1,7 +1,7 @@
 """Points of one photograph matched in another from a start: correlation to a pixel, then least squares.
 
 With `equalise` the histograms of both photographs are equalised in between, which is the order of document
-002; it helps the eye more than the matching, which has a gain and an offset of its own.
+002; it helps the eye more than the matching, which estimates gain and offset itself.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Affine maps from one photograph to another around points, from the key points near them.
 
 Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or
-something else. Key points, whose descriptors know neither scale nor rotation, tell the map beforehand.
+something else. Key points, whose descriptors know neither scale nor rotation, give the map beforehand.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MARGIN_PX = 300.0  # around the points, in which key points are looked for
 MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
 LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
 GROSS = 3.0  # times the robust spread, beyond which a key point is on another map
-MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set are on some map of their own spread
+MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set fit some map with their spread
 MAX_FEATURES = 10_000
 TRIPLES = np.array(list(combinations(range(AROUND), 3)))
 SINGULAR = 1e-3  # part of the squared extent of the key points that the triangle of a triple must have
@@ -108,7 +108,7 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
     agree = off[best] <= GROSS * spread
     if agree.sum() < MIN_AGREEING:
         return None
-    # near ones tell more about the place than far ones, as the surface is curved
+    # near ones predict the place better than far ones, as the surface is curved
     length = np.linalg.norm(offset[agree], axis=1)
     weight = 1.0 / (1.0 + (length / max(float(np.median(length)), 1.0)) ** 2)
     N = full[agree].T @ (weight[:, None] * full[agree])

@@ -46,8 +46,8 @@ def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
     """Return both photographs with the blur of the less sharp one.
 
     The sharper one is smoothed by a Gaussian. Both are then averaged over squares for which that blur is one
-    of SHARP_PX: a window holds as much texture as one of a sharp photograph, and its noise is that of pixels
-    that have none in common.
+    of SHARP_PX: a window contains as much texture as one of a sharp photograph, and its noise is that of
+    pixels that have none in common.
 
     Args:
         left: photograph, (H, W) or (H, W, 3), 8 or 16 bit or float, of an object.

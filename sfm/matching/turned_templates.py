@@ -14,7 +14,7 @@ from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.match_flags import NccFlag, in_words
 from sfm.matching.radiometry import grey_of, grey_of_8_bit
 
-# Correlation bears 5 degrees and 7 % of what a template is not turned and scaled by.
+# Correlation tolerates a rotation of 5 degrees and a scale of 7 % between template and photograph.
 ANGLES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
 SAME_PX = 5.0  # peaks of two shapes this near are one place
@@ -34,7 +34,7 @@ def match_turned(
     """Match points whose templates are turned by up to 30 degrees and scaled by up to 1.3 in the right.
 
     The two best places of all shapes are matched, and the better one is taken where it is better by more than
-    chance: a template in steps of 10 degrees is not alike enough to tell beforehand.
+    chance: a template in steps of 10 degrees is not alike enough to decide beforehand.
 
     Args:
         left: the left photograph.

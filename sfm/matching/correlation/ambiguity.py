@@ -15,7 +15,7 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
     """Return whether the second-best place may be as good as the best.
 
     The difference of their Fisher's z is compared with its standard error, that of independent coefficients
-    of so many pixels. Of 3 independent pixels or less nothing can be told, and any second place counts.
+    of so many pixels. Of 3 independent pixels or less nothing can be concluded, and any second place counts.
 
     Args:
         best: coefficients r of the best places, (k,).
@@ -30,7 +30,7 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
 
 
 def independent_pixels(grey: AnyArray, xy: FloatArray, template_px: int) -> FloatArray:
-    """Return how many independent pixels tell as much as a template, whose neighbours are alike, (k,).
+    """Return how many independent pixels are worth as much as a template, whose neighbours are alike, (k,).
 
     Args:
         grey: photograph, one channel, (H, W).

@@ -2,8 +2,8 @@
 
 The coefficient r is that of equation (2.6) of document 002; cv2.matchTemplate does the sums. The peak is
 refined by a parabola, which is good to a tenth of a pixel where the patches differ by a shift only. The sigma
-holds the misfit of the parabola: errors are 0.5 to 1.9 times as large on the textures tried, 2.6 times on a
-smooth one without noise at whole pixels, as nine values do not show the third powers.
+includes the misfit of the parabola: errors are 0.5 to 1.9 times as large on the textures tried, 2.6 times on
+a smooth one without noise at whole pixels, as nine values do not show the third powers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Windows that cover photographs: of how many pixels, and those that do not overlap.
 
-Windows that overlap measure the same pixels twice, and their errors have these in common: the precision of a
-result would be told too good, and no residual shows it.
+Windows that overlap measure the same pixels twice, and their errors have these in common: a result would
+be reported too precise, and no residual shows it.
 """
 
 from __future__ import annotations
@@ -103,9 +103,7 @@ def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points
     order = np.argsort(-count, kind="stable")
     rows = rows[np.argsort(seen.point[rows], kind="stable")]
     cells = np.floor(seen.xy[rows] / side_px).astype(np.int64)
-    cells -= (
-        cells.min(axis=0) - 1
-    )  # with a free one on each side, so that neighbours have numbers of their own
+    cells -= cells.min(axis=0) - 1  # with a free one on each side, so that neighbours have different numbers
     columns, lines = cells.max(axis=0) + 2
     cell = (seen.image[rows] * lines + cells[:, 1]) * columns + cells[:, 0]
     first = np.concatenate([[0], np.cumsum(count)])

@@ -120,7 +120,7 @@ def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> Flo
 def residual_as_sharp(work: Workspace, square: float) -> float:
     """Return the sum of squared residuals of a fit without blur.
 
-    A blur that makes the template less noisy fits better than the true one: its residuals tell too little.
+    A blur that makes the template less noisy fits better than the true one: its residuals are too small.
 
     Args:
         work: normal equations with blur in the last rows.
@@ -166,7 +166,7 @@ def white_noise(residual: AnyArray, side: int) -> float:
 @compiled
 def kernel_noise(H: FloatArray, half: int, kind: int, wx: AnyArray, wy: AnyArray) -> float:
     """Return the mean sum of squared weights over the window: what resampling leaves of a pixel's noise."""
-    stride = max(1, half // 2)  # 25 places tell the mean
+    stride = max(1, half // 2)  # 25 places give the mean
     total, count = 0.0, 0
     for b in range(-half, half + 1, stride):
         for a in range(-half, half + 1, stride):

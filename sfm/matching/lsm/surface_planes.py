@@ -31,7 +31,7 @@ def planes_at(
 
     Returns:
         Object points of the places, and unit normals of the surface there, towards the photograph, both
-        (k, 3); NaN where the neighbours tell no plane in front of the photograph.
+        (k, 3); NaN where the neighbours define no plane in front of the photograph.
     """
     lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
     points, normal = np.full((len(xy), 3), np.nan), np.full((len(xy), 3), np.nan)

@@ -121,9 +121,9 @@ def match_lsm(
         max_steps: after so many a patch counts as diverged.
         max_shift_px: farther from the start is too far.
         min_correlation: below it the places are not alike.
-        blur: whether three more unknowns tell how differently both are blurred. Of an oblique surface they
-            always are, since a pixel is longer on it: without them windows move by 0.01 px, in all matches
-            of a template alike.
+        blur: whether three more unknowns describe how differently both are blurred. Of an oblique surface
+            they always are, since a pixel is longer on it: without them windows move by 0.01 px, in all
+            matches of a template alike.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if none.
         threads: patches are shared among so many.

@@ -21,7 +21,7 @@ from sfm.matching.epipolar import epipolar_distance
 SEARCH = (2.5, 1.5, 1.0, 1.0)
 # Residuals below this part of the tolerance count alike, so that chance agreement is not mistaken for proof.
 FLOOR = 0.1
-# Radius, in standard deviations of a coordinate, that holds 95 % of a normal distribution in the plane.
+# Radius, in standard deviations of a coordinate, that contains 95 % of a normal distribution in the plane.
 RADIUS_95 = 2.45
 # Natural logarithm of the number of chance points below which a point is beyond doubt (1 in 10^9).
 CERTAIN = -20.0

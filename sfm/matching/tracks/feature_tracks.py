@@ -1,7 +1,7 @@
 """Tie points: points of natural texture found in several photographs and measured by least squares matching.
 
-SIFT features, whose descriptors know neither scale nor rotation, are matched pair by pair and kept where an
-epipolar geometry holds; what is connected over all photographs is one point. Each point is then put on the
+SIFT features, whose descriptors know neither scale nor rotation, are matched pair by pair and kept where they
+fit an epipolar geometry; features connected over all photographs are one point. Each point is then put on the
 most precise place nearby in the photograph that sees it best (its reference), and carried into the others by
 least squares matching, which starts from the features' scales and directions.
 """
@@ -244,7 +244,8 @@ def measure_tracks(
     """Measure the points of tracks by least squares matching from their references.
 
     The reference is the photograph in which the features are the most extended among the middle ones of the
-    point: a template should be neither the finest nor the coarsest picture. Matching tells the difference of
+    point: a template should be neither the finest nor the coarsest picture. Matching measures the difference
+    of
     two noises: half of its covariance goes to the point in the reference, half to the other.
 
     Args:

@@ -136,7 +136,7 @@ def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
 def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray, AnyArray]]:
     """Yield first and last line of strips of a photograph, and line, x and y of the gradients that they need.
 
-    Of a large photograph gradients, their products and sums would take twenty times its own memory.
+    Of a large photograph gradients, their products and sums would take twenty times its memory.
 
     Args:
         grey: the photograph, float32, (H, W).

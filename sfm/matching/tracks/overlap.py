@@ -2,7 +2,7 @@
 
 Matching every photograph with every other takes time with the square of their number. The coarsest features
 are the most likely to be found again from elsewhere; how many of a few hundred of them choose each other
-tells which photographs overlap, in a small part of the time of matching all.
+shows which photographs overlap, in a small part of the time of matching all.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def overlapping_pairs(
         score: features that photographs have in common, see `common_features`, (m, m).
         partners: how many others every photograph is matched with, at least; all, if there are no more.
         neighbours: photographs that were taken near each, the nearest first, negative for none: an array
-            (m, k) for each way to tell.
+            (m, k) for each way to know them.
     """
     m = len(score)
     if m <= partners + 1:
