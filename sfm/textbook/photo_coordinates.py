@@ -31,7 +31,7 @@ class RadialTable:
 
 @dataclass(frozen=True)
 class PhotoCorrections:
-    """What is corrected; what is left at its default is switched off."""
+    """The corrections to be made; those left at their defaults are switched off."""
 
     principal_point_mm: FloatArray = field(default_factory=lambda: np.zeros(2))  # x0, y0, (2,)
     radial_table: RadialTable | None = None  # subtracted: the measured point is displaced outwards

@@ -30,7 +30,7 @@ from sfm.textbook.resection.zeng_wang import resect_zeng_wang
 
 START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
 ALL_POINTS = 3  # fewest points of any method
-ON_A_LINE = ("fischler-bolles", "zeng-wang")  # methods whose solutions a fourth point tells apart
+ON_A_LINE = ("fischler-bolles", "zeng-wang")  # methods between whose solutions a fourth point decides
 ON_A_CYLINDER = ("fischler-bolles", "church", "zeng-wang", "rampal")  # methods of the first three points
 
 
@@ -49,7 +49,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Resected:
-    """What one method finds; None is what it does not tell. Lengths in the object unit, angles in rad."""
+    """The result of one method; None where it gives nothing. Lengths in the object unit, angles in rad."""
 
     method: str
     points: int  # how many were given
@@ -77,7 +77,7 @@ def resect(task: Task, method: str) -> Resected:
     Raises:
         GeometryError: unknown method, or the points do not allow it.
 
-    Source: of each method, in its own module; the fourth point that tells the solutions apart, document 001,
+    Source: of each method, in its module; the fourth point that decides between the solutions, document 001,
     sec. 3.3.1 and 4.1.1.
     """
     if method not in _FUNCTIONS:

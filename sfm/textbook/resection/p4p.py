@@ -16,7 +16,7 @@ from sfm.orientation.resection.candidates import (
 )
 
 MIN_POINTS = 4
-COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residuals tell what it costs
+COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residuals show what it costs
 PARALLEL = 1e-12  # |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel
 
 
