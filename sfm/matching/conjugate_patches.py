@@ -18,7 +18,7 @@ from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.ncc import NccMatches, match_ncc
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.lsm.patch_equations import MARGIN
-from sfm.matching.lsm.plane_windows import ELSEWHERE, match_where_plane, squares_over_covariance
+from sfm.matching.lsm.plane_windows import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
@@ -192,7 +192,7 @@ def confirmed(
     off = back.right - target
     lost = good[~(np.linalg.norm(off, axis=1) <= by.back_px)]
     d, C = np.einsum("kij,kj->ki", linear_part(matched.warp[good]), off), matched.covariance[good]
-    real = squares_over_covariance(d, C) > ELSEWHERE  # False for NaN
+    real = squares_over_covariance(d, C) > MAX_SQUARED_RATIO  # False for NaN
     covariance = matched.covariance.copy()
     covariance[good[real]] += d[real, :, None] * d[real, None, :]
     why = np.array(matched.reason, dtype=object)

@@ -14,17 +14,18 @@ import numpy as np
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
 from sfm.matching.tracks.features import match_features, sift_features
 
-AROUND = 12  # key points nearest to a point
+NEAR_KEY_POINTS = 12  # key points nearest to a point
 MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it
 FARTHEST_PX = 150.0  # of the third-nearest key point: farther away the surface is another one
 MARGIN_PX = 300.0  # around the points, in which key points are looked for
 MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
 LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
-GROSS = 3.0  # times the robust spread, beyond which a key point is on another map
+GROSS_SPREADS = 3.0  # times the robust spread, beyond which a key point is on another map
 MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set fit some map with their spread
 MAX_FEATURES = 10_000
-TRIPLES = np.array(list(combinations(range(AROUND), 3)))
-SINGULAR = 1e-3  # part of the squared extent of the key points that the triangle of a triple must have
+TRIPLES = np.array(list(combinations(range(NEAR_KEY_POINTS), 3)))
+# Part of the squared extent of the key points that the triangle of a triple must have.
+MIN_TRIANGLE_FRACTION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,13 @@ def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArra
     found = LocalAffinities(
         np.full((len(at), 2), np.nan), np.full((len(at), 2, 2), np.nan), np.full(len(at), np.nan)
     )
-    if len(key_left) < AROUND:
+    if len(key_left) < NEAR_KEY_POINTS:
         return found
     for k, place in enumerate(at):
         if not np.isfinite(place).all():
             continue
         distance = np.linalg.norm(key_left - place, axis=1)
-        near = np.argpartition(distance, AROUND - 1)[:AROUND]
+        near = np.argpartition(distance, NEAR_KEY_POINTS - 1)[:NEAR_KEY_POINTS]
         if np.sort(distance[near])[2] > FARTHEST_PX:
             continue
         one = _agreed_map(key_left[near] - place, key_right[near])
@@ -91,12 +92,12 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
     """Return linear part, place of the zero offset and its standard deviation, px; None if too few agree.
 
     Args:
-        offset: of the key points from the point, left px, (AROUND, 2).
-        target: their places in the right photograph, px, (AROUND, 2).
+        offset: of the key points from the point, left px, (NEAR_KEY_POINTS, 2).
+        target: their places in the right photograph, px, (NEAR_KEY_POINTS, 2).
     """
     full = np.column_stack([offset, np.ones(len(offset))])  # (n, 3)
     area = np.abs(np.linalg.det(full[TRIPLES]))
-    triples = TRIPLES[area > SINGULAR * np.ptp(offset, axis=0).max() ** 2]
+    triples = TRIPLES[area > MIN_TRIANGLE_FRACTION * np.ptp(offset, axis=0).max() ** 2]
     if not len(triples):
         return None
     maps = np.linalg.solve(full[triples], target[triples])  # (t, 3, 2)
@@ -105,7 +106,7 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
     spread = max(MAD_TO_SIGMA * float(np.median(off[best])), LOCALISATION_PX)
     if spread > MAX_SPREAD_PX:
         return None
-    agree = off[best] <= GROSS * spread
+    agree = off[best] <= GROSS_SPREADS * spread
     if agree.sum() < MIN_AGREEING:
         return None
     # near ones predict the place better than far ones, as the surface is curved

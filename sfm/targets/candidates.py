@@ -21,7 +21,7 @@ from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 # Reasons that are about the shape of a candidate and not about damage.
 SHAPE_REASONS = (Flag.LOBED, Flag.THIN_BACKGROUND, Flag.POOR_FIT)
 # Centres nearer than this share of the smaller radius belong to concentric targets.
-CONCENTRIC = 0.5
+MAX_CENTRE_FRACTION = 0.5
 # Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.
 ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
 # Parts of an unreadable code are smaller than this share of its dot.
@@ -134,12 +134,14 @@ def find_duplicates(
         ]
         distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
         larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
-        smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])
+        smaller = (
+            (near != i) & ~larger & (reason[near] == 0) & (distance < MAX_CENTRE_FRACTION * radius[near])
+        )
         smaller &= coded[near] | ~coded[i]
         inner = np.where(larger, i, near)
         tolerance = ECCENTRIC_SIGMAS * (sigma[inner] + typical)
         apart = distance > ECCENTRIC * radius[inner] + tolerance
-        apart |= tolerance > CONCENTRIC * radius[inner]
+        apart |= tolerance > MAX_CENTRE_FRACTION * radius[inner]
         stained = larger & (distance < radius[near]) & apart & (sign[near] == usual)
         if sign[i] != usual:
             duplicate[i] = stained.any()
@@ -149,7 +151,7 @@ def find_duplicates(
                 off_centre[i] = shift * max(0.0, 1 - ECCENTRIC * radius[i] / max(np.hypot(*shift), 1e-9))
         duplicate[i] |= (smaller & ~(apart & (sign[near] != usual) & (sign[i] == usual))).any()
         within = larger & coded[near] & ~coded[i] & (reason[near] == 0)
-        duplicate[i] |= (within & (distance < CONCENTRIC * radius[i])).any()
+        duplicate[i] |= (within & (distance < MAX_CENTRE_FRACTION * radius[i])).any()
     return duplicate, off_centre
 
 

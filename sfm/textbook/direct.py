@@ -16,7 +16,7 @@ from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust
 
 MAX_STEPS = 30
-CONVERGED = 1e-12
+MAX_LAST_STEP = 1e-12
 START_TOLERANCE = 0.1  # tangents: what a start may be off
 
 
@@ -85,7 +85,7 @@ def orient_direct(
         distance = np.linalg.norm(points[point] - positions[image], axis=1).mean()
         positions = positions + step[:, :3]
         rotations = rotations @ rotation_from_vector(step[:, 3:])
-        if np.abs(step[:, :3]).max() < CONVERGED * distance and np.abs(step[:, 3:]).max() < CONVERGED:
+        if np.abs(step[:, :3]).max() < MAX_LAST_STEP * distance and np.abs(step[:, 3:]).max() < MAX_LAST_STEP:
             converged = True
             break
     v, A, B = _observations(uv, image, point, positions, rotations, points)

@@ -13,7 +13,7 @@ from sfm.errors import GeometryError
 
 SIMILARITY, AFFINE = "similarity", "affine"
 FEWEST = {SIMILARITY: 2, AFFINE: 3}
-COLLINEAR = 1e-9  # second singular value over the first
+MIN_SINGULAR_RATIO = 1e-9  # second singular value over the first
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def orient_fiducials(
         )
     centre = m.mean(axis=0)
     spread = np.linalg.svd(m - centre, compute_uv=False)
-    if spread[0] == 0 or (kind == AFFINE and spread[1] <= COLLINEAR * spread[0]):
+    if spread[0] == 0 or (kind == AFFINE and spread[1] <= MIN_SINGULAR_RATIO * spread[0]):
         raise GeometryError("fiducial marks: the marks coincide or lie on one line")
     x, y = (m - centre).T
     one, zero = np.ones(n), np.zeros(n)

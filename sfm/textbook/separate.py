@@ -28,7 +28,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
 TOLERANCE = 1e-13  # relative decrease of v'Pv in a round at which the rounds end
-SHORTEST = 2.0**-12  # shortest share of a step that is tried
+MIN_STEP_SHARE = 2.0**-12  # shortest share of a step that is tried
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _shorten(
 ) -> tuple[State, float]:
     """Return the state after the longest share of the step, by halves, that does not raise v'Pv."""
     share = 1.0
-    while share >= SHORTEST:
+    while share >= MIN_STEP_SHARE:
         moved = step(layout, state, share * reduced, share * points)
         reached = float(sum_of_squares(layout.observations, moved, weight))
         if reached <= vPv:

@@ -32,7 +32,7 @@ from sfm.conventions import (
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import SHARED, Covered, Windows, first_alike, points_apart
+from sfm.matching.lsm.coverage import MAX_SHARED_FRACTION, Covered, Windows, first_alike, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -216,9 +216,9 @@ def test_windows_on_both_sides_of_a_line_of_the_grid_overlap_too() -> None:
         share += np.prod(np.maximum(1 - np.abs(own[:, None] - own[None]) / side, 0.0), axis=2) / 2
     np.fill_diagonal(share, 0.0)
     with_earlier = np.tril(share)[np.ix_(kept, kept)].sum(axis=1)  # all have two rays: the first come first
-    assert 0.05 < with_earlier.max() <= SHARED
+    assert 0.05 < with_earlier.max() <= MAX_SHARED_FRACTION
     left_out = np.tril(share)[np.ix_(~kept, kept)].sum(axis=1)
-    assert left_out.min() > SHARED
+    assert left_out.min() > MAX_SHARED_FRACTION
 
 
 def test_squares_with_texture_lie_side_by_side() -> None:

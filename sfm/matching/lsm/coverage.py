@@ -17,8 +17,8 @@ from sfm.kernels.options import compiled
 from sfm.network import ImagePoints
 
 # Ratio of precisions for the same pixels up to which the windows that are preferred are taken.
-ALIKE = 1.1
-SHARED = 0.15  # part of the pixels of a point, or of a window, that others may have measured
+MAX_COST_RATIO = 1.1
+MAX_SHARED_FRACTION = 0.15  # part of the pixels of a point, or of a window, that others may have measured
 SAMPLES = np.linspace(-0.42, 0.42, 6)  # of a window at which it is asked what is covered, in its sides
 
 
@@ -41,7 +41,7 @@ def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
         costs: windows and the standard deviation that their rays leave together, the preferred ones first.
     """
     best = min(cost for _, cost in costs)
-    return next(windows for windows, cost in costs if cost <= ALIKE * best)
+    return next(windows for windows, cost in costs if cost <= MAX_COST_RATIO * best)
 
 
 class Covered:
@@ -69,7 +69,7 @@ class Covered:
     def free_middles(self, image: int, side_px: int) -> BoolArray:
         """Return which pixels of a photograph are middles of squares with few covered pixels, (H, W)."""
         shared = cv2.boxFilter(self.pixels(image), cv2.CV_32F, (side_px, side_px))
-        return np.asarray(shared <= SHARED)
+        return np.asarray(shared <= MAX_SHARED_FRACTION)
 
     def is_free(self, image: int, xy: FloatArray, side_px: float) -> BoolArray:
         """Return which squares of a photograph have few covered pixels, (k,).
@@ -83,7 +83,7 @@ class Covered:
         col = np.rint(xy[:, :1] + side_px * SAMPLES).astype(np.int64).clip(0, width - 1)[:, None, :]
         row = np.rint(xy[:, 1:] + side_px * SAMPLES).astype(np.int64).clip(0, height - 1)[:, :, None]
         covered = (self._bits[image][row, col >> 3] >> (7 - (col & 7)).astype(np.uint8)) & 1
-        return np.asarray(covered.mean(axis=(1, 2)) <= SHARED)
+        return np.asarray(covered.mean(axis=(1, 2)) <= MAX_SHARED_FRACTION)
 
 
 def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points: int) -> BoolArray:
@@ -136,7 +136,7 @@ def _keep_apart(
     before = np.full(len(xy), -1)  # that was kept there before
     for point in order:
         begin, end = first[point], first[point + 1]
-        shared, most = 0.0, SHARED * (end - begin)
+        shared, most = 0.0, MAX_SHARED_FRACTION * (end - begin)
         for k in range(begin, end):
             for line in (-columns, 0, columns):
                 at = np.searchsorted(cells, cell[k] + line - 1)

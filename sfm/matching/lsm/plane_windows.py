@@ -15,11 +15,11 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.matching.lsm.warp import linear_part
 
-SMALLER = 0.75  # side of the next window
+SIDE_RATIO = 0.75  # side of the next window
 MIN_WINDOW_PX = 9  # smaller ones hardly hold the parameters of an affine warp
 # Squared difference of two windows, in that of the smaller one's noise, from which the larger one is off.
 # Half of that noise is common to both: chance leads so far in less than one of a hundred.
-ELSEWHERE = 6.0
+MAX_SQUARED_RATIO = 6.0
 ROUNDING_PX = 1e-6  # of places in intensities of single precision
 
 
@@ -51,7 +51,7 @@ def match_where_plane(
     rows = np.flatnonzero(matches.good)
     start, linear = matches.xy[rows].copy(), linear_part(matches.warp[rows])
     sides, found = [window_px], [_rows(matches, rows)]
-    while len(rows) and (side := int(SMALLER * sides[-1]) | 1) >= MIN_WINDOW_PX:
+    while len(rows) and (side := int(SIDE_RATIO * sides[-1]) | 1) >= MIN_WINDOW_PX:
         one = match_lsm(
             left, right, xy_left[rows], start, window_px=side, interpolation=interpolation, start=linear
         )
@@ -86,7 +86,7 @@ def _largest_that_agrees(found: list[LsmMatches]) -> IntArray:
         for smaller in found[number + 1 :]:
             both = np.flatnonzero(agrees & smaller.good)
             d, C = smaller.xy[both] - found[number].xy[both], smaller.covariance[both]
-            agrees[both] = squares_over_covariance(d, C) <= ELSEWHERE
+            agrees[both] = squares_over_covariance(d, C) <= MAX_SQUARED_RATIO
         chosen[agrees] = number
     return chosen
 

@@ -12,7 +12,8 @@ from sfm.network import Estimate, ImagePoints, rows_of
 NEIGHBOURS = 6  # object points whose plane a place is put on
 NEAREST, FARTHEST = 0.5, 2.0  # of a plane, in the depths of the nearest and the farthest object point
 TOLERANCE_FACTOR = 6.0  # of the spread of points about the planes of their neighbours
-FLATTEST = 1e-6  # part of the squares of neighbours' tangents that is added where they are in a row
+# Part of the squares of neighbours' tangents that is added where they are in a row.
+REGULARISATION_FRACTION = 1e-6
 
 
 def planes_at(
@@ -110,5 +111,9 @@ def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArr
     """
     A = np.concatenate([away, np.ones((*away.shape[:2], 1))], axis=2)
     N = np.einsum("kij,kil->kjl", A, A)
-    N += FLATTEST * np.einsum("kij,kij->k", away, away)[:, None, None] * np.diag([1.0, 1.0, 0.0])
+    N += (
+        REGULARISATION_FRACTION
+        * np.einsum("kij,kij->k", away, away)[:, None, None]
+        * np.diag([1.0, 1.0, 0.0])
+    )
     return np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse)[:, :, None])[:, :, 0], N

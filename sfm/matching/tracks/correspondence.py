@@ -35,7 +35,7 @@ from sfm.matching.tracks.evidence import (
 from sfm.network import Estimate
 
 # Two points that never share a photograph and lie closer than this many tolerances are one target.
-SAME = 2.5
+SAME_TOLERANCES = 2.5
 # Cells of the search raster along the longer side of a photograph, at most.
 RASTER = 64
 
@@ -165,7 +165,7 @@ class _Search:
         When the orientation is off by more than the tolerance, one target may split in two points.
         """
         self.used[track[track >= 0]] = True
-        reach = SAME * self.scene.tolerance
+        reach = SAME_TOLERANCES * self.scene.tolerance
         for other, its_place in zip(self.tracks, self.places, strict=True):
             if same_target(self.scene, track, place, other, its_place, reach):
                 return

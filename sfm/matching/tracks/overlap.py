@@ -19,7 +19,7 @@ from sfm.matching.tracks.features import RATIO
 FEATURES = 250  # of each photograph, the coarsest
 PARTNERS = 10  # that what they show chooses for each photograph
 NEIGHBOURS = 4  # that were taken near each photograph, whatever they show
-CLEAR = 6  # features that choose each other by which an overlap is more than chance
+MIN_MUTUAL_FEATURES = 6  # features that choose each other by which an overlap is more than chance
 # Partners of a photograph with few clear ones, and of one that is not connected with the others. So many hold
 # nearly all that overlap (96 to 100 % where 3 of 10 features are found again); pairs grow with photographs.
 MANY_PARTNERS = 30
@@ -43,7 +43,7 @@ def overlapping_pairs(
     if m <= partners + 1:
         return np.column_stack(np.triu_indices(m, 1))
     both = score + score.T
-    lost = (both >= CLEAR).sum(axis=1) < partners / 2
+    lost = (both >= MIN_MUTUAL_FEATURES).sum(axis=1) < partners / 2
     wanted = _best(both, np.where(lost, MANY_PARTNERS, partners))
     for near in neighbours:
         used = (near >= 0) & (lost[:, None] | (np.arange(near.shape[1]) < NEIGHBOURS))

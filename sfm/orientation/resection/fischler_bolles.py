@@ -19,8 +19,9 @@ FLAT = 1e-14  # 16 area^2 over the fourth power of the largest side below which 
 NEWTON_STEPS = 20
 NEWTON_CONVERGED = 1e-10  # relative step; the error after it is its square
 FITS = 1e-9  # misfit of the squared sides, relative to the largest, below which legs are a solution
-SAME = 1e-9  # relative difference of legs below which two solutions are one
-NEAR = 1e-6  # relative misfit above which the second root for the third leg is no separate solution
+MAX_SAME_DIFFERENCE = 1e-9  # relative difference of legs below which two solutions are one
+# Relative misfit above which the second root for the third leg is no separate solution.
+MAX_DOUBLE_ROOT_MISFIT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def solve_triple(
             y, misfit, other = y_plus, misfit_plus, misfit_minus
             if side == 1:
                 y, misfit, other = y_minus, misfit_minus, misfit_plus
-            if y <= 0.0 or (misfit > other and misfit > NEAR * Rbc2):
+            if y <= 0.0 or (misfit > other and misfit > MAX_DOUBLE_ROOT_MISFIT * Rbc2):
                 continue
             a = np.sqrt(a2)
             fits, a, b, c = polish_legs(a, a * x, a * y, Rab2, Rac2, Rbc2, gab, gac, gbc)
@@ -246,7 +247,9 @@ def polish_legs(
 def is_known(a: float, b: float, c: float, legs: FloatArray, n: int) -> bool:
     """Return whether legs are those of one of the first n solutions."""
     for i in range(n):
-        if abs(a - legs[i, 0]) + abs(b - legs[i, 1]) + abs(c - legs[i, 2]) < SAME * (a + b + c):
+        if abs(a - legs[i, 0]) + abs(b - legs[i, 1]) + abs(c - legs[i, 2]) < MAX_SAME_DIFFERENCE * (
+            a + b + c
+        ):
             return True
     return False
 

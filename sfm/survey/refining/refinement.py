@@ -23,7 +23,7 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import ALIKE
+from sfm.matching.lsm.coverage import MAX_COST_RATIO
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
@@ -274,7 +274,7 @@ def refine_model(
     oriented = measured(estimate, size)
     if window_px is None:
         sizes = [Size(side, size.shrink) for side in WINDOWS_PX]
-        chosen = best(oriented.whole, sizes, oriented.spread_px, ALIKE)
+        chosen = best(oriented.whole, sizes, oriented.spread_px, MAX_COST_RATIO)
         if chosen != size:
             size, oriented = chosen, measured(oriented.whole, chosen)
     anew, tolerance_px = oriented.network, TOLERANCE_FACTOR * oriented.spread_px

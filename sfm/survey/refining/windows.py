@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
-from sfm.matching.lsm.coverage import ALIKE, points_apart
+from sfm.matching.lsm.coverage import MAX_COST_RATIO, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -152,7 +152,12 @@ def _reduced(network: Network, estimate: Estimate, shrink: int) -> tuple[Network
 
 
 def best_size(
-    keys: KeyPoints, estimate: Estimate, sizes: Sequence[Size], *, alike: float = ALIKE, tolerance_px: float
+    keys: KeyPoints,
+    estimate: Estimate,
+    sizes: Sequence[Size],
+    *,
+    alike: float = MAX_COST_RATIO,
+    tolerance_px: float,
 ) -> Size:
     """Return the windows that determine the most together.
 

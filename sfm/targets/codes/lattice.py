@@ -9,8 +9,8 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
-NEAR = 0.25  # of the spacing, within which a dot must be where its neighbours predict it
-COMPACT = 1.2  # times its dots, the places in the box of a lattice that needs no other beside it
+MAX_OFF_FRACTION = 0.25  # of the spacing, within which a dot must be where its neighbours predict it
+MAX_BOX_RATIO = 1.2  # times its dots, the places in the box of a lattice that needs no other beside it
 SEEDS = 8  # dots that are tried to begin with
 MIN_SINE = 0.3  # of the angle between rows and columns
 
@@ -50,7 +50,7 @@ def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
         found = _grown(xy, is_dot, seed, *steps)
         if best is None or (len(found.rows), -found.box) > (len(best.rows), -best.box):
             best = found
-        if len(best.rows) > len(dots) / 2 and best.box < COMPACT * len(best.rows):
+        if len(best.rows) > len(dots) / 2 and best.box < MAX_BOX_RATIO * len(best.rows):
             break
     return best
 
@@ -62,7 +62,7 @@ def _first_steps(xy: FloatArray, seed: int) -> tuple[FloatArray, FloatArray] | N
     steps = [
         away[k]
         for k in order
-        if np.hypot(*(away[order] + away[k]).T).min() < NEAR * np.hypot(*away[k])  # its opposite
+        if np.hypot(*(away[order] + away[k]).T).min() < MAX_OFF_FRACTION * np.hypot(*away[k])  # its opposite
     ]
     for other in steps[1:]:
         first = steps[0]
@@ -88,7 +88,7 @@ def _grown(xy: FloatArray, is_dot: BoolArray, seed: int, across: FloatArray, dow
             away = np.hypot(*(xy - xy[k] - step).T)
             j = int(np.argmin(away))
             error = float(away[j] / np.hypot(*step))
-            if error < NEAR and j not in place:
+            if error < MAX_OFF_FRACTION and j not in place:
                 counter += 1
                 heapq.heappush(waiting, (error, counter, k, j, across, down))
 

@@ -24,7 +24,7 @@ from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
 
 MIN_SIDE, MIN_DOTS_OF_PLATE = 3, 20  # dots or crossings along a side, and dots of a plate
-FILLED = 0.8  # of the places of a plate hold dots
+MIN_FILLED_FRACTION = 0.8  # of the places of a plate hold dots
 # A dot so many standard deviations larger than those around it in two photographs is a mark.
 MARK_SIGMAS = 5.0
 # Boards are sought in photographs of at most this size, px.
@@ -270,7 +270,7 @@ def _whole_plate(name: str, place: IntArray) -> PlateFamily | None:
     rows, steps = (int(n) for n in place.max(axis=0) + 1)
     shifted = PlateFamily(name, rows, 1).is_shifted
     plate = PlateFamily(name, rows, steps // 2 if shifted else steps)
-    if min(plate.rows, plate.columns) < MIN_SIDE or len(place) < FILLED * plate.count:
+    if min(plate.rows, plate.columns) < MIN_SIDE or len(place) < MIN_FILLED_FRACTION * plate.count:
         return None
     if shifted and (steps % 2 or ((place[:, 0] + place[:, 1]) % 2).any()):
         return None

@@ -41,7 +41,7 @@ TAGGED = ("charuco", "aprilgrid")
 APRIL_BORDERS = (2, 1)  # modules of the black border of the tags of an AprilGrid, Kalibr's first
 PLATES = (*GRIDS, *BOARDS)
 UNCODED = -1
-ALIKE = 1e-6  # pitches, of rounding
+MAX_ROUNDING = 1e-6  # pitches, of rounding
 # How far a tag may be off its place behind the homography of its board, in the distance of tags or squares.
 # Distortion of 5 % at the corners of a photograph that 8 x 8 tags fill leaves 0.1; a misread tag is off by 1.
 MAX_OFF_PLACE = 0.15
@@ -106,7 +106,7 @@ class PlateFamily:
         for turn in range(1, fold):
             away = np.abs(points[:, None] * np.exp(2j * np.pi * turn / fold) - points)
             number = away.argmin(axis=1)
-            if away.min(axis=1).max() < ALIKE and self._has_colours_of(number):
+            if away.min(axis=1).max() < MAX_ROUNDING and self._has_colours_of(number):
                 found.append(number)
         return tuple(found)
 
@@ -215,7 +215,7 @@ def refuse_unusable_plate(plate: PlateFamily) -> None:
     for turn in range(1, turns):
         turned = marks * np.exp(2j * np.pi * turn / turns)
         moved = turned - turned.mean() + marks.mean()
-        if np.abs(moved[:, None] - marks).min(axis=1).max() < ALIKE:
+        if np.abs(moved[:, None] - marks).min(axis=1).max() < MAX_ROUNDING:
             raise GeometryError(
                 f"the marks look alike turned by {360 * turn // turns} degrees: turn one, or mark another dot"
             )

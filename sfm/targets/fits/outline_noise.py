@@ -23,7 +23,7 @@ MAX_HARMONIC, MIN_DAMPED = 12, 0.2
 # Its exponent is used where it is so many sigmas above 0, and up to this.
 EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
 # Larger than any degree of freedom that a population can show.
-_ALIKE = 1e4
+_MAX_HALF_FREEDOM = 1e4
 
 
 class OutlineShape(NamedTuple):
@@ -129,8 +129,8 @@ def damping_of(k: IntArray, softness: FloatArray | float) -> FloatArray:
 
 def _inverse_trigamma(value: float) -> float:
     """Return y with trigamma(y) = value, by Newton steps (Smyth 2004, appendix)."""
-    if value < 1 / _ALIKE:
-        return _ALIKE
+    if value < 1 / _MAX_HALF_FREEDOM:
+        return _MAX_HALF_FREEDOM
     y = 0.5 + 1 / value
     for _ in range(10):
         y += polygamma(1, y) * (1 - polygamma(1, y) / value) / polygamma(2, y)

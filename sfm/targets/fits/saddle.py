@@ -26,7 +26,7 @@ from sfm.kernels.options import compiled
 MAX_HALF_SPACINGS = 0.35
 MIN_HALF_PX, MAX_HALF_PX = 3, 15
 ROUNDS, LAST_STEP_PX = 20, 1e-3
-FARTHEST = 1.0  # of the half window, by which a crossing may be off where it was expected
+MAX_OFF_FRACTION = 1.0  # of the half window, by which a crossing may be off where it was expected
 MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; one edge has 0
 SMOOTHING_PX = 0.7  # of the gradients
 MIN_BLUR_PX = 0.1  # that is distinguished from that of the filters
@@ -196,7 +196,7 @@ def _crossing(gx: AnyArray, gy: AnyArray, x0: float, y0: float, half: int) -> tu
             break
         step_x, step_y = (yy * nx - xy * ny) / det, (xx * ny - xy * nx) / det
         x, y = x + step_x, y + step_y
-        if math.hypot(x - x0, y - y0) > FARTHEST * half:
+        if math.hypot(x - x0, y - y0) > MAX_OFF_FRACTION * half:
             break
         if math.hypot(step_x, step_y) < LAST_STEP_PX:
             return x, y

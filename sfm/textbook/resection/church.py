@@ -14,7 +14,7 @@ from sfm.orientation.resection.fischler_bolles import rays_from_tangents
 
 MIN_POINTS = 3
 MAX_STEPS = 100
-CONVERGED = 1e-12  # step relative to the distance of the points
+MAX_LAST_STEP = 1e-12  # step relative to the distance of the points
 HALVINGS = 10
 NO_PYRAMID = 1e-12  # determinant of three unit vectors below which they lie in a plane
 _I, _J = np.array([0, 1, 2]), np.array([1, 2, 0])
@@ -64,7 +64,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray
         misfit = new
         history.append(position)
         distance = np.linalg.norm(X - position, axis=1).mean()
-        if np.linalg.norm(factor * step) <= CONVERGED * distance:
+        if np.linalg.norm(factor * step) <= MAX_LAST_STEP * distance:
             break
         if not np.isfinite(position).all() or distance > 1e12 * np.linalg.norm(X - X.mean(axis=0)):
             raise GeometryError("church: the position runs away from this start, a nearer one is needed")

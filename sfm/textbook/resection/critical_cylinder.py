@@ -8,7 +8,8 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
-NEAR = 0.05  # relative distance below which the error of the position grows more than tenfold
+# Relative distance below which the error of the position grows more than tenfold.
+MAX_RELATIVE_DISTANCE = 0.05
 
 
 @checked_arguments(position="3", points="3 3")
@@ -43,7 +44,7 @@ def cylinder_distance(position: FloatArray, points: FloatArray) -> float:
 def cylinder_warning(position: FloatArray, points: FloatArray) -> str:
     """Return a warning if the camera is near the critical cylinder of three points, else an empty string."""
     distance = cylinder_distance(position, points)
-    if abs(distance) >= NEAR:
+    if abs(distance) >= MAX_RELATIVE_DISTANCE:
         return ""
     where = "outside" if distance > 0 else "inside"
     return (

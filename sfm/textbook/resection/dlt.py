@@ -13,10 +13,11 @@ from sfm.errors import GeometryError
 
 PARAMETERS = 11
 DISTORTION = ("K1", "K2", "K3", "P1", "P2")
-COPLANAR = 1e-3  # thickness of the points over their extent below which the system is as good as singular
+# Thickness of the points over their extent below which the system is as good as singular.
+MIN_THICKNESS = 1e-3
 MAX_STEPS = 100
-CONVERGED = 1e-12  # change of the 11 parameters, relative
-SINGULAR = 1e-11  # smallest over largest singular value of the scaled equations
+MAX_LAST_CHANGE = 1e-12  # change of the 11 parameters, relative
+MIN_SINGULAR_RATIO = 1e-11  # smallest over largest singular value of the scaled equations
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def resect_dlt(
     if not (np.isfinite(xy).all() and np.isfinite(xyz).all()):
         raise GeometryError("dlt: a coordinate is not a finite number")
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
-    if extents[0] == 0 or extents[2] <= COPLANAR * extents[0]:
+    if extents[0] == 0 or extents[2] <= MIN_THICKNESS * extents[0]:
         raise GeometryError(
             "dlt: the points lie in one plane or nearly so, which leaves the 11 parameters undetermined; "
             "use p4p or robust with a known camera"
@@ -125,7 +126,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
         # unit norm of the 12 parameters: homogeneous, solved through the smallest singular vector
         scale = np.linalg.norm(rows, axis=0)
         _, s, Vt = np.linalg.svd(rows / scale, full_matrices=len(rows) < rows.shape[1])
-        if s[min(len(s), rows.shape[1] - 1) - 1] <= SINGULAR * s[0]:
+        if s[min(len(s), rows.shape[1] - 1) - 1] <= MIN_SINGULAR_RATIO * s[0]:
             raise GeometryError("dlt: the points do not determine the parameters (a critical arrangement)")
         h = Vt[-1] / scale
         norm = np.linalg.norm(h[8:11])
@@ -139,7 +140,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
         g, k, weight = h[:12], new_k, 1 / A
         r3 = g[8:11]
         centre = np.array([g[0:3] @ r3, g[4:7] @ r3])
-        if step > 1 and change < CONVERGED:
+        if step > 1 and change < MAX_LAST_CHANGE:
             break
     return g, k
 

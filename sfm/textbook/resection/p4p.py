@@ -16,8 +16,10 @@ from sfm.orientation.resection.candidates import (
 )
 
 MIN_POINTS = 4
-COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residuals show what it costs
-PARALLEL = 1e-12  # |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel
+# Thickness up to which points are taken as a plane; the residuals show what it costs.
+MAX_COPLANAR_THICKNESS = 0.01
+# |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel.
+MAX_PARALLEL_RATIO = 1e-12
 
 
 @checked_arguments(tangents="k 2", points="n 3")
@@ -38,7 +40,7 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
     Source: Fischler, Bolles (1981), appendix B; document 001, eqs. 2.19-2.30, with f = 1 (tangents).
     """
     uv, xyz = checked_points("p4p", tangents, points, needed=MIN_POINTS)
-    if thickness(xyz) > COPLANAR:
+    if thickness(xyz) > MAX_COPLANAR_THICKNESS:
         raise GeometryError(
             f"p4p: the points are not in one plane (thickness {thickness(xyz):.2g} of their extent), "
             "use robust, or dlt from six points on"
@@ -82,7 +84,7 @@ def _position_over_plane(T: FloatArray) -> FloatArray:
     c = inverse[:, 2]  # point of the plane on the optical axis
     DI_inverse = np.hypot(a[0], a[1]) / abs(a[2])
     foot = c[:2] / c[2]
-    if DI_inverse < PARALLEL:
+    if DI_inverse < MAX_PARALLEL_RATIO:
         # parallel planes: the distance is the scale, the square root of the ratio of areas
         scale = np.sqrt(abs(np.linalg.det(T[:2, :2]))) / abs(T[2, 2])
         return np.array([foot[0], foot[1], 1 / scale])

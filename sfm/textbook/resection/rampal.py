@@ -21,10 +21,10 @@ from sfm.textbook.resection.zeng_wang import direction_test, trilaterate
 
 MIN_POINTS = 3
 MAX_STEPS = 100
-CONVERGED = 1e-14  # rad
+MAX_LAST_STEP = 1e-14  # rad
 MARGIN = 0.9  # part of the way to a flat triangle that one step may go
 SPAN = 0.02  # singular value, relative, from which on the points span a direction well
-SAME = 1e-6  # distance of two positions, in extents of the points, below which they are one
+MAX_SAME_DISTANCE = 1e-6  # distance of two positions, in extents of the points, below which they are one
 MAX_TRIPLES = 20
 
 
@@ -62,7 +62,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
             continue
         solution = solution_of(position, rotation_from_position(uv, xyz, position), uv, xyz)
         size = np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max()
-        if all(np.linalg.norm(solution.position - one.position) > SAME * size for one in found):
+        if all(np.linalg.norm(solution.position - one.position) > MAX_SAME_DISTANCE * size for one in found):
             found.append(solution)
     if not found:
         raise failure
@@ -106,7 +106,7 @@ def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
         room = np.where(step > 0, second, first)
         factor = min(1.0, float(np.min(MARGIN * room / np.maximum(np.abs(step), 1e-300))))
         first = first + factor * step
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max() < MAX_LAST_STEP:
             break
     S = scale * np.sin(np.pi - theta - first)
     sides = np.sqrt((S - S[j]) ** 2 + 4 * S * S[j] * np.sin(theta / 2) ** 2)

@@ -11,8 +11,8 @@ from sfm.kernels.options import compiled
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
 from sfm.orientation.resection.fischler_bolles import (
+    MAX_DOUBLE_ROOT_MISFIT,
     MAX_SOLUTIONS,
-    NEAR,
     Poses,
     is_known,
     is_triangle,
@@ -176,7 +176,7 @@ def _solve(
         off_low = abs(((low - x) ** 2 + 2.0 * low * x * g23) * p2 / L1 - 1.0)
         for side in range(2):
             m, off, other = (high, off_high, off_low) if side == 0 else (low, off_low, off_high)
-            if m <= 0.0 or (off > other and off > NEAR):
+            if m <= 0.0 or (off > other and off > MAX_DOUBLE_ROOT_MISFIT):
                 continue
             fits, R1, R2, R3 = polish_legs(p, m * p, x * p, L3, L2, L1, g12, g13, g23)
             if not fits or n == MAX_SOLUTIONS or is_known(R1, R2, R3, distances, n):
