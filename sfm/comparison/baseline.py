@@ -33,11 +33,11 @@ class Baseline(Protocol):
 
     @property
     def network(self) -> Network:
-        """The photographs it oriented, by the survey's names, and its own points in them."""
+        """The photographs it oriented, by the survey's names, and its points in them."""
 
     @property
     def estimate(self) -> Estimate:
-        """Its cameras, orientations and points, in a frame and scale of its own."""
+        """Its cameras, orientations and points, in its own frame and scale."""
 
     @property
     def total(self) -> int:
@@ -45,7 +45,7 @@ class Baseline(Protocol):
 
     @property
     def rms_px(self) -> float:
-        """Root mean square residual per coordinate of its own points, px."""
+        """Root mean square residual per coordinate of its points, px."""
 
     @property
     def seconds(self) -> float:
@@ -59,7 +59,7 @@ class BaselineComparison:
     name: str  # of the baseline
     photographs: tuple[int, int]  # oriented
     total: int  # photographs given
-    rms_px: tuple[float, float]  # of each one's own points and image points, per coordinate, px
+    rms_px: tuple[float, float]  # of the points and image points of each, per coordinate, px
     targets: int  # object points of the survey that the baseline's photographs determine too
     target_rms_px: float  # of the survey's image points under the baseline's orientations, px
     survey_from_baseline: Similarity

@@ -241,8 +241,8 @@ def _fitted(
         exchanged = int(((other >= 0) & (other != np.arange(len(other)))).sum())
         searched = exchanged * math.log(len(other))
     penalty = lost * cost + parameters / 2 * math.log(3 * n) + searched
-    nobody = np.zeros(n, dtype=bool)
-    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, nobody, (1.0, 0.0), None, (), other)
+    none_stable = np.zeros(n, dtype=bool)
+    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, none_stable, (1.0, 0.0), None, (), other)
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
     if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
         return failed

@@ -56,14 +56,14 @@ class Congruency:
     difference: FloatArray  # d_S, (n, 3)
     covariance: FloatArray  # Q_S of all coordinates together, (3 n, 3 n)
     motions: FloatArray  # G: what is no change, (3 n, u)
-    statistic: FloatArray  # T of each point, its drop of Omega (stable) or its own test, over 3, (n,)
+    statistic: FloatArray  # T of each point, its drop of Omega (stable) or its separate test, over 3, (n,)
     level: FloatArray  # alpha of the test of each point, (n,)
     critical: FloatArray  # of T, (n,)
     weights: FloatArray  # P_kk of each stable point, from which its drop is, 0 of the others, (n, 3, 3)
 
     @property
     def moved(self) -> BoolArray:
-        """Points that do not agree with the stable ones, (n,); none where nobody knows which."""
+        """Points that do not agree with the stable ones, (n,); none where it is not known which."""
         return np.asarray(self.agreed & ~self.stable & (self.critical < self.statistic))
 
     @property
@@ -93,7 +93,7 @@ def congruency(
         covariance: Q_a + Q_b of all coordinates together, (3 n, 3 n).
         xyz: coordinates, (n, 3).
         motion: what of the whole is no change: rigid (translation and rotation), similarity (the scale too,
-            where not both have one of their own), or none (both in the datum of control).
+            where not both have one), or none (both in the datum of control).
         redundancy: of both adjustments together; None if the variances are known.
         reference: points that may carry the datum, (n,); all if not given.
         alpha: probability of calling something a change that is none.
@@ -115,7 +115,7 @@ def congruency(
     sizes = np.linalg.svd(G[np.repeat(reference, 3)], compute_uv=False)
     if (sizes < RANK * np.linalg.svd(G, compute_uv=False).max(initial=0.0)).any():
         raise GeometryError(
-            "congruency: the points of reference lie on a line, which holds no rotation about it"
+            "congruency: the points of reference lie on a line, which fixes no rotation about it"
         )
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * first))
 

@@ -1,8 +1,8 @@
 """Which point and which photograph of one result is which of another.
 
 Names are believed where they identify something: codes, control, given observations, file names. Uncoded
-targets and tie points are numbered anew in every run, and some formats hold no names at all; what bears such
-a number is recognised by its image points, where both results have the same photographs, or else by its
+targets and tie points are numbered anew in every run, and some formats have no names at all; a point with
+such a number is recognised by its image points, where both results have the same photographs, or else by its
 place, after an alignment on what is already paired. A number that identifies nothing is never compared with
 another.
 """
@@ -214,7 +214,7 @@ def _points_by_image_points(
 
 
 def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Similarity | None:
-    """Return a_from_b by what is paired so far, or as they are if they coincide; None where neither holds."""
+    """Return a_from_b by what is paired so far, or as they are if they coincide; None in any other case."""
     for pairs, ours, theirs in (
         (points, a.estimate.points, b.estimate.points),
         (images, a.estimate.position, b.estimate.position),
@@ -315,7 +315,7 @@ def nearest_places(
 
 
 def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
-    """Return the distance of each to its nearest neighbour in its own result; infinite for a single one."""
+    """Return the distance of each to its nearest neighbour in the same result; infinite for a single one."""
     places = one[0][one[1]]
     if len(places) < 2:
         return np.full(len(rows), np.inf)

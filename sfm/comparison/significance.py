@@ -58,12 +58,12 @@ class ResultComparison:
     """Differences b - a of two results after b was aligned to a."""
 
     names: tuple[str, str]
-    unit: str  # of a's lengths, as people call it; empty where nobody knows
+    unit: str  # of a's lengths, as people call it; empty where it is not known
     has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known
     same_share: float  # of a's image points that b has too; NaN if a has none
     pairing: Pairing  # what is common, by index, and how it was recognised
     alignment: str  # points | cameras | control | none
-    scale_estimated: bool  # in the alignment, since not both results have a scale of their own
+    scale_estimated: bool  # in the alignment, since not both results have a scale
     a_from_b: Similarity
     points: tuple[str, ...]  # names in a of the common points, n of them
     point_difference: FloatArray  # object unit of a, (n, 3)
@@ -76,7 +76,7 @@ class ResultComparison:
     global_statistic: float  # of all points together over its degrees of freedom; NaN without tests
     global_critical: float  # of the global test; NaN without tests
     stable: BoolArray  # points that the alignment is over, (n,); all of them where nothing moved
-    majority: bool  # whether most of the points agree; if not, nobody knows which of them moved
+    majority: bool  # whether most of the points agree; if not, it is not known which of them moved
     cause: Cause | None  # what explains that they differ; None where single points moved, or nothing does
     images: tuple[str, ...]  # names in a of the common photographs, m of them
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
@@ -85,7 +85,7 @@ class ResultComparison:
 
     @property
     def independent(self) -> bool:
-        """Whether the results come from measurements of their own, as the test wants it."""
+        """Whether the results come from separate measurements, as the test wants it."""
         return not self.same_share > SAME_SHARE
 
     @property
@@ -230,7 +230,7 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
 
 
 def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
-    """Differences of the cameras that took the same photographs, or bear one name, each pair once."""
+    """Differences of the cameras that took the same photographs, or have one name, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
     if a.images_named and b.images_named:

@@ -6,7 +6,7 @@ in which they lower Omega = d' Q^+ d. With W = (Q + c G G')^-1, which is the sam
 
     P = W - W G (G' W G)^-1 G' W,  w = P d,  Omega = d' w,  drop of point k: w_k' P_kk^-1 w_k,
 
-and the removal of a point, which is to give it a displacement of its own, is P - P_k P_kk^-1 P_k'. This
+and the removal of a point, which gives it a separate displacement, is P - P_k P_kk^-1 P_k'. This
 repeats the S-transformation to the points that are left after every removal, at the cost of a product.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.2; Niemeier (2008),
@@ -159,7 +159,7 @@ def _rows(points: IntArray, m: int) -> IntArray:
 
 
 def _remove(P: FloatArray, w: FloatArray, rows: IntArray | slice) -> None:
-    """Give points displacements of their own: their rows of P and of w = P d become 0."""
+    """Give points separate displacements: their rows of P and of w = P d become 0."""
     by_rows = np.linalg.solve(P[rows][:, rows], P[rows])
     w -= by_rows.T @ w[rows]
     P -= P[:, rows] @ by_rows

@@ -6,7 +6,7 @@ survey in `brown` is `full_opencv`.
 
 With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
 the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
-all. Where the image points cannot tell k1-k3 from k4-k6, the distortion is therefore held at the survey's
+all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's
 result in both adjusters, and the comparison says so.
 
 Cameras that share single parameters, for adjusters that know no such sharing.
@@ -37,9 +37,9 @@ from sfm.network import Estimate, Network
 from sfm.runtime.progress import report_step
 
 # The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
-# does not tell whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
+# does not show whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
 MAX_ITERATIONS = 200
-ALPHA = 0.05  # of the chi-square test whether the image points tell two solutions apart, with 1 freedom
+ALPHA = 0.05  # of the chi-square test whether the image points distinguish two solutions, with 1 freedom
 Outcome = Literal["agrees", "fits alike", "differs"]
 
 
@@ -63,7 +63,7 @@ class AdjusterComparison:
     )  # the other's covariances of the points with photographs and cameras held
     # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
     unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
-    better: BetterFit | None = None  # than the survey's own camera, where the compared one has more free
+    better: BetterFit | None = None  # than the camera of the survey, where the compared one has more free
     stopped_early: bool = False  # whether going on from the other's solution leads to the in-house one
 
     @property
@@ -82,7 +82,7 @@ class AdjusterComparison:
 
     @property
     def outcome(self) -> Outcome:
-        """Whether they agree, fit alike (the image points do not tell them apart), or differ."""
+        """Whether they agree, fit alike (the image points do not distinguish them), or differ."""
         if self.agree:
             return "agrees"
         return "fits alike" if self.gap <= chi2_isf(ALPHA, 1) else "differs"
@@ -200,7 +200,7 @@ def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
 
 
 def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
-    """Return the cameras on their own, with what they share held at its value, and what that is, in words.
+    """Return the cameras unshared, with what they share held fixed at its value, and what that is, in words.
 
     COLMAP shares all parameters of a camera among its photographs or none. What several cameras share in
     part, such as one distortion for photographs that differ in c, can only be held at the survey's result.

@@ -1,4 +1,4 @@
-"""Whether the other adjuster's camera fits the image points better than the survey's own, and what to free.
+"""Whether the other adjuster's camera fits the image points better than that of the survey, and what to free.
 
 COLMAP frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
 that has more free than the survey's; that they agree then says nothing about the survey.
@@ -20,7 +20,7 @@ from sfm.distributions import f_isf
 from sfm.network import Estimate, Network
 
 ALPHA = 0.001  # probability of the F-test where both cameras fit alike
-BETTER = 1.1  # times; below it nobody would see the difference in the coordinates
+MIN_RMS_RATIO = 1.1  # times; below it the difference is not seen in the coordinates
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     """Return by how much the camera of the comparison fits better; None where it does not.
 
     Args:
-        survey: adjustment of the survey, with its own cameras.
+        survey: adjustment of the survey, with its cameras.
         network: image points with equal weights, as both adjusters had them.
         compared: the in-house adjustment of that network with the cameras of the comparison.
     """
@@ -56,7 +56,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
         return None
     F = (freer.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
     found = BetterFit(freer.rms_px, compared.rms_px, more)
-    if f_isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
+    if f_isf(ALPHA, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
         return None
     tested = contradicted_parameters(_adjusted(network, freer.estimate, survey.sigma_px, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
@@ -64,7 +64,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
 
 
 def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
-    """Return the parameters that the survey holds and the comparison has free under another name."""
+    """Return the parameters that the survey holds fixed and the comparison has free under another name."""
     names: dict[str, None] = {}
     for ours, theirs in zip(cameras, compared, strict=True):
         free = corresponding_free(theirs, ours.model) & ~ours.free
