@@ -19,7 +19,7 @@ from sfm.conventions import FloatArray
 
 SIX = ir.VectorType(ir.DoubleType(), 6)
 FUSED = ("contract",)
-_intrinsic: Any = extending.intrinsic  # whose own types are those of the code that is generated
+_intrinsic: Any = extending.intrinsic  # whose types are those of the code that is generated
 ALIGNED = 8  # bytes; no more is known of where six numbers lie
 
 

@@ -83,7 +83,7 @@ def factorise(N: FloatArray, L: FloatArray, least: float) -> bool:
 
 @compiled
 def solve_factorised(L: FloatArray, x: FloatArray) -> None:
-    """Solve L L' x = g in place: x holds g, shape (n,), and receives the solution."""
+    """Solve L L' x = g in place: x is g, shape (n,), and receives the solution."""
     n = len(L)
     for i in range(n):
         total = x[i]

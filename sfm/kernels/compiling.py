@@ -26,7 +26,7 @@ def when_compiling(send: Callable[[], None]) -> Iterator[None]:
 
 
 class _First(Listener):
-    """Hears of every kernel, tells of the first."""
+    """Hears of every kernel, reports the first."""
 
     def __init__(self, send: Callable[[], None]) -> None:
         self._send: Callable[[], None] | None = send
@@ -39,4 +39,4 @@ class _First(Listener):
             send()
 
     def on_end(self, event: Event) -> None:
-        """Nothing is told of the end."""
+        """The end is not reported."""

@@ -48,7 +48,7 @@ def cache_folder(module: str) -> str:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function compiled for loops over arrays that it is given; it can make none of its own.
+    """Return a function compiled for loops over arrays that it is given; it can make none itself.
 
     numba counts references of every array that a loop touches; at a few dozen operations for an image point
     the counting would take twice the time of the formula (213 against 47 ns for the collinearity

@@ -19,7 +19,7 @@ TOUCH = 1e-9  # |f| at a turning point over sum |coefficient| below which it cou
 STEPS = 60
 FACTORED = 1e-11  # misfit of the product of the factors over sum |coefficient| that is accepted
 APART = 1e-5  # discriminant of a factor over p^2 + 4 |q| above which its roots are real or complex for sure
-CONVERGED = 1e-9  # relative step; the error after it is its square, or what rounding allows
+MAX_LAST_STEP = 1e-9  # relative step; the error after it is its square, or what rounding allows
 
 
 @checked_arguments(coefficients="5")
@@ -193,7 +193,7 @@ def _bracketed(
         new = x - step
         if slope == 0.0 or new <= low or new >= high:
             new = 0.5 * (low + high)
-        if abs(new - x) <= CONVERGED * abs(x):
+        if abs(new - x) <= MAX_LAST_STEP * abs(x):
             return new
         x = new
     return x

@@ -8,10 +8,9 @@ from sfm.conventions import FloatArray
 from sfm.kernels.cholesky import factorise, solve_factorised
 from sfm.kernels.options import compiled
 
-SINGULAR = 1e-14  # what elimination leaves of a diagonal of 1 below which scaled equations are singular
-SINGULAR_THREE = (
-    1e-13  # determinant over the product of the diagonal below which three equations are singular
-)
+MIN_PIVOT = 1e-14  # what elimination leaves of a diagonal of 1 below which scaled equations are singular
+# Determinant over the product of the diagonal below which three equations are singular.
+SINGULAR_THREE = 1e-13
 
 
 @compiled
@@ -24,7 +23,7 @@ def cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @compiled
 def turn(R: FloatArray, wx: float, wy: float, wz: float, out: FloatArray) -> None:
-    """Fill out = R exp([w]x), a rotation (3, 3) followed by a small one about its own axes (Rodrigues)."""
+    """Fill out = R exp([w]x), a rotation (3, 3) followed by a small one about its axes (Rodrigues)."""
     t2 = wx * wx + wy * wy + wz * wz
     t = np.sqrt(t2)
     if t < 1e-4:
@@ -64,7 +63,7 @@ def solve_scaled(N: FloatArray, n_vector: FloatArray, dx: FloatArray) -> bool:
         for b in range(a + 1):
             L[a, b] = N[a, b] * scale[a] * scale[b]
         dx[a] = n_vector[a] * scale[a]
-    if not factorise(L, L, SINGULAR):
+    if not factorise(L, L, MIN_PIVOT):
         return False
     solve_factorised(L, dx)
     for a in range(m):

@@ -1,4 +1,4 @@
-"""The sources that a module depends on: its own and those of every module of the package that it imports.
+"""The sources that a module depends on: itself and those of every module of the package that it imports.
 
 Expensive results on disk, compiled kernels and measurements of photographs, are kept
 for these sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled

@@ -37,7 +37,7 @@ def set_warm() -> None:
 
 
 def _folder() -> Path:
-    """Where numba keeps what it compiles, or the user's cache where nobody can write there."""
+    """Where numba keeps what it compiles, or the user's cache where that is not writable."""
     return KEPT if os.access(KEPT.parent, os.W_OK) else user_folder("kernels", "notes of compiled kernels")
 
 

@@ -1,4 +1,4 @@
-"""What the EXIF data of a photograph say about its camera and sensor, its time and its place."""
+"""EXIF data of a photograph: its camera and sensor, its time and its place."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PIXEL_MM = (1e-5, 1.0)
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a photograph's file says about its size and camera; None where it is silent."""
+    """Size and camera as the file of a photograph states them; None where it does not."""
 
     size_px: tuple[int, int]
     """width and height as stored, px"""
@@ -116,7 +116,7 @@ def _size_taken(camera: Any) -> tuple[int, int] | None:
 def _pixel_from_exif(
     size: tuple[int, int], camera: Any, focal: float | None, equivalent: float | None
 ) -> tuple[float, float] | None:
-    """Return width and height of a pixel in mm, None if the file does not tell."""
+    """Return width and height of a pixel in mm, None if the file does not state them."""
     unit = _positive(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     unit_mm = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0}.get(unit) if unit else None
     across = _positive(camera.get(ExifTags.Base.FocalPlaneXResolution))

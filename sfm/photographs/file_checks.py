@@ -99,7 +99,7 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
 
 
 def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
-    """Open a header without Pillow's own limit, which is below that of aerial scans."""
+    """Open a header without the limit of Pillow, which is below that of aerial scans."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:

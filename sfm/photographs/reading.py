@@ -15,7 +15,7 @@ from sfm.conventions import AnyArray
 from sfm.errors import PhotographError
 from sfm.photographs.file_checks import opened_header, read_bytes, refuse_bomb, refuse_truncated
 
-# What is wrong with a file is said by PhotographError; OpenCV's warnings on private TIFF tags help nobody.
+# PhotographError states what is wrong with a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 CHANNELS = ("luminance", "red", "green", "blue")
