@@ -215,15 +215,18 @@ def test_what_is_wrong_in_a_survey_made_in_python_is_one_line(wrong: dict[str, o
             lambda: sfm.KnownPoints.from_arrays(["1", "1"], np.zeros((2, 3))),
             "control, row 2: id '1' stands on",
         ),
-        (lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.nan]]), "control, row 1: column Z holds nan"),
+        (
+            lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.nan]]),
+            "row 1: column Z contains nan",
+        ),
         (lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0]]), r"X, Y, Z have the shape \(1, 2\), expected"),
-        (lambda: sfm.KnownPoints.from_arrays(["1"], np.zeros((1, 3)), -1), "column sX holds -1, needed 0"),
+        (lambda: sfm.KnownPoints.from_arrays(["1"], np.zeros((1, 3)), -1), "column sX contains -1, needed 0"),
         (lambda: sfm.Observations.from_arrays(["a"], ["1", "2"], [[1, 2]]), "2 values of point, expected 1"),
         (
             lambda: sfm.Observations.from_arrays(["a"], ["1"], [[1, 2]], unit="m"),
             "unit 'm', expected px or mm",
         ),
-        (lambda: sfm.ObservedExterior.from_arrays(["a"], [[0, 0, 0]], -1), "column sX holds -1"),
+        (lambda: sfm.ObservedExterior.from_arrays(["a"], [[0, 0, 0]], -1), "column sX contains -1"),
         (lambda: sfm.ScaleBar("1", "2", -1.0, 0.1), "scale bar 1 - 2: length -1.0, needed more than 0"),
         (lambda: sfm.Network.from_arrays(["a"], ["1"], [1, 2]), "expected k names, k names and finite"),
         (lambda: sfm.run_survey("s", compare_with="x"), "compare_with 'x', expected one of colmap, none"),
@@ -376,7 +379,7 @@ def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None
     failed = subprocess.run(told, capture_output=True, text=True, check=False)
     last = failed.stderr.strip().splitlines()[-1]
     assert failed.returncode == 1 and "InstallationError" in last
-    assert file in last and "an environment of its own" in last
+    assert file in last and "a separate environment" in last
     command = told[3].replace("import sfm", "sys.argv = ['kolinear', '--help']; import sfm.cli")
     line = subprocess.run([*told[:3], command], capture_output=True, text=True, check=False)
     assert line.returncode == 2 and line.stderr.count("\n") == 1 and line.stderr.startswith("kolinear: ")
@@ -387,7 +390,7 @@ def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None
         text=True,
         check=False,
     )
-    assert line.returncode == 2 and line.stderr.count("\n") == 1 and "of its own" in line.stderr
+    assert line.returncode == 2 and line.stderr.count("\n") == 1 and "a separate environment" in line.stderr
 
 
 READ = "import sfm; print(sfm.read_result(sys.argv[1]).points.xyz.shape[0])"

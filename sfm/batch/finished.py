@@ -1,4 +1,4 @@
-"""Which results were finished by the user's own batches: what `--resume` may keep.
+"""Which results were finished by batches of this user: what `--resume` may keep.
 
 A result that lies in the folder of a batch may have come with the survey, with a log and a manifest that fit.
 So whoever finishes a result notes it in the user's cache folder, by its path and the hash of its manifest,
@@ -19,7 +19,7 @@ from sfm.files.whole_files import whole_file
 
 
 def note_finished(folder: Path) -> None:
-    """Note that a result is the user's own; where there is no room it is computed again at `--resume`."""
+    """Note that a result is by this user; where there is no room it is computed again at `--resume`."""
     with suppress(OSError, OutputError):
         entry = _entry(folder)
         make_user_folder(entry.parents[1])
@@ -41,7 +41,7 @@ def was_finished(folder: Path) -> bool:
 
 
 def remove_old_notes() -> None:
-    """Remove what nobody has asked for in months.
+    """Remove notes not asked for in months.
 
     Raises:
         OutputError: others can write where results are noted.

@@ -119,14 +119,14 @@ def measure_one(
     try:
         with when_compiling(lambda: send({"compiling": True})):
             note = _measure(survey, image, path, store)
-    except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
+    except Exception as error:  # an unforeseen one fails the survey, which comes upon it again
         note = PhotographNote(image, failed=as_plain(error_in_words(error)))
     send({"photograph": image})
     return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
 
 
 def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
-    """Measure what a survey asks for in a photograph, which the store then holds."""
+    """Measure what a survey asks for in a photograph, and keep it in the store."""
     if survey.tie_points is not None:
         natural, stored = natural_points_of(path, survey.tie_points, store)
         return PhotographNote(image, features=len(natural), stored=stored)
@@ -289,7 +289,7 @@ def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
 
 @dataclass(frozen=True)
 class _Sending:
-    """Progress that tells whoever watches the batch which stage begins."""
+    """Progress that reports to the watched batch which stage begins."""
 
     send: Send
 

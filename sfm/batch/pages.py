@@ -48,7 +48,9 @@ def refuse_foreign_pages(out: Path) -> None:
             f"{as_plain(str(out))}: the path has control or invisible characters; needed another --out"
         )
     if not read_manifest(out).keys() <= {MANIFEST, *PAGES}:
-        raise OutputError(f"{out}: the folder holds '{MANIFEST}' of a result, no batch; needed another --out")
+        raise OutputError(
+            f"{out}: the folder contains '{MANIFEST}' of a result, no batch; needed another --out"
+        )
     refuse_foreign_files(out, PAGES)
 
 

@@ -107,7 +107,7 @@ def run_batch(
 
     Raises:
         OutputError: the folder cannot be written, or another run is writing into it.
-        BackendError: there is nobody left to work.
+        BackendError: no worker is left.
     """
     refuse_foreign_pages(Path(out))
     out = Path(os.path.abspath(out))  # it has no links
@@ -215,12 +215,12 @@ def _below(path: Path) -> list[Path]:
 
 
 def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
-    """Read all survey files and give each a folder of its own."""
+    """Read all survey files and give each a separate folder."""
     read: list[tuple[Path, SurveyFile | Exception]] = []
     for file in files:
         try:
             read.append((file, read_survey_file(file, allow_outside=allow_outside)))
-        except Exception as error:  # one that nobody has foreseen fails this survey alone
+        except Exception as error:  # an unforeseen one fails this survey alone
             read.append((file, error))
     names = [_folder_name(file, survey) for file, survey in read]
     often = Counter(name.casefold() for name in names)

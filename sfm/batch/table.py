@@ -25,7 +25,7 @@ COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that stay in sight
 REFRESHES_PER_SECOND = 4
 MEASURING_SHARE = 0.5  # of a survey's time, in small ones; the rest is its adjustment and report
-TELLING_SHARE = 0.05  # of a batch that must be done before it is told how long the rest takes
+MIN_DONE_SHARE = 0.05  # of a batch that must be done before the time left is stated
 
 
 @dataclass
@@ -127,7 +127,7 @@ class BatchTable:
         text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
         if self._failed:
             text += f", {self._failed} failed"
-        if run_share >= TELLING_SHARE and self._left:
+        if run_share >= MIN_DONE_SHARE and self._left:
             text += f", about {_duration((now - self._begun) * (1 / run_share - 1))} left"
         return text
 
@@ -148,9 +148,9 @@ def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None
     console.print(Text(", ".join(parts), "bold"))
     for row in rows:
         if not row.succeeded:
-            told = outcome_of(row) if row.status != "done" else f"{outcome_of(row)}: see its report"
+            outcome = outcome_of(row) if row.status != "done" else f"{outcome_of(row)}: see its report"
             where = "" if row.reason.startswith(row.file) else f" ({row.file})"  # not twice
-            console.print(Text(f"  {row.survey}{where}: {told}", style="red"), soft_wrap=True)
+            console.print(Text(f"  {row.survey}{where}: {outcome}", style="red"), soft_wrap=True)
     console.print(Text(f"Index: {page}", style="bold"), soft_wrap=True)
 
 

@@ -49,7 +49,7 @@ SAME = 1e-6  # relative difference from the standard deviations of the table, wh
 def points_kept_together(names: tuple[str, ...]) -> IntArray:
     """Return the points whose joint covariance is kept: all of up to 1000, a sample of more, in rising order.
 
-    Points with names of their own come first, since another result knows them too; the others are drawn at
+    Points with real names come first, since another result knows them too; the others are drawn at
     random, so that they lie where the points lie.
 
     Args:

@@ -64,7 +64,7 @@ class CsvTable:
         """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
         for k, c in np.argwhere(wrong)[:1]:
             where = f"{self.place(k)}: column {columns[c]}"
-            raise SurveyFileError(f"{where} holds {values[k, c]:g}, needed {needed}")
+            raise SurveyFileError(f"{where} contains {values[k, c]:g}, needed {needed}")
 
     def refuse_duplicates(self, keys: tuple[object, ...], columns: tuple[str, ...]) -> None:
         """Raise SurveyFileError if a key comes twice."""
@@ -264,26 +264,26 @@ def _opened(path: Path) -> TextIO:
 
 
 def _name(cell: str, where: str) -> str:
-    """Return a name; one that is empty, very long or holds characters that nobody sees is refused."""
+    """Return a name; one that is empty, very long or contains invisible characters is refused."""
     name = from_cell(cell.strip())
     if not name:
         raise SurveyFileError(f"{where} is empty, a name is needed")
     if len(name) > MAX_NAME or not is_plain(name):
         raise SurveyFileError(
-            f"{where} holds '{as_plain(name):.60}', needed plain text of at most {MAX_NAME} characters"
+            f"{where} contains '{as_plain(name):.60}', needed plain text of at most {MAX_NAME} characters"
         )
     return sys.intern(name)
 
 
 def _number(cell: str, where: str) -> float:
-    """Return a number as programs write it; Python's own float() takes 1_0 and digits of all scripts, too."""
+    """Return a number as programs write it; Python's float() takes 1_0 and digits of all scripts, too."""
     text = cell.strip()
     try:
         value = float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise SurveyFileError(f"{where} holds {cell!r:.60}, a finite number is needed")
+        raise SurveyFileError(f"{where} contains {cell!r:.60}, a finite number is needed")
     if abs(value) > MAX_NUMBER:
-        raise SurveyFileError(f"{where} holds {text:.60}, needed a number of at most {MAX_NUMBER:g}")
+        raise SurveyFileError(f"{where} contains {text:.60}, needed a number of at most {MAX_NUMBER:g}")
     return value

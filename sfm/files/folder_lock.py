@@ -1,7 +1,7 @@
 """The lock of a folder: one run at a time writes into it, and everybody can read who.
 
-The operating system holds the lock and lets go of it when the process ends, however it ends. So a lock file
-that nobody holds is stale by that alone, and no process number has to be trusted. It lies beside what it
+The operating system keeps the lock and releases it when the process ends, however it ends. So a lock file
+that is free is stale by that alone, and no process number has to be trusted. It lies beside what it
 locks, where the runs of other computers on the same disk see it.
 """
 
@@ -27,7 +27,7 @@ TEXT_AT = 1  # Windows keeps others from reading the locked byte, the first
 
 @dataclass(frozen=True)
 class Owner:
-    """Who holds a lock, or held it when it was left behind."""
+    """The owner of a lock, or the one that left it behind."""
 
     process: int  # number of the process
     computer: str
@@ -49,7 +49,7 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
         The owner of a stale lock that was taken over, a run that was killed; None if there was none.
 
     Raises:
-        FolderInUseError: another run holds the lock.
+        FolderInUseError: another run has the lock.
         OutputError: the file cannot be written, or is no lock.
     """
     try:
@@ -70,7 +70,7 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
         yield before
     finally:
         if ours:
-            os.ftruncate(handle, 0)  # an empty one is nobody's, where an open file cannot be removed
+            os.ftruncate(handle, 0)  # an empty one has no owner, where an open file cannot be removed
             with suppress(OSError):
                 path.unlink()  # while it is still held: whoever waits for it opens a new one
         unlock_descriptor(handle)
@@ -78,7 +78,7 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
 
 
 def owner_of(path: Path) -> Owner | None:
-    """Read who holds the lock file `path`, or has left it behind; None if nobody says so."""
+    """Read who owns the lock file `path`, or has left it behind; None if that is not stated."""
     try:
         handle = open_own(path, os.O_RDONLY)
     except (OSError, OutputError):
@@ -114,7 +114,7 @@ def _write_owner(handle: int) -> None:
 
 
 def _owner(handle: int) -> Owner | None:
-    """Read who holds a lock; None if nobody says so."""
+    """Read who owns a lock; None if that is not stated."""
     try:
         os.lseek(handle, TEXT_AT, os.SEEK_SET)
         found = json.loads(os.read(handle, MAX_OWNER_BYTES))

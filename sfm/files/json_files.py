@@ -74,8 +74,8 @@ def _first_error(path: Path, error: ValidationError, what: str) -> str:
     message = " ".join(first["msg"].split())
     if first["type"] == "json_invalid":
         line = re.search(r" at line (\d+) column \d+$", message)
-        number, told = (line[1], message[: line.start()]) if line else ("1", message)
-        return f"{path}, line {number}: not {what} ({as_plain(told)})"
+        number, reason = (line[1], message[: line.start()]) if line else ("1", message)
+        return f"{path}, line {number}: not {what} ({as_plain(reason)})"
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"]).lstrip(".")
     place = as_plain(place[:MAX_NAME])
     if first["type"] == "missing":

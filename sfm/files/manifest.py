@@ -28,7 +28,7 @@ NAMED = 3  # files that a message names
 def refuse_foreign_folder(out: Path) -> None:
     """Raise OutputError unless a folder is absent, empty, or as Kolinear wrote it, by its manifest.
 
-    It is called before the work starts, too, so that nobody waits for a result that has no place.
+    It is called before the work starts, too, so that no one waits for a result that has no place.
     """
     refuse_links(out)
     try:
@@ -77,7 +77,7 @@ def _foreign(folder: Path, names: Iterable[str]) -> list[str]:
 def _refuse(folder: Path, foreign: list[str], needed: str) -> None:
     if foreign:
         raise OutputError(
-            f"{folder}: the folder holds {listed(foreign, most=NAMED, separator='; ')}; {needed}"
+            f"{folder}: the folder contains {listed(foreign, most=NAMED, separator='; ')}; {needed}"
         )
 
 

@@ -114,7 +114,7 @@ def open_own(path: Path, flags: int) -> int:
 
     Args:
         path: the file.
-        flags: of os.open; what they create is new or the program's own, by the caller's check.
+        flags: of os.open; what they create is new or written by the program, by the caller's check.
 
     Raises:
         OutputError: a link is in the path, or it is no such file.

@@ -25,8 +25,8 @@ MAX_NAME = 500  # characters of a name that is read from a file
 BLOCK = 10_000  # rows that are written at a time
 SHOWN = 40  # characters of what was found that a message repeats
 
-# What nobody sees, or what changes how the text around it is seen: categories Cc, Cf, Cs, Zl and Zp, and all
-# else that is ignored by default.
+# Invisible characters, and those that change how the text around them is seen: categories Cc, Cf, Cs, Zl and
+# Zp, and all else that is ignored by default.
 _HIDDEN = re.compile(
     r"[\x00-\x1f\x7f-\x9f\xad\u034f\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u115f\u1160\u17b4\u17b5"
     r"\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f\u3164\ud800-\udfff\ufe00-\ufe0f\ufeff\uffa0"

@@ -3,7 +3,7 @@
     mounts.csv     camera,rig,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg
     moments.csv    image,moment
 
-Mounts are in the image axes of the reference camera of the rig, whose own row is 0. A standard deviation of 0
+Mounts are in the image axes of the reference camera of the rig, whose row is 0. A standard deviation of 0
 means held fixed, an empty cell adjusted and not known. Photographs that moments.csv does not name are alone.
 
 Source: RFC 4180 for CSV.

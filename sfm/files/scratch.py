@@ -40,7 +40,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def remove_abandoned() -> None:
-    """Remove this user's scratch folders whose run has ended: nobody holds their lock."""
+    """Remove this user's scratch folders whose run has ended: their lock is free."""
     for folder in Path(tempfile.gettempdir()).resolve().glob(f"{PREFIX}*"):
         with suppress(OSError, OutputError):  # another user's, or at work
             status = folder.lstat()

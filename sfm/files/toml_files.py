@@ -74,8 +74,8 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
     except tomllib.TOMLDecodeError as error:
         raise SurveyFileError(f"{path}{_slip(text, str(error), repeated)}") from error
     except (ValueError, RecursionError) as error:
-        told = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
-        raise SurveyFileError(f"{path}: not a TOML file: {told}") from error
+        reason = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
+        raise SurveyFileError(f"{path}: not a TOML file: {reason}") from error
 
 
 def _slip(text: str, message: str, repeated: Collection[str]) -> str:

@@ -1,4 +1,4 @@
-"""Folders in the user's cache: what the program may believe later lies here, where nobody else can write.
+"""Folders in the user's cache: files that the program may trust later lie here, where no one else can write.
 
 They may be removed at any time.
 """
@@ -16,7 +16,7 @@ from platformdirs import user_cache_path
 
 from sfm.errors import OutputError
 
-KEPT_SECONDS = 90 * 86400  # entries that nobody has asked for are removed then
+KEPT_SECONDS = 90 * 86400  # entries not asked for are removed then
 WRITING_SECONDS = 86400  # what is half-written for longer was left by a killed run
 
 
@@ -53,7 +53,7 @@ def make_user_folder(folder: Path) -> None:
 
 
 def remove_unused(folder: Path) -> None:
-    """Remove entries that nobody has asked for in months, and what a killed run left half-written."""
+    """Remove entries not asked for in months, and what a killed run left half-written."""
     now = time.time()
     for path in folder.glob("*/*"):
         with suppress(OSError):

@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all, and never by way of a link that somebody has laid there.
 
 New files are made under unpredictable names and moved to their place by one rename, which
-follows no link. What is there already is replaced only where it is known as the program's own.
+follows no link. What is there already is replaced only where it is known to be written by the program.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
 def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterator[Path]:
     """Give a file to write, which is at `path` when it is finished.
 
-    It lies in a folder of its own, so that what a library leaves beside its file goes with it.
+    It lies in a separate folder, so that what a library leaves beside its file goes with it.
 
     Args:
         path: the file.
         what: what is written, for the message, if the path alone does not say it.
-        replaces: whether the caller knows an earlier file to be the program's own, which is replaced.
+        replaces: whether the caller knows an earlier file to be written by the program, which is replaced.
 
     Yields:
         Path of the file to write.
@@ -152,7 +152,7 @@ def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
 def remove_leftovers(out: Path) -> None:
     """Remove what killed runs have left beside a place, and restore what they had moved away.
 
-    Only for who knows that nobody is writing there, by a lock.
+    Only for a caller whose lock shows that no one is writing there.
     """
     ours = re.compile(rf"\.{re.escape(out.name)}{RANDOM}(old|part)")
     if not out.parent.is_dir():
@@ -180,7 +180,7 @@ def refuse_full(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class _Part:
-    """A new folder under a name that nobody can know before, and the folder it lies in."""
+    """A new folder under a name that cannot be known before, and the folder it lies in."""
 
     path: Path
     handle: int | None  # of it; None where the system has none
@@ -212,7 +212,7 @@ def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
 
 @contextmanager
 def _naming_disk_errors(out: Path, part: Path, what: str) -> Iterator[None]:
-    """Let errors speak of `out`, not of a part of it that nobody will find."""
+    """Let errors speak of `out`, not of a part of it that will not be found."""
     try:
         yield
     except OSError as error:

@@ -71,5 +71,5 @@ class Engine(Protocol):
         dropped.
 
         Raises:
-            BackendError: there is nobody left to work.
+            BackendError: no worker is left.
         """

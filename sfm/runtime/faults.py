@@ -22,12 +22,12 @@ FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h
 OPENCV_NO_MEMORY = -4  # cv::Error::StsNoMem
 # The C library on a shared library that finds no room (dlopen), and Python on a thread without a stack.
 NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
-MAX_LETTERS = 200  # of an error's own message
+MAX_LETTERS = 200  # of the message of an error
 
 
 @contextmanager
 def working_on(what: str) -> Iterator[None]:
-    """Note on errors that nobody has foreseen what was at work; the innermost comes first."""
+    """Note on unforeseen errors what was at work; the innermost comes first."""
     try:
         yield
     except KolinearError:
@@ -54,18 +54,18 @@ def error_in_words(error: Exception) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     kind = type(error).__name__
-    told = kind if message == kind else f"{kind}: {message}"
-    return f"a fault of Kolinear: {told}{place}{f', at {at_work}' if at_work else ''}"
+    text = kind if message == kind else f"{kind}: {message}"
+    return f"a fault of Kolinear: {text}{place}{f', at {at_work}' if at_work else ''}"
 
 
 def ending_of(error: Exception) -> tuple[str, int]:
     """Return the line that a program ends with, and its exit code; the traceback of a fault is kept."""
-    told = error_in_words(error)
+    text = error_in_words(error)
     if not is_fault(error):
-        return told, BAD_INPUT
+        return text, BAD_INPUT
     path = keep_traceback(error)
     where = "its traceback cannot be written" if path is None else f"its traceback is in {path}"
-    return f"{told}; {where}", FAULT
+    return f"{text}; {where}", FAULT
 
 
 def keep_traceback(error: Exception) -> Path | None:

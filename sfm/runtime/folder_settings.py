@@ -21,11 +21,11 @@ MODULES, SAFE_PATH = "PYTHONPATH", "PYTHONSAFEPATH"
 
 
 def refuse_folder_settings() -> None:
-    """Raise KolinearError where the current folder holds settings of a library; before any is imported."""
+    """Raise KolinearError where the current folder contains settings of a library; before any is imported."""
     for name in SETTINGS:
         if os.path.lexists(name):
             raise KolinearError(
-                f"the current folder, {os.getcwd()}, holds '{name}', by which it would decide what is "
+                f"the current folder, {os.getcwd()}, contains '{name}', by which it would decide what is "
                 "computed or run; start Kolinear from another folder, or remove the file"
             )
 

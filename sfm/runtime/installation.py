@@ -33,7 +33,7 @@ def refuse_mixed_installation(root: str | None = None) -> None:
             name = os.path.dirname(file)
             line = (
                 f"{path}: a file of another project, whose package is called {name} too; install Kolinear "
-                "into an environment of its own"
+                "into a separate environment"
             )
             if os.path.basename(sys.argv[0]) in COMMANDS:
                 print(f"kolinear: {line}", file=sys.stderr)

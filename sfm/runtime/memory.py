@@ -38,7 +38,7 @@ def keep_freed_memory() -> None:
 
     glibc decides so by the largest block that has been freed, up to that limit; this one is never written to
     and takes no memory. The first photograph that is freed has the same effect. Where the environment sets
-    MALLOC_TRIM_THRESHOLD_, as for the workers of a batch, that holds.
+    MALLOC_TRIM_THRESHOLD_, as for the workers of a batch, that applies.
     """
     bytes(LARGEST_KEPT)
 

@@ -23,7 +23,7 @@ class Progress(Protocol):
     """Interface that a run reports its progress to; implementations draw it, count it or ignore it."""
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """A stage of that name begins; `total` steps will be announced, None if nobody knows."""
+        """A stage of that name begins; `total` steps will be announced, None if unknown."""
 
     def advance(self, step: str = "") -> None:
         """One step of the stage, such as a photograph of that name, is done."""
@@ -33,7 +33,7 @@ class Progress(Protocol):
 
 
 class Silent:
-    """Progress that nobody watches."""
+    """Progress that is not shown."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Take note of nothing."""
@@ -81,7 +81,7 @@ class StageClock:
     def stage(self, name: str, total: int | None = None) -> Iterator[None]:
         """Announce a stage and how many steps it has, if that is known, and time what is done in it.
 
-        What it has freed is given back to the system at its end.
+        Memory that it has freed is given back to the system at its end.
         """
         self.progress.stage(name, total)
         begun = time.perf_counter()

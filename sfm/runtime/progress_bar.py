@@ -73,7 +73,7 @@ class Drawn:
 
 
 class _Counted(ProgressColumn):
-    """Parts done of all; nothing where nobody knows how many there are."""
+    """Parts done of all; nothing where their number is not known."""
 
     def render(self, task: Task) -> Text:
         """Return what is written."""

@@ -255,10 +255,10 @@ def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...
     ):
         run_batch(surveys, tmp_path / os.fsdecode(b"a\xff"), HERE, ALONE, Notes())
     (tmp_path / "index.html").write_text("my own", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"holds 'index.html'; which would be replaced"):
+    with pytest.raises(OutputError, match=r"contains 'index.html'; which would be replaced"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     (tmp_path / "batch.json").write_text("[]", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"holds 'batch.json'; 'index.html'; which would"):
+    with pytest.raises(OutputError, match=r"contains 'batch.json'; 'index.html'; which would"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["batch.json", "index.html"]
 

@@ -207,7 +207,7 @@ def test_a_second_run_replaces_the_first_and_nothing_else(
     out.mkdir()
     (out / "thesis.doc").touch()
     line = refused(monkeypatch, capsys, "run", survey, "--out", out)
-    assert "holds 'thesis.doc'" in line
+    assert "contains 'thesis.doc'" in line
     assert list(out.iterdir()) == [out / "thesis.doc"]
 
 

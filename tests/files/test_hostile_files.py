@@ -188,7 +188,7 @@ def test_a_database_that_computes_its_tables_is_refused(database: Path, computed
     connection.commit()
     connection.close()
     begun = time.process_time()
-    with pytest.raises(SurveyFileError, match=r"images is computed, needed a table that holds it"):
+    with pytest.raises(SurveyFileError, match=r"images is computed, needed a table that contains it"):
         read_database(database)
     assert time.process_time() - begun < SECONDS
 

@@ -79,7 +79,7 @@ def test_hidden_characters_are_those_of_unicode() -> None:
 def test_hidden_characters_are_refused_in_names(tmp_path: Path, hidden: str) -> None:
     path = tmp_path / "a.csv"
     path.write_text(f"id,X\na{hidden}b,1\n", encoding="utf-8", newline="")
-    with pytest.raises(SurveyFileError, match=r"line [23]: (column id holds|[12] columns)"):
+    with pytest.raises(SurveyFileError, match=r"line [23]: (column id contains|[12] columns)"):
         read_table(path, ("id",), ("X",))
     escaped = f"\\U{ord(hidden):08x}"
     for text in (

@@ -134,10 +134,10 @@ def test_a_scale_from_what_is_tested_is_refused() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("line,from,to,length\n1,a,b,0\n", "line 2: column length holds 0, needed more than 0"),
+        ("line,from,to,length\n1,a,b,0\n", "line 2: column length contains 0, needed more than 0"),
         ("line,from,to,length\n1,a,a,5\n", "line 2: both ends are point a, two points are needed"),
         ("line,from,to,length\n1,a,b,5\n2,b,a,5\n", "line 3: from 'a', to 'b' stands on line 2 already"),
-        ("line,from,to,length,sigma\n1,a,b,5,-1\n", "column sigma holds -1, needed more than 0"),
+        ("line,from,to,length,sigma\n1,a,b,5,-1\n", "column sigma contains -1, needed more than 0"),
         ("from,to,length\na,b,5\n", "no column line, needed line,from,to,length"),
     ],
 )

@@ -94,7 +94,7 @@ def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     write_page(validation, tmp_path / "out")
     write_page(validation, tmp_path / "out")  # an earlier one is replaced
     (tmp_path / "out" / "mine.txt").write_text("keep")
-    with pytest.raises(OutputError, match=r"holds 'mine\.txt'"):
+    with pytest.raises(OutputError, match=r"contains 'mine\.txt'"):
         write_page(validation, tmp_path / "out")
     assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
     with pytest.raises(OutputError, match="a file has this name"):

@@ -598,10 +598,10 @@ def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a file has this name"):
         refuse_foreign_folder(tmp_path / "file")
-    with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
+    with pytest.raises(OutputError, match="the folder contains 'file'; --out needs a new or empty folder"):
         refuse_foreign_folder(tmp_path)
     (tmp_path / "file").rename(tmp_path / "summary.json")
-    with pytest.raises(OutputError, match=r"holds 'summary.json'; --out needs"):
+    with pytest.raises(OutputError, match=r"contains 'summary.json'; --out needs"):
         refuse_foreign_folder(tmp_path)
 
 

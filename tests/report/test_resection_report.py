@@ -136,7 +136,7 @@ def test_bad_files(tmp_path, four):
     refused("a.csv, line 1: no column Z, needed point,X,Y,Z,x_mm,y_mm", path=tmp_path / "a.csv", c_mm=24)
     (tmp_path / "b.csv").write_text("point,X,Y,Z,x_mm,y_mm\n1,2,3,four,5,6\n")
     refused(
-        "b.csv, line 2: column Z holds 'four', a finite number is needed", path=tmp_path / "b.csv", c_mm=24
+        "b.csv, line 2: column Z contains 'four', a finite number is needed", path=tmp_path / "b.csv", c_mm=24
     )
     (tmp_path / "c.csv").write_text("point,X,Y,Z,x_mm,y_mm\n")
     refused("c.csv: no rows below the header", path=tmp_path / "c.csv", c_mm=24)

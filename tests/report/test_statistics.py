@@ -34,7 +34,7 @@ from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.checks import (
-    LISTED,
+    MAX_LISTED,
     count_observations,
     largest_residuals,
     longest_residual,
@@ -618,7 +618,7 @@ def test_statistics_are_shown_and_written(synthetic: tuple[Network, Estimate]) -
         "remarks": [],
     }
     worst = largest_residuals(a)
-    assert len(worst) == LISTED == 10
+    assert len(worst) == MAX_LISTED == 10
     w = np.abs(np.where(a.rejected[:, None], 0, a.standardised))
     assert abs(worst[0][4]) == w.max()
     np.testing.assert_array_equal(np.sort(w.max(axis=1))[::-1][:10], [abs(one[4]) for one in worst])

@@ -213,7 +213,7 @@ def test_table_of_diameters(tmp_path: Path) -> None:
     assert names == ("7", "u001")
     assert diameter.tolist() == [12.5, 3.0]
     for text, message in (
-        ("id,diameter\n7,-1\n", "column diameter holds -1, needed more than 0"),
+        ("id,diameter\n7,-1\n", "column diameter contains -1, needed more than 0"),
         ("id,diameter\n7,1\n7,2\n", "7"),
         ("id,size\n7,1\n", "diameter"),
     ):

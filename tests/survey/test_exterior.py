@@ -281,9 +281,9 @@ def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        (CENTRES + "image 1,nan,2,3,1,1,1\n", r"line 2: column X holds 'nan', a finite number is needed"),
-        (CENTRES + "image 1,1,2,3,1,inf,1\n", r"line 2: column sY holds 'inf', a finite number is needed"),
-        (CENTRES + "image 1,1,2,3,1,-1,1\n", r"line 2: column sY holds -1, needed 0 \(fixed\) or more"),
+        (CENTRES + "image 1,nan,2,3,1,1,1\n", r"line 2: column X contains 'nan', a finite number is needed"),
+        (CENTRES + "image 1,1,2,3,1,inf,1\n", r"line 2: column sY contains 'inf', a finite number is needed"),
+        (CENTRES + "image 1,1,2,3,1,-1,1\n", r"line 2: column sY contains -1, needed 0 \(fixed\) or more"),
         (CENTRES + "image 1,1,2,3,1,,1\n", r"line 2: column sY is empty beside a value in Y; needed both"),
         (CENTRES + "image 1,1,,3,1,1,1\n", r"line 2: column Y is empty beside a value in sY; needed both"),
         (CENTRES + "image 1,0,0,0,1,1,1\nimage 1,1,1,1,1,1,1\n", r"line 3: image 'image 1' stands on line 2"),
@@ -293,17 +293,20 @@ def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> No
         ),
         (
             CENTRES + "image 1,0,0,0,1,1,1\nimage 2,5000,1,1,1e-3,1,1\n",
-            r"line 3: column sX holds 0.001, needed at least 0.005",
+            r"line 3: column sX contains 0.001, needed at least 0.005",
         ),
         ("image,X,Y\nimage 1,0,0\n", r"line 1: no column Z, needed image,X,Y,Z\[,sX,sY,sZ,omega_deg,"),
         ("image,X,Y,Z,height\n", r"line 1: unknown column 'height', needed image,X,Y,Z\[,sX"),
-        (WHOLE + "image 1,,,,,,,0,0,400,1,1,1\n", r"line 2: column kappa_deg holds 400, needed degrees"),
-        (WHOLE + "image 1,,,,,,,0,90,0,1,1,1\n", r"line 2: column phi_deg holds 90, needed another than"),
+        (WHOLE + "image 1,,,,,,,0,0,400,1,1,1\n", r"line 2: column kappa_deg contains 400, needed degrees"),
+        (WHOLE + "image 1,,,,,,,0,90,0,1,1,1\n", r"line 2: column phi_deg contains 90, needed another than"),
         (
             WHOLE + "image 1,,,,,,,0,0,0,1,0,1\n",
-            r"line 2: column sphi_deg holds 0, needed omega, phi, kappa fix",
+            r"line 2: column sphi_deg contains 0, needed omega, phi, kappa fix",
         ),
-        (WHOLE + "image 1,,,,,,,0,0,0,1,1e-12,1\n", r"line 2: column sphi_deg holds 1e-12, needed at least"),
+        (
+            WHOLE + "image 1,,,,,,,0,0,0,1,1e-12,1\n",
+            r"line 2: column sphi_deg contains 1e-12, needed at",
+        ),
     ],
 )
 def test_wrong_tables_are_refused_with_line_and_column(tmp_path: Path, text: str, match: str) -> None:

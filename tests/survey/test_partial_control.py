@@ -67,7 +67,7 @@ def test_a_wrong_height_is_found(tmp_path: Path) -> None:
     ("row", "message"),
     [
         ("1,,,,,,", "at least one coordinate"),
-        ("1,1.0,2.0,3.0,,0.1,0.1", "column sX holds nan, needed a number where the coordinate is given"),
+        ("1,1.0,2.0,3.0,,0.1,0.1", "column sX contains nan, needed a number where the coordinate is given"),
     ],
 )
 def test_control_without_sense_is_refused(row: str, message: str, tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_covariances_of_control_are_weights(tmp_path: Path) -> None:
         "id,X,Y,Z,sX,sY,sZ,cXY,cXZ,cYZ\n1,0,0,0,0.1,0.2,0.1,0.01,,\n2,1,1,1,0.1,0.1,0.1,,,\n",
     )
     np.testing.assert_allclose(control.covariance[0, 0], [0.01, 0.01, 0.0])
-    with pytest.raises(SurveyFileError, match=r"column cXY holds 0\.03, needed a correlation below 1"):
+    with pytest.raises(SurveyFileError, match=r"column cXY contains 0\.03, needed a correlation below 1"):
         _control(
             tmp_path / "control.csv",
             "id,X,Y,Z,sX,sY,sZ,cXY,cXZ,cYZ\n1,0,0,0,0.1,0.2,0.1,0.03,,\n2,1,1,1,0.1,0.1,0.1,,,\n",
@@ -159,7 +159,10 @@ def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("row", "message"),
-    [("1,0,0,,1,1,,,,1", "checkZ holds 1"), ("1,0,0,0,1,1,1,2,,", "column checkX holds 2, needed 0, 1")],
+    [
+        ("1,0,0,,1,1,,,,1", "checkZ contains 1"),
+        ("1,0,0,0,1,1,1,2,,", "column checkX contains 2, needed 0,"),
+    ],
 )
 def test_checks_without_sense_are_refused(row: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match=message):

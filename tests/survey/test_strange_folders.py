@@ -226,7 +226,7 @@ def test_settings_of_libraries_in_the_current_folder_are_refused(
     before = sorted(tmp_path.rglob("*"))
     assert kolinear(monkeypatch, *arguments) == 2
     told = capsys.readouterr().err
-    assert told.count("\n") == 1 and f"holds '{name}', by which it would decide" in told
+    assert told.count("\n") == 1 and f"contains '{name}', by which it would decide" in told
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -385,7 +385,15 @@ def test_no_command_writes_through_a_link(
 
 SHARED = ("out", "new", "out/batch", "out/batch/logs")  # folders that may hold other files, too
 LATER = (("render", "new/a", "folder"), ("refine", "new", "file"))  # beside it; photographs come before it
-NAMED = ("is there already", "cannot be", "holds '", "left alone", "exists", "has this name", "is a folder")
+NAMED = (
+    "is there already",
+    "cannot be",
+    "contains '",
+    "left alone",
+    "exists",
+    "has this name",
+    "is a folder",
+)
 
 
 @pytest.mark.parametrize(
@@ -450,7 +458,7 @@ def test_photographs_that_were_rendered_are_replaced_and_no_others(
     before = content(out)
     (out / "p1.jpg").write_text(OWN)
     assert kolinear(monkeypatch, "render", scene(tmp_path), out) == 2
-    assert "holds 'p1.jpg', changed since Kolinear wrote it; " in capsys.readouterr().err
+    assert "contains 'p1.jpg', changed since Kolinear wrote it; " in capsys.readouterr().err
     assert content(out) == {**before, "p1.jpg": OWN.encode()}
     assert (out / "survey.toml").read_text() == OWN
 
@@ -535,13 +543,13 @@ def result(adjusted: Path, tmp_path: Path) -> tuple[Path, Path]:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("plots/mine.png", "holds 'plots/mine.png'; "),
-        ("overlays/notes/mine.jpg", "holds 'overlays/notes/mine.jpg'; "),
-        ("colmap/project.ini", "holds 'colmap/project.ini'; "),
-        ("points.csv", "holds 'points.csv', changed since Kolinear wrote it; "),
-        ("report.html", "holds 'report.html', changed since Kolinear wrote it; "),
-        ("manifest.json", "holds 'cameras.csv'; 'colmap/cameras.bin'; "),
-        ("link", "holds 'link'; "),
+        ("plots/mine.png", "contains 'plots/mine.png'; "),
+        ("overlays/notes/mine.jpg", "contains 'overlays/notes/mine.jpg'; "),
+        ("colmap/project.ini", "contains 'colmap/project.ini'; "),
+        ("points.csv", "contains 'points.csv', changed since Kolinear wrote it; "),
+        ("report.html", "contains 'report.html', changed since Kolinear wrote it; "),
+        ("manifest.json", "contains 'cameras.csv'; 'colmap/cameras.bin'; "),
+        ("link", "contains 'link'; "),
     ],
 )
 def test_files_of_the_user_in_a_result_are_kept_and_named(
@@ -589,7 +597,7 @@ def test_a_result_folder_of_a_stranger_is_left_alone(
     (out / "summary.json").write_text(json.dumps(summary))
     (out / "plots" / "holiday.png").write_text(OWN)
     assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 2
-    assert "holds 'plots/holiday.png'; 'summary.json'; " in capsys.readouterr().err
+    assert "contains 'plots/holiday.png'; 'summary.json'; " in capsys.readouterr().err
     assert (out / "plots" / "holiday.png").read_text() == OWN
 
 

@@ -434,15 +434,18 @@ GOOD = "image,point,x_px,y_px\n1,a,10,20\n"
         ),
         (GOOD.replace("y_px", "x_px"), r"line 1: column 'x_px' is a duplicate"),
         (GOOD.replace("y_px", "y_px,sx_px").replace("20", "20,1"), r"line 1: no column sy_px"),
-        (GOOD + "1,b,nan,3\n", r"line 3: column x_px holds 'nan', a finite number is needed"),
-        (GOOD + "1,b,1,1e999\n", r"line 3: column y_px holds '1e999'"),
-        (GOOD + "1,b,1,2px\n", r"line 3: column y_px holds '2px'"),
+        (GOOD + "1,b,nan,3\n", r"line 3: column x_px contains 'nan', a finite number is needed"),
+        (GOOD + "1,b,1,1e999\n", r"line 3: column y_px contains '1e999'"),
+        (GOOD + "1,b,1,2px\n", r"line 3: column y_px contains '2px'"),
         (GOOD + "1,b,1\n", r"line 3: 3 columns, the header has 4"),
         (GOOD + "1,,1,2\n", r"line 3: column point is empty"),
         ("image,point,x_px,y_px\n", r"no rows below the header"),
-        ("image,point,x_px,y_px,sx_px,sy_px\n1,a,1,2,0.1,0\n", r"column sy_px holds 0, needed more than 0"),
+        (
+            "image,point,x_px,y_px,sx_px,sy_px\n1,a,1,2,0.1,0\n",
+            r"column sy_px contains 0, needed more",
+        ),
         ('image,point,x_px,y_px\n"1,a,10,20\n', r"line 2|columns"),
-        ("image,point,x_px,y_px\n1,a\x00,1,2\n", r"line 2: column point holds 'a\\x00', needed plain"),
+        ("image,point,x_px,y_px\n1,a\x00,1,2\n", r"line 2: column point contains 'a\\x00', needed plain"),
     ],
 )
 def test_bad_tables_are_named_with_their_line(tmp_path: Path, table: str, match: str) -> None:
@@ -456,7 +459,7 @@ def test_bad_control_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n')
     for table, match in (
         ("id,X,Y,Z\n1,0,0,0\n1,1,1,1\n", "line 3: id '1' stands on line 2 already"),
-        ("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,0,-1,0\n", r"column sY holds -1, needed 0 \(fixed\) or more"),
+        ("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,0,-1,0\n", r"column sY contains -1, needed 0 \(fixed\) or more"),
         ("id,X,Y\n1,0,0\n", "no column Z"),
     ):
         (tmp_path / "control.csv").write_text(table, encoding="utf-8")
