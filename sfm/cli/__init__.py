@@ -26,7 +26,7 @@ BAD_INPUT = 2  # exit code where a person must put something right
 def main() -> None:
     """Run the command line; every error is one line.
 
-    Exit code 2 stands for what a person can put right, 70 for what nobody has foreseen.
+    Exit code 2 means something that a person can put right, 70 an unforeseen error.
     """
     guard_outlets()
     try:
@@ -95,7 +95,7 @@ def _decimal_comma(error: Any, arguments: Sequence[str]) -> str:
 
 
 def _report_fault(error: Exception) -> None:
-    """End with one line about what nobody has foreseen; not enough memory is something to put right."""
+    """End with one line about an unforeseen error; not enough memory is something to put right."""
     from sfm.runtime.faults import ending_of
 
     message, code = ending_of(error)

@@ -112,9 +112,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
-    told = describe_precision(typical, largest, result.length_unit)
+    text = describe_precision(typical, largest, result.length_unit)
     if not math.isfinite(typical):
-        told = "all coordinates are fixed" if precision.fixed_points else "not known"
+        text = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
         *_cameras(findings),
         *describe_rigs(findings.rigs, findings.result.length_unit),
@@ -135,7 +135,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     if a.error_correlation is not None:
         rows.append(("correlation", describe_neighbours(a)))
     if not findings.calibrated:
-        rows.append(("point precision", told))
+        rows.append(("point precision", text))
     if result.control_check is not None:
         rows.append(("check at control", describe_check(result.control_check, result.length_unit)))
     both = result.comparison

@@ -7,11 +7,11 @@ import os
 import sys
 from typing import Any, TextIO
 
-READER_GONE = 141  # exit code; 128 + SIGPIPE, as a shell tells it of other programs
+READER_GONE = 141  # exit code; 128 + SIGPIPE, as a shell reports it of other programs
 
 
 def guard_outlets() -> None:
-    """Make stdout and stderr bear what comes before them and after them.
+    """Make stdout and stderr tolerate readers that end and names that they cannot encode.
 
     A reader of stdout that ends, as `head` does, ends the program quietly; one of stderr ends nothing. Lines
     of both have their order where both go to one file or pipe.

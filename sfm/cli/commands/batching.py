@@ -72,13 +72,13 @@ def batch(
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run many surveys side by side, each to its own report.
+    """Run many surveys side by side, each with its report.
 
     One table lists them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one met
     a fault of the program; 2 where a person must put something right.
     """
     if cluster is not None and jobs is not None:
-        raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")
+        raise KolinearError("--jobs is for processes on this computer, --cluster brings its workers")
     with loading():
         from rich.console import Console
 
@@ -128,7 +128,7 @@ def batch_engine(
 
     Args:
         busy: returns how many calls can run at a time at most; more workers would wait for nothing.
-        jobs: workers on this computer; as many as it bears if not given.
+        jobs: workers on this computer; as many as its cores and memory allow if not given.
         cluster: address of a Dask scheduler in place of them.
         send: receives one line where surveys run one after the other, and why.
 
@@ -199,7 +199,7 @@ def in_process_engine() -> Iterator[InProcess]:
 
 
 def _called(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:
-    """Return what a call returns and what it has told.
+    """Return what a call returns and what it has reported.
 
     BLAS is held to one thread as in a worker: sums of several threads differ in the last bit.
     """

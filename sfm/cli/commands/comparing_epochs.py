@@ -47,7 +47,7 @@ def epochs(
     alpha: Annotated[
         float,
         typer.Option(
-            "--alpha", min=1e-6, max=0.5, help="Probability of saying that something moved where nothing did."
+            "--alpha", min=1e-6, max=0.5, help="Probability of reporting a movement where nothing moved."
         ),
     ] = 0.05,
     together: Annotated[

@@ -1,4 +1,4 @@
-"""Command about surveys that nobody has described yet: a survey file drafted from photographs."""
+"""Command about surveys without a survey file: one is drafted from photographs."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def _draft(photographs: Path, pitch: float | None = None) -> Draft:
 
 
 def _write(draft: Draft, photographs: Path, file: Path) -> None:
-    """Write a drafted survey with the folder of its photographs, and tell on stderr what was found."""
+    """Write a drafted survey with the folder of its photographs, and report on stderr what was found."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.remarks.verdict import lines_of

@@ -34,7 +34,7 @@ def measure(
         "out/measurement"
     ),
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format of RESULT; else by what is there.")
+        str | None, typer.Option("--from", metavar="F", help="Format of RESULT; by default from its content.")
     ] = None,
     outside: Annotated[
         bool, typer.Option("--allow-outside", help="Let the features file name files outside its folder.")
@@ -73,8 +73,8 @@ def measure(
         print(f"{what}form error {fit.form_error:.3g} {found.unit}, {counted(fit.used.sum(), 'point')}")
     rows = quantity_table(found).rows
     for name, what, _, _, value, sigma, unit, remark in rows[:MAX_PRINTED]:
-        told = f"{name} ({what}): {value} +- {sigma} {unit}"
-        print(f"{told}{f'; {remark}' if remark else ''}")
+        line = f"{name} ({what}): {value} +- {sigma} {unit}"
+        print(f"{line}{f'; {remark}' if remark else ''}")
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
     print(f"Report: {page}")
@@ -86,9 +86,9 @@ def accept(
         Path, typer.Argument(metavar="LENGTHS.csv", help="Calibrated lengths: line,from,to,length[,sigma].")
     ],
     a: Annotated[float, typer.Option("--limit-a", metavar="A", help="A of the limit A + K L, object unit.")],
-    k: Annotated[float, typer.Option("--limit-k", metavar="K", help="K of it, such as 2e-5.")] = 0.0,
+    k: Annotated[float, typer.Option("--limit-k", metavar="K", help="K of the limit, such as 2e-5.")] = 0.0,
     b: Annotated[
-        float | None, typer.Option("--limit-b", metavar="B", help="What the limit is at most, object unit.")
+        float | None, typer.Option("--limit-b", metavar="B", help="Largest value of the limit, object unit.")
     ] = None,
     coverage: Annotated[
         float, typer.Option("--coverage", metavar="k", min=1.0, help="k of U = k sigma of the calibration.")

@@ -60,7 +60,7 @@ def match_command(
         picture: PNG file that gets template, matched patch and their difference.
 
     Returns:
-        What the command line prints, and whether any point was matched.
+        The text that the command line prints, and whether any point was matched.
 
     Raises:
         KolinearError: unreadable photographs, points or table, even windows, or files that cannot be written.

@@ -252,7 +252,7 @@ def _numbers(text: str) -> IntArray:
         begin, end = int(first), int(last if dash else first)
         if end < begin or end - begin >= MAX_TARGETS or len(numbers) + end - begin >= MAX_TARGETS:
             raise SurveyFileError(
-                f"--ids {text}: '{part}' must run upwards, and a sheet holds at most {MAX_TARGETS} targets"
+                f"--ids {text}: '{part}' must run upwards, a sheet has at most {MAX_TARGETS} targets"
             )
         numbers += range(begin, end + 1)
     return np.array(numbers, dtype=np.int64)

@@ -190,7 +190,8 @@ def network_command(
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a grey value.")] = 2.0,
     blur: Annotated[float, typer.Option("--blur-px", help="Standard deviation of an edge, px.")] = 0.8,
     incidence: Annotated[
-        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Of a ray to the normal.")
+        float,
+        typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the normal."),
     ] = 60.0,
     f_number: Annotated[
         float | None, typer.Option("--f-number", metavar="N", help="For the depth of field; needs --focus.")
@@ -204,13 +205,13 @@ def network_command(
     ] = None,
     distance: Annotated[
         str | None,
-        typer.Option("--distance", metavar="MIN,MAX", help="Of stations from the nearest point."),
+        typer.Option("--distance", metavar="MIN,MAX", help="Range of stations from points."),
     ] = None,
     space: Annotated[
         str | None,
-        typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Where one can stand."),
+        typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Region of stations."),
     ] = None,
-    floor: Annotated[float | None, typer.Option("--floor", metavar="Z", help="No station is below.")] = None,
+    floor: Annotated[float | None, typer.Option("--floor", metavar="Z", help="Lowest station.")] = None,
     photographs: Annotated[
         int, typer.Option("--photographs", metavar="N", min=4, max=1000, help="Photographs at most.")
     ] = 60,

@@ -62,10 +62,11 @@ def simulate_command(
 def more_command(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
     count: Annotated[
-        int, typer.Option("--photographs", metavar="N", min=1, max=50, help="How many more.")
+        int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new ones.")
     ] = 3,
     incidence: Annotated[
-        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Of a ray to the mean of those there.")
+        float,
+        typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the mean ray."),
     ] = 60.0,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of page and tables.")] = Path(
         "out/more"

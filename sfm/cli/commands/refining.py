@@ -26,7 +26,7 @@ def refine(
         typer.Option(
             "--window",
             metavar="N",
-            help="Side of the windows, odd, 3 to 101 px; 15 or 11, what the surface bears, if not given.",
+            help="Side of the windows, odd, 3 to 101 px; by default 15 or 11, whichever measure better.",
         ),
     ] = None,
     min_correlation: Annotated[

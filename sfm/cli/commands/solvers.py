@@ -52,15 +52,15 @@ def validate(
 
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="What to compare it with.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare it with.")],
     align: Annotated[
-        str, typer.Option("--align", help="points, cameras, control or none: what B is aligned to A by.")
+        str, typer.Option("--align", help="B is aligned to A by points, cameras, control or none.")
     ] = "points",
     control: Annotated[
         str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
     ] = "",
     a_format: Annotated[
-        str | None, typer.Option("--from-a", metavar="F", help="Format of A; else by what is there.")
+        str | None, typer.Option("--from-a", metavar="F", help="Format of A; by default from its content.")
     ] = None,
     b_format: Annotated[str | None, typer.Option("--from-b", metavar="F", help="Format of B.")] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
@@ -115,11 +115,11 @@ def convert(
         ),
     ] = None,
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
+        str | None, typer.Option("--from", metavar="F", help="Format to read; by default from its content.")
     ] = None,
     straighten: Annotated[
         bool,
-        typer.Option("--undistort", help="Correct image points for distortion: for formats that hold none."),
+        typer.Option("--undistort", help="Correct image points for distortion, for formats without it."),
     ] = False,
     control: Annotated[
         Path | None,

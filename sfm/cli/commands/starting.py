@@ -19,8 +19,8 @@ SAME_PRESS_SECONDS = 1.0  # `timeout` sends the signal of one Ctrl-C twice
 
 _running = ExitStack()
 """what lasts as long as the command"""
-_told: list[bool] = []
-"""holds something once somebody listens for compiling"""
+_listening: list[bool] = []
+"""not empty once somebody listens for compiling"""
 
 
 @contextmanager
@@ -28,8 +28,8 @@ def loading() -> Iterator[None]:
     """Import what a command needs, which takes a second.
 
     Ctrl-C ends the program right there, since nothing is begun that could be left half-done: an exception
-    would be swallowed by the machinery of imports, or come out of it as an ImportError. From here on a person
-    is told if kernels are compiled.
+    would be swallowed by the machinery of imports, or come out of it as an ImportError. From here on the
+    compiling of kernels is announced.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:
@@ -54,7 +54,7 @@ def stopped_once() -> Iterator[None]:
         with _running:
             yield
     finally:
-        _told.clear()
+        _listening.clear()
         if signal.getsignal(signal.SIGINT) is _stop:
             signal.signal(signal.SIGINT, before)
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # what is done is done
@@ -79,10 +79,10 @@ def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) 
 
 def _announce_compiling() -> None:
     """Say on stderr when kernels are compiled, for as long as the command runs; numba is loaded."""
-    if "numba" in sys.modules and not _told:
+    if "numba" in sys.modules and not _listening:
         from sfm.kernels.compiling import COMPILING, when_compiling
 
-        _told.append(True)
+        _listening.append(True)
         _running.enter_context(
             when_compiling(lambda: print(f"kolinear: the {COMPILING}", file=sys.stderr, flush=True))
         )

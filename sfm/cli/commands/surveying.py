@@ -61,7 +61,7 @@ PicturesMb = Annotated[
         "--pictures-mb",
         metavar="MB",
         min=0.0,
-        help="What the photographs and crops inside report.html may take; the rest lies in pictures/.",
+        help="Largest size of photographs and crops inside report.html; the rest is in pictures/.",
     ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print more: every photograph and warning.")]
@@ -69,7 +69,7 @@ AllowOutside = Annotated[
     bool,
     typer.Option(
         "--allow-outside",
-        help="Let the survey file name files outside its own folder; only for survey files that you trust.",
+        help="Let the survey file name files outside its folder; only for survey files that you trust.",
     ),
 ]
 
@@ -86,7 +86,7 @@ Weighted = Annotated[
     bool,
     typer.Option(
         "--camera-weighted",
-        help="Adjust what --camera adjusted, with its values and their full covariance as an observation.",
+        help="Adjust the parameters that --camera adjusted, observed with their values and full covariance.",
     ),
 ]
 
@@ -194,7 +194,7 @@ def _run_survey(
     overwrite: bool,
     pictures_mb: float = 0.0,
 ) -> Path:
-    """Run a survey, write and tell its result, return its folder; the command is for photographs or not."""
+    """Run a survey, write and print its result, return its folder; the command is for photographs or not."""
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result

@@ -44,11 +44,11 @@ def view(
         ),
     ] = None,
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format of FOLDER; else by what is there.")
+        str | None, typer.Option("--from", metavar="F", help="Format of FOLDER; by default from its content.")
     ] = None,
     budget: Annotated[
         float,
-        typer.Option("--pictures-mb", metavar="MB", min=0.0, help="What the pictures in the page may take."),
+        typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest size of the pictures."),
     ] = 15.0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
 ) -> None:
