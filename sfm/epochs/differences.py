@@ -1,9 +1,9 @@
 """The differences of two epochs in one frame, with the covariance of all of them together.
 
-Points are recognised by their codes and other names, and what bears a mere number by its place after a robust
-alignment. Q_d = Q_1 + Q_2 - C - C' where both epochs were given the same values: a bar whose length is stated
-wrong makes both epochs wrong alike. With an observation l of standard deviation s and gradient g, an epoch
-moves by Q g / s^2 for a unit of l, so that
+Points are recognised by their codes and other names, and those with a mere number by their place after a
+robust alignment. Q_d = Q_1 + Q_2 - C - C' where both epochs were given the same values: a bar whose length is
+stated wrong makes both epochs wrong alike. With an observation l of standard deviation s and gradient g, an
+epoch moves by Q g / s^2 for a unit of l, so that
 
     C = (Q_1 g_1) (Q_2 g_2)' / (s^2 s01 s02),
 
@@ -48,7 +48,7 @@ class Differences:
     only_first: tuple[str, ...]  # points that the second epoch lacks
     only_second: tuple[str, ...]
     by_place: int  # points recognised by their place
-    untested: tuple[str, ...]  # common points that an epoch holds, or did not keep the covariance of
+    untested: tuple[str, ...]  # common points that an epoch holds fixed, or did not keep the covariance of
     shared: tuple[str, ...]  # given values that both epochs share, in words
     held_alike: tuple[str, ...] = ()  # cameras with the same values held in both
     held_apart: tuple[str, ...] = ()  # with values held in one only, or at others in either
@@ -182,8 +182,8 @@ def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
         if other is not None and abs(other - value) <= SAME * abs(value):
             raise GeometryError(
                 f"{first.name} and {second.name} share the weighted {parameter} of camera {camera}, whose "
-                "error is in both: adjust the epochs together (--together), or let every epoch determine "
-                "its own (free)"
+                "error is in both: adjust the epochs together (--together), or let each epoch "
+                "determine it (free)"
             )
 
 

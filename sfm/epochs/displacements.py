@@ -78,7 +78,7 @@ class Displacements:
 
     @property
     def undecided(self) -> BoolArray:
-        """Points of reference that left the stable set, and did not move by their own test, (n,)."""
+        """Points of reference that left the stable set, and did not move by their separate test, (n,)."""
         return self.reference & ~self.stable & ~self.moved
 
     @property
@@ -148,7 +148,7 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
 def _detectable(found: Congruency, redundancy: int | None) -> FloatArray:
     """Return the smallest displacement of each point that would be found, in its worst direction, (n,).
 
-    A stable point is found by the drop of Omega, another one by its own test in the datum.
+    A stable point is found by the drop of Omega, another one by a separate test in the datum.
     """
     shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(found.level.tolist())}
     variance = point_blocks(found.covariance, 3)

@@ -1,6 +1,6 @@
 """Change of the mounts of a rig between two epochs: T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom.
 
-What both epochs were given alike, as a scale bar, makes the true variance of d smaller than Q_1 + Q_2: the
+Values given alike to both epochs, as a scale bar, make the true variance of d smaller than Q_1 + Q_2: the
 test then finds less, and does not find what is not there.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.

@@ -96,7 +96,7 @@ def analyse_epochs(
     names = tuple(epoch.name for epoch in epochs)
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
-        raise GeometryError(f"epochs: two of them are called '{twice}'; give each a name of its own")
+        raise GeometryError(f"epochs: two of them are called '{twice}'; give each a different name")
 
     cameras: tuple[SharedCamera, ...] = ()
     if together:
@@ -132,7 +132,7 @@ def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch,
             if _matching(found.untested, pattern).any():
                 raise GeometryError(
                     f"epochs: point of reference {pattern} cannot be tested in {epochs[0].name} and "
-                    f"{epochs[1].name}: one holds it as known, or did not keep its covariance with the others"
+                    f"{epochs[1].name}: one has it as known, or did not keep its covariance with the others"
                 )
             lacking = [e.name for e in epochs if not _matching(e.result.network.points, pattern).any()]
             raise GeometryError(

@@ -139,8 +139,7 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
     if not shared:
         raise GeometryError(
             f"epochs together: no camera is in two of them ({_some(tuple(found))}); a camera that took "
-            "several epochs bears one name in their survey files, and has no parameters of its own for each "
-            "photograph"
+            "several epochs needs one name in their survey files, and no parameters per photograph"
         )
     kept = {}
     for name, numbers in shared.items():
@@ -236,7 +235,7 @@ def _network_of(epoch: Epoch) -> Network:
 
 
 def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray) -> None:
-    """Refuse an adjustment that is not the one of the result: other weights, or values nobody has kept."""
+    """Refuse an adjustment that is not the one of the result: other weights, or values that were not kept."""
     stored = epoch.result
     sigma = np.sqrt(np.diagonal(Q).reshape(-1, 3).sum(axis=1))
     moved = np.linalg.norm(a.estimate.points[points] - stored.estimate.points[points], axis=1)
@@ -326,7 +325,7 @@ def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
     return (
         f"epochs together: camera {camera.name} is not the same: T {camera.statistic:.3g}, limit "
         f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "
-        "epochs without --together, each with an interior orientation of its own"
+        "epochs without --together, each with a separate interior orientation"
     )
 
 

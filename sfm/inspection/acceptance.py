@@ -137,7 +137,7 @@ def accept_result(
         a: A of the limit A + K L, object unit.
         k: K of it, a pure number.
         b: what the limit is at most, object unit.
-        bars: "start - end" of the scale bars that gave the scale; None where nobody knows.
+        bars: "start - end" of the scale bars that gave the scale; None where not known.
         control: names of control points that gave it.
         coverage: k of the expanded uncertainty of the calibration.
         diagonal: of the measuring volume, object unit; that of the box around all points if not given.
@@ -167,7 +167,7 @@ def accept_result(
     variance = np.array([points.covariance_between([one])[0, 0] for one in functions])
     error = measured - lengths.length
     limit = np.minimum(a + k * lengths.length, b)
-    # |error| against its own limit of each length: scaled, all limits are 1
+    # |error| against the limit of each length: scaled, all limits are 1
     decision = decide(np.abs(error) / limit, lengths.sigma / limit, -np.inf, 1.0, coverage)
     if diagonal is None:  # of the smaller box: along the axes of the system, or along those of the object
         _, _, principal = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)

@@ -133,7 +133,7 @@ class ToleranceSettings(Section):
 
 
 class MeasureSettings(Section):
-    """[measure]: what holds for all."""
+    """[measure]: settings that apply to all."""
 
     weights: Weights = "network"
     coverage: Coverage = 2.0
@@ -194,7 +194,7 @@ def read_features_file(path: Path, *, allow_outside: bool = False) -> tuple[Feat
         allow_outside: whether these paths may lead out of its folder.
 
     Returns:
-        What it says, and the paths of the tables and meshes that it names.
+        Its settings, and the paths of the tables and meshes that it names.
 
     Raises:
         SurveyFileError: unreadable, no TOML, an unknown key, a wrong type, or a contradiction; the line names

@@ -1,7 +1,7 @@
 """Measuring a result: hidden points, alignment, shapes, functions and tolerances, in this order.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, chs. 6 and 8; the module of each
-step names its own.
+step names its source.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ HEADLINES_OF_TOLERANCES: Mapping[Level, str] = {
     "bad": "Tolerances are not kept.",
 }
 WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
-SEEN_FROM = 0.8  # of the rays of targets that come from their own side of a surface, at least
+SEEN_FROM = 0.8  # of the rays of targets that come from their side of a surface, at least
 MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
 
 

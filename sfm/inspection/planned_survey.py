@@ -36,7 +36,7 @@ from sfm.targets.codes.rings import CodeFamily
 
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 MAX_PIXELS = 70_000_000  # of a simulated photograph: they are drawn whole, with oversampling
-NEAR = 0.3  # of the distance of neighbours within which a measured point is a planned one
+MAX_NEIGHBOUR_FRACTION = 0.3  # of the distance of neighbours within which a measured point is a planned one
 Positive = Annotated[float, Field(gt=0, lt=1e12)]
 Deviation = Annotated[float, Field(ge=0, lt=1e12)]
 
@@ -81,7 +81,7 @@ class _Plan(Content):
 
 @dataclass(frozen=True)
 class PlannedSurvey:
-    """A plan as its folder holds it."""
+    """A plan as stored in its folder."""
 
     name: str
     unit: str
@@ -307,8 +307,8 @@ def write_simulation(
         network = replace(network, points=names, images=images)
     lines = ["[survey]", 'name = "simulation"', f'unit = "{plan.unit}"']
     for a, camera in enumerate(plan.cameras):
-        own = [name for name, of in zip(network.images, network.camera, strict=True) if of == a]
-        lines += _camera_section(camera, own)
+        images_of = [name for name, of in zip(network.images, network.camera, strict=True) if of == a]
+        lines += _camera_section(camera, images_of)
     lines += [*_rig_section(folder, network, truth), *targets]
     bars = network.scale_bars
     for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
@@ -357,18 +357,18 @@ def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes
         blur_px=float(np.sqrt(max(plan.blur_px**2 - 1 / 12, 0.04))), exposure=exposure, noise=plan.noise / 255
     )
     stations = plan.stations
-    for a, own in enumerate(rows_of(stations.camera, len(plan.cameras))):
+    for a, rows in enumerate(rows_of(stations.camera, len(plan.cameras))):
         write_planned_photographs(
             pictures,
-            tuple(f"{stations.names[i]}.png" for i in own),
+            tuple(f"{stations.names[i]}.png" for i in rows),
             plan.cameras[a],
-            stations.position[own],
-            stations.rotation[own],
+            stations.position[rows],
+            stations.rotation[rows],
             xyz=xyz,
             normals=plan.normals,
             code=codes_of(plan, family),
             radius=plan.diameter / 2,
-            seen=plan.seen[own],
+            seen=plan.seen[rows],
             family=family,
             optics=optics,
             seed=seed + a,
@@ -439,7 +439,7 @@ def achieved(
         seed: as of `write_simulation`.
 
     Raises:
-        SurveyFileError: fewer than 3 coded targets were measured, which tell what is what.
+        SurveyFileError: fewer than 3 coded targets were measured, by which the others are named.
     """
     names = {name: j for j, name in enumerate(result.network.points)}
     xyz = result.estimate.points
@@ -454,7 +454,9 @@ def achieved(
     apart = np.linalg.norm(true[:, None] - true[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
-    found = (away[np.arange(len(away)), nearest] < NEAR * apart.min(axis=1)) & np.isfinite(plan.sigma[:, 0])
+    found = (away[np.arange(len(away)), nearest] < MAX_NEIGHBOUR_FRACTION * apart.min(axis=1)) & np.isfinite(
+        plan.sigma[:, 0]
+    )
     j, k = nearest[found], np.flatnonzero(found)
     motion = fit_similarity(xyz[j], true[k])
     error = motion.apply(xyz[j]) - true[k]

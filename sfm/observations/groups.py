@@ -1,4 +1,4 @@
-"""Observations of a group of points that have parameters of their own: planes, lines, frames, directions.
+"""Observations of a group of points with parameters of the group: planes, lines, frames, directions.
 
 The parameters of a group are found anew from its points whenever the observations are linearised, and do not
 appear among the unknowns: with their derivatives H and the weight W, the derivatives by the points are
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 
 NO_PARAMETERS = np.zeros(0)
-SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of own parameters below which one is open
+SINGULAR = 1e-9  # eigenvalue of the group's scaled normal equations below which a parameter is open
 
 
 class Fit(NamedTuple):
-    """A group at some values of its points, its own parameters fitted."""
+    """A group at some values of its points, with the parameters of the group fitted."""
 
     difference: FloatArray  # computed minus observed, (r, c)
     Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
-    H: FloatArray  # derivatives by the own parameters, (r, c, h)
-    own: FloatArray = NO_PARAMETERS  # values of the parameters, where these are reported, (h,)
+    H: FloatArray  # derivatives by the parameters of the group, (r, c, h)
+    own: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
 
 
 class OwnParameters(NamedTuple):
@@ -81,7 +81,7 @@ class Group(TableKind):
 
     @property
     def values(self) -> FloatArray:
-        """What was observed, (1, r c)."""
+        """Observed values, (1, r c)."""
         return self.value.reshape(1, -1)[: len(self)]
 
     def with_values(self, values: FloatArray) -> Self:
@@ -93,7 +93,7 @@ class Group(TableKind):
         return tuple(Block(POINT, self.point[k : k + 1][: len(self)]) for k in range(len(self.point)))
 
     def linearise(self, values: Values) -> Linear:
-        """Return computed minus observed and the derivatives, the own parameters fitted."""
+        """Return computed minus observed and the derivatives, the parameters of the group fitted."""
         fit = self.fit(values.points[self.point])
         d = fit.difference.size
         Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
@@ -190,7 +190,7 @@ class Group(TableKind):
 
 
 def inverse_of_determined(N: FloatArray) -> FloatArray:
-    """Return the inverse of the normal equations of own parameters over those that are determined, (h, h)."""
+    """Return the inverse of the group's normal equations over the determined parameters, (h, h)."""
     scale = 1 / np.sqrt(np.maximum(np.diagonal(N), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(N * scale[:, None] * scale)
     on = values > SINGULAR

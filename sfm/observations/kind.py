@@ -93,7 +93,7 @@ class Kind(ABC):
     @property
     @abstractmethod
     def values(self) -> FloatArray:
-        """What was observed, in the units of `units`, (n, d)."""
+        """Observed values, in the units of `units`, (n, d)."""
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:
@@ -152,8 +152,8 @@ class Kind(ABC):
     def met(self, values: Values) -> FloatArray:
         """Return object points that meet the observations, near those of values, (n, 3).
 
-        What a motion of the network does to observations is asked there: offsets of nothing from a line would
-        have its errors determine the scale.
+        There the effect of a motion of the network on observations is asked for: offsets of nothing from a
+        line would have its errors determine the scale.
         """
         return values.points
 

@@ -12,7 +12,7 @@ from sfm.observations.kind import Values
 
 
 class LevelGroups(Group):
-    """Heights of points above a level of their own."""
+    """Heights of points above a level of the group."""
 
     name: ClassVar[str] = "points at one height"
     single: ClassVar[str] = "level"

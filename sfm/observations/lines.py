@@ -13,7 +13,7 @@ from sfm.observations.kind import Values
 
 
 class Lines(Group):
-    """Offsets of points across a straight line of their own, in two directions; observed is none."""
+    """Offsets of points across a straight line through them, in two directions; observed is none."""
 
     name: ClassVar[str] = "lines"
     single: ClassVar[str] = "line"

@@ -14,7 +14,7 @@ ROUNDS = 20  # of the plane, which offsets shift and turn; each leaves a fractio
 
 
 class Planes(Group):
-    """Distances of points from a plane of their own."""
+    """Distances of points from a plane fitted to them."""
 
     name: ClassVar[str] = "planes"
     single: ClassVar[str] = "plane"

@@ -11,7 +11,7 @@ from sfm.observations.lines import Lines
 
 
 class PlumbLines(Lines):
-    """Offsets of points in X and Y from a plumb line of their own; observed is none."""
+    """Offsets of points in X and Y from a plumb line through them; observed is none."""
 
     name: ClassVar[str] = "plumb lines"
     single: ClassVar[str] = "plumb line"

@@ -29,7 +29,7 @@ class Pairs(RowKind):
 
     @property
     def values(self) -> FloatArray:
-        """What was observed, (n, d)."""
+        """Observed values, (n, d)."""
         return self.value
 
     def with_values(self, values: FloatArray) -> Self:

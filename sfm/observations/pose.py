@@ -13,7 +13,7 @@ from sfm.observations.kind import Kind, Linear, Values
 if TYPE_CHECKING:
     from sfm.network import Estimate
 
-MIN_COS_PHI = 1e-8  # nearer to +-90 deg omega and kappa have no sigmas of their own
+MIN_COS_PHI = 1e-8  # nearer to +-90 deg omega and kappa have no separate sigmas
 
 
 class PoseObservations(Kind):

@@ -43,7 +43,7 @@ RIM = 16
 OUTLINE = 256
 
 # Faces that reach into each other by less than this part of the largest one only touch.
-TOUCHING = 1e-6
+TOUCHING_FRACTION = 1e-6
 
 TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
 
@@ -102,7 +102,7 @@ def render_photographs(
     seed: int,
     threads: int = 2,
 ) -> tuple[list[AnyArray], list[ProjectedTargets]]:
-    """Photograph a scene from several stations side by side; each has its own noise, given by the seed.
+    """Photograph a scene from several stations side by side; each has other noise, given by the seed.
 
     Args:
         scene: what is photographed.
@@ -328,7 +328,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     """Return the faces turned to the camera, from back to front (painter's algorithm).
 
     Of two faces whose images overlap, one is painted first if it lies on the far side of the plane of the
-    other, or the other on the near side of its own.
+    other, or the other on the near side of the first's.
 
     Source: Newell, Newell and Sancha (1972), Proc. ACM National Conference, p. 443 (tests 2 to 4).
     """
@@ -338,7 +338,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     corners = faces.corners()
     # Height of the corners of face g above the plane of face f.
     above = np.einsum("fi,fgci->fgc", normal, corners[None] - faces.centre[:, None, None])
-    slack = TOUCHING * np.abs(faces.half).max(initial=0.0)
+    slack = TOUCHING_FRACTION * np.abs(faces.half).max(initial=0.0)
     far = (above <= slack).all(axis=2).T  # [g, f]: g is on the far side of f
     near = (above >= -slack).all(axis=2).T
     may_precede = far | near.T  # [g, f]: g may be painted before f

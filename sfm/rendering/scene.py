@@ -1,6 +1,6 @@
 """Scene: plane faces in space with circular targets and other marks, as `render` photographs them.
 
-Each face is a rectangle with its own plane axes a (right) and b (up) seen from outside; everything painted
+Each face is a rectangle with plane axes a (right) and b (up) seen from outside; everything painted
 on it is given in these plane coordinates. Intensities are reflectances between 0 and 1.
 """
 
