@@ -1,7 +1,7 @@
 """Remark: one finding about a result, as data. The catalogue makes its sentence, cause and remedy.
 
 A kind is a row of the catalogue (`sfm.remarks.catalogue`). Code that finds something returns a remark of that
-kind with its subjects and numbers; it holds no English.
+kind with its subjects and numbers; it contains no English.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from sfm.report.page import (
 )
 from sfm.report.viewer.product_scenes import displacements_viewer
 
-NAMED = 12  # points in a sentence
+MAX_NAMED = 12  # points in a sentence
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
@@ -318,4 +318,4 @@ def _same(found: Displacements) -> bool:
 
 
 def _names(names: Iterable[str]) -> str:
-    return listed(names, most=NAMED)
+    return listed(names, most=MAX_NAMED)

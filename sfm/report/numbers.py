@@ -16,7 +16,7 @@ from sfm.remarks.kind import significant as significant
 from sfm.units import SUPERSCRIPTS
 from sfm.units import finer_unit as finer_unit
 
-SMALL = 1e-3  # below it parameters are written with an exponent
+MIN_PLAIN_VALUE = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none
 NOT_DETERMINED = "not determined"  # in place of an infinite standard deviation
 
@@ -80,7 +80,7 @@ def with_exponent(value: float, sigma: float) -> tuple[str, str]:
         return (f"{value:.6g}", NOT_DETERMINED)
     if not (np.isfinite(sigma) and sigma > 0):
         return (f"{value:.6g}", "held fixed")
-    if abs(value) >= SMALL or value == 0:
+    if abs(value) >= MIN_PLAIN_VALUE or value == 0:
         return to_precision(value, sigma), significant(sigma, 2)
     power = int(np.floor(np.log10(abs(value))))
     decimals = int(np.clip(1 - np.floor(np.log10(sigma)) + power, 0, 12))

@@ -312,7 +312,7 @@ class Banner:
 
 @dataclass(frozen=True)
 class Page:
-    """What a page shows, and the files beside it."""
+    """The content of a page, and the files beside it."""
 
     name: str  # of its files, without their endings
     kind: str  # line above the title

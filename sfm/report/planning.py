@@ -54,7 +54,7 @@ from sfm.report.phrases import NORMAL_95, describe_rigs
 from sfm.report.tables.summary import summary_of_rigs
 from sfm.report.viewer.product_scenes import plan_viewer
 
-NAMED = 12  # weak points that are listed
+MAX_NAMED = 12  # weak points that are listed
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 
@@ -186,9 +186,9 @@ def _weak(plan: Plan) -> tuple[Part, ...]:
     columns = (Column("point"), Column("sigma", "", fine, significant, factor), Column("reason"))
     rows = [
         (one.name, one.sigma if np.isfinite(one.sigma) else NOT_DETERMINED, one.reason)
-        for one in plan.weak[:NAMED]
+        for one in plan.weak[:MAX_NAMED]
     ]
-    more = (Note(f"The worst {NAMED} of {len(plan.weak)}."),) if len(plan.weak) > NAMED else ()
+    more = (Note(f"The worst {MAX_NAMED} of {len(plan.weak)}."),) if len(plan.weak) > MAX_NAMED else ()
     return Table(columns, rows), *more
 
 

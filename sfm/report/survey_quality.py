@@ -51,8 +51,8 @@ from sfm.report.tables.csv_files import component_rows
 
 MAX_BINS = 12  # numbers of rays that are listed one by one
 MAX_OPEN = 30  # parameters that are shown without a click
-WEAKEST = 5  # points
-STRONGEST = 20  # correlations of the exterior orientation; all are in summary.json
+MAX_WEAK_POINTS = 5  # points
+MAX_CORRELATIONS = 20  # correlations of the exterior orientation; all are in summary.json
 OVER = f"{100 * STRONG:.0f} %"
 
 
@@ -94,7 +94,9 @@ def precision_parts(f: Findings) -> Iterator[Part]:
     size = f"{general(f.object_size, 5)} {unit}"
     yield Paragraph(f"The object is {size} across (diagonal of the box around its points).")
     if adjusted:
-        weakest = np.argsort(-np.linalg.norm(np.nan_to_num(p.points), axis=1), kind="stable")[:WEAKEST]
+        weakest = np.argsort(-np.linalg.norm(np.nan_to_num(p.points), axis=1), kind="stable")[
+            :MAX_WEAK_POINTS
+        ]
         heads = (Column("weakest points"), *axes("s", finer, factor=factor), *columns(">rays"))
         yield Table(
             (*heads, Column("angle", "", "deg", "z.1f")),
@@ -356,7 +358,7 @@ def _correlations(f: Findings) -> Iterator[Part]:
 def _pairs(found: Iterable[Correlation]) -> Table:
     rows = [(one.first, one.second, 100 * one.value) for one in found]
     heads = (Column("parameter"), Column("and"), Column("correlation", "", "%", "+.1f"))
-    return Table(heads, rows, most=STRONGEST, all_in="summary.json")
+    return Table(heads, rows, most=MAX_CORRELATIONS, all_in="summary.json")
 
 
 COMPONENTS = {

@@ -62,7 +62,7 @@ CONVENTIONS = (
 
 @dataclass(frozen=True)
 class Report:
-    """What the sections of a report show."""
+    """The content of the sections of a report."""
 
     f: Findings
     plots: Sequence[Plot]

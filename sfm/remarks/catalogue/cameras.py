@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
-# a warning where the 95 % value reaches a pixel, which nobody takes for the error of a calibrated
+# a warning where the 95 % value reaches a pixel, which no one takes for the error of a calibrated
 # camera; an error where the standard deviation does, and image points measured as precisely as those
 # of the calibration would contradict the camera: imprecise ones from all sides are a weak calibration
 NOT_CALIBRATED = Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", error=WRONG_SIGMAS))

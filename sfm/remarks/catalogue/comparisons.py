@@ -115,7 +115,7 @@ ROWS = (
         "warning",
         "Not tested: {share:%} of the image points of {first} are those of {second}.",
         "two adjustments of one survey: the differences are those of adjusters, models and datum",
-        "Compare results of photographs of their own.",
+        "Compare results of separate photographs.",
     ),
     Kind(
         "no_sigmas",

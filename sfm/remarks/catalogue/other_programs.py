@@ -23,8 +23,8 @@ ROWS = (
     Kind(
         "adjuster_fits_better",
         "warning",
-        "The camera of {program} with {parameters} free fits {times} times better: {rms} in place of {own} "
-        "RMS.",
+        "The camera of {program} with {parameters} free fits {times} times better: {rms} in place of "
+        "{before} RMS.",
         "the camera model of the survey does not suit the lens",
         "Free these parameters.",
     ),

@@ -14,7 +14,7 @@ from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import ALONE_IN, BLUE, RED, alone, plan_axes, plot
 from sfm.report.numbers import finer_unit, significant
 
-DRAWN = 12  # points of a series that are drawn, those that moved farthest
+MAX_DRAWN = 12  # points of a series that are drawn, those that moved farthest
 BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
 
@@ -28,7 +28,7 @@ def difference_figure(
         xyz: coordinates, object unit, (n, 3).
         difference: object unit, (n, 3).
         significant_ones: drawn in red, (n,).
-        unit: the object unit, empty where nobody knows.
+        unit: the object unit, empty where it is not known.
     """
     plane, names = plan_axes(xyz)
     turned, d = xyz @ plane.T, difference @ plane.T
@@ -120,7 +120,7 @@ def plot_series(found: EpochSeries) -> Plot | None:
         for k in np.flatnonzero(one.moved):
             name = one.differences.points[k]
             moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(one.displacement[k])))
-    chosen = sorted(moved, key=lambda name: -moved[name])[:DRAWN]
+    chosen = sorted(moved, key=lambda name: -moved[name])[:MAX_DRAWN]
     if not chosen:
         return None
     factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))

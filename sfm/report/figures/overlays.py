@@ -21,7 +21,7 @@ MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720
 JPEG_QUALITY = 82
 ARROW_PX = 22.0  # length in the picture of a residual of the size of the RMS
-CROWDED = 300  # image points of a photograph; more of them are drawn as dots without names
+MAX_NAMED_POINTS = 300  # image points of a photograph; more of them are drawn as dots without names
 CROWDED_ARROW_PX = 8.0  # the same length where photographs are crowded, which keeps the vectors apart
 DOT_PX = 2  # radius of such a dot
 LABEL_SIZE = 0.5  # of OpenCV's Hershey font
@@ -135,7 +135,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     colour = [DROPPED if rejected else USED for rejected in adjustment.rejected[rows]]
     owner = nearest_image_points(photograph.xy, seen)
     colour_of_target = [UNUSED if row < 0 else colour[row] for row in owner]
-    crowded = len(photograph.xy) > CROWDED
+    crowded = len(photograph.xy) > MAX_NAMED_POINTS
     if crowded:
         _dots(picture, photograph.xy, colour_of_target, scale)
     else:
@@ -156,7 +156,7 @@ def arrow_factor(adjustment: Adjustment) -> float:
     rms, network = adjustment.rms_px, adjustment.network
     if not np.isfinite(rms) or rms <= 0:
         return 1.0
-    crowded = len(network.image_points) > CROWDED * len(network.images)
+    crowded = len(network.image_points) > MAX_NAMED_POINTS * len(network.images)
     longest = (CROWDED_ARROW_PX if crowded else ARROW_PX) / rms
     power = 10.0 ** np.floor(np.log10(longest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= longest))

@@ -21,7 +21,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class PlotCamera:
-    """A camera as people know it, whatever its photographs have of their own."""
+    """A camera as people know it, whatever varies between its photographs."""
 
     name: str
     c_px: float
@@ -52,7 +52,7 @@ class PlotData:
     xy: FloatArray  # image coordinates, px, (k, 2)
     from_centre: FloatArray  # the same from the middle of the photograph, px, (k, 2)
     residuals: FloatArray  # px, (k, 2)
-    standardised: FloatArray  # residuals over their own standard deviation a posteriori, (2k,)
+    standardised: FloatArray  # residuals over their standard deviation a posteriori, (2k,)
     image_rms_px: FloatArray  # root mean square residual per coordinate of each photograph, px, (m,)
     image_points: IntArray  # number of each photograph, (m,)
     rms_px: float  # of all

@@ -15,7 +15,7 @@ from threading import Thread
 
 from sfm.report.figures.plot_data import Plot, PlotData
 
-# Nothing of the current folder, the environment or a user's own packages is imported before the paths of this
+# Nothing of the current folder, the environment or a user's packages is imported before the paths of this
 # process are known; multiprocessing would, and would run the program of this process again.
 BEGIN = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
@@ -33,8 +33,8 @@ def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
 class PlotProcess:
     """Draws the plots of one report.
 
-    It ends with the process that began it, whatever ends that: nobody else holds the ends of its pipes. Of a
-    Ctrl-C it hears nothing, being in a session of its own.
+    It ends with the process that began it, whatever ends that: no other process has the ends of its pipes.
+    Ctrl-C does not reach it, as it is in a separate session.
 
     Raises:
         OSError: it cannot be started, as with a limit on processes.
@@ -53,7 +53,7 @@ class PlotProcess:
         self._send(list(sys.path))
 
     def begin(self, shown: PlotData) -> None:
-        """Begin to draw; the process may still be importing, and a pipe holds little."""
+        """Begin to draw; the process may still be importing, and a pipe takes little."""
         self._shown = shown
         sender = Thread(target=self._send, args=(shown,), daemon=True)
         try:
@@ -76,7 +76,7 @@ class PlotProcess:
         return plots
 
     def close(self) -> None:
-        """End the process, which holds nothing that could be left half-done."""
+        """End the process, which has nothing that could be left half-done."""
         self._process.kill()
         self._process.wait()
         if self._sender is not None:
@@ -115,7 +115,7 @@ def plot_process(jobs: int) -> Iterator[PlotProcess | None]:
 
 
 def serve() -> None:
-    """Draw what comes in by stdin, out to stdout, until nobody is there; faults are for who began this."""
+    """Draw what comes in by stdin, out to stdout, until its reader is gone; faults are for who began this."""
     # what a library prints must not come between
     given, drawn, sys.stdout = sys.stdin.buffer, sys.stdout.buffer, sys.stderr
     with suppress(Exception):
@@ -124,4 +124,4 @@ def serve() -> None:
         while True:
             pickle.dump(draw_plots(pickle.load(given)), drawn)
             drawn.flush()
-    os._exit(0)  # nothing is left to write, and nobody to write it to
+    os._exit(0)  # nothing is left to write, and no one to write it to

@@ -89,7 +89,7 @@ def alone(height_in: float) -> Figure:
 
 
 def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
-    """Return a figure with margins for rows of two panels; matplotlib's own layouts draw everything twice."""
+    """Return a figure with margins for rows of two panels; matplotlib's layouts draw everything twice."""
     each_in = (height_in - TOP_IN - bottom_in - (rows - 1) * BETWEEN_IN) / rows
     figure = Figure(figsize=(WIDTH_IN, height_in))
     figure.subplots_adjust(
@@ -392,7 +392,7 @@ def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:
 
 
 def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
-    """Return centre and mean residual of each cell of the format that holds at least three."""
+    """Return centre and mean residual of each cell of the format that contains at least three."""
     side = max(width, height) / CELLS
     columns = int(np.ceil(width / side))
     cell = (xy // side).astype(int) @ (1, columns)

@@ -79,7 +79,7 @@ def statistics_of(result: SurveyResult) -> Statistics:
     """Return the statistics of a result with its covariance, against the standard deviations stated for it.
 
     Each kind of observation is tested by itself, since a test of all of them together passes by
-    construction where the image points have the weight of their own residuals.
+    construction where the image points have the weight that their residuals give.
     """
     adjustment = result.adjustment
     kinds = by_kind(adjustment)

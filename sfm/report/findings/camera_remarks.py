@@ -12,9 +12,10 @@ from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import SurveyResult
 
-SURE = 3.0  # standard deviations from which a camera is as the adjustment has it
-OUTSIDE = 0.25  # of the diagonal, half way to a corner: no principal point is farther from the centre
-DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
+SURE_SIGMAS = 3.0  # standard deviations from which a camera is as the adjustment has it
+# Of the diagonal, half way to a corner: no principal point is farther from the centre.
+MAX_OFFSET_FRACTION = 0.25
+DECENTRING_FRACTION = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 
 def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
@@ -70,7 +71,7 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         far = unless_note(remark("principal_point_far", camera=camera.name, share=away))
         remarks += far
         sigma = _principal_sigma_px(result, number) / diagonal
-        if away - SURE * sigma > OUTSIDE:
+        if away - SURE_SIGMAS * sigma > MAX_OFFSET_FRACTION:
             remarks.append(remark("principal_point_outside", camera=camera.name, share=away, sigma=sigma))
         other = _format_around(at, width, height) if far else None
         if other is not None:
@@ -97,14 +98,14 @@ def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
         shares = {
             name: values[name]
             for name, one in zip(camera.names, adjusted, strict=True)
-            if one and abs(values[name]) > SURE * sigma[name]
+            if one and abs(values[name]) > SURE_SIGMAS * sigma[name]
         }
         if camera.free[camera.parts[0]].sum() == 2:  # of both directions
             first, second = np.flatnonzero(camera.parts[0])
             ratio = camera.parameters[second] / camera.parameters[first]
             ratio *= camera.pixel_mm[1] / camera.pixel_mm[0]
             of_ratio = np.hypot(*(sigma[camera.names[k]] / camera.parameters[k] for k in (first, second)))
-            if abs(ratio - 1) > SURE * of_ratio:
+            if abs(ratio - 1) > SURE_SIGMAS * of_ratio:
                 shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
         for name, value in shares.items():
             found += unless_note(
@@ -117,6 +118,6 @@ def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] |
     """Return the format whose centre a place is: the sides exchanged, doubled or halved; None without one."""
     formats = [(height, width), *((round(s * width), round(s * height)) for s in (0.5, 2.0))]
     for one in formats:
-        if np.linalg.norm(at - np.array(one) / 2) < DECENTRED * np.hypot(*one):
+        if np.linalg.norm(at - np.array(one) / 2) < DECENTRING_FRACTION * np.hypot(*one):
             return one
     return None

@@ -17,7 +17,7 @@ from sfm.conventions import FloatArray
 from sfm.observations.kind import is_observed
 from sfm.result import SurveyResult
 
-LISTED = 10  # largest residuals
+MAX_LISTED = 10  # largest residuals
 TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is stated beside that of all
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
 
@@ -139,7 +139,7 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     )
 
 
-def largest_residuals(adjustment: Adjustment, count: int = LISTED) -> tuple[tuple[Any, ...], ...]:
+def largest_residuals(adjustment: Adjustment, count: int = MAX_LISTED) -> tuple[tuple[Any, ...], ...]:
     """Return the accepted image points with the largest standardised residuals, largest first.
 
     Returns:

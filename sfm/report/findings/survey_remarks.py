@@ -210,7 +210,7 @@ def comparison_remarks(result: SurveyResult) -> tuple[Remark, ...]:
                 parameters=better.free,
                 times=better.times,
                 rms=(better.rms_px, "px"),
-                own=(better.own_rms_px, "px"),
+                before=(better.own_rms_px, "px"),
             )
         )
     return tuple(remarks)

@@ -1,4 +1,4 @@
-"""The viewer as a page holds it: script, styles, data, pictures, and the policy that allows them.
+"""The viewer as a page embeds it: script, styles, data, pictures, and the policy that allows them.
 
 A scene as text inside a page: names as JSON, numbers as arrays, gzip, base64.
 
@@ -40,7 +40,7 @@ NO_PICTURE = "no photograph was read for this page"
 
 @dataclass(frozen=True)
 class Viewer:
-    """What a page embeds of a viewer."""
+    """The parts of a viewer that a page embeds."""
 
     script: Markup  # to the letter, since the policy allows it by its hash
     style: Markup

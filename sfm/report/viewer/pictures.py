@@ -255,9 +255,9 @@ def _left_out(read: int, m: int, views: int, crops: int, rays: int, beside: bool
     if read < m:
         lines.append(f"{m - read} of {m} photographs could not be read: they have no picture here.")
     if views < read:
-        lines.append(f"This page holds {views} of {read} photographs, those of the largest RMS; {rest}.")
+        lines.append(f"This page shows {views} of {read} photographs, those of the largest RMS; {rest}.")
     if crops < rays and read:
-        lines.append(f"This page holds crops of {crops} of {rays} image points, the worst; {rest}.")
+        lines.append(f"This page shows crops of {crops} of {rays} image points, the worst; {rest}.")
     return lines
 
 
