@@ -1,4 +1,4 @@
-"""Dask as the engine of batches: a cluster of this computer's own, or any scheduler that is running.
+"""Dask as the engine of batches: a cluster on this computer, or any scheduler that is running.
 
 Source: dask.distributed, Client futures API (https://distributed.dask.org/en/stable/client.html).
 """
@@ -61,8 +61,8 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-# What Dask remembers for its dashboard, which nobody sees here. Call stacks, sampled 100 times a second in
-# each worker and kept for 1000 s, were 1.1 MiB a survey; its logs grow for the first hundreds of surveys.
+# Records that Dask keeps for its dashboard, which is not shown here. Call stacks, sampled 100 times a second
+# in each worker and kept for 1000 s, were 1.1 MiB a survey; its logs grow for the first hundreds of surveys.
 NO_DIARY = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.low-level-log-length": 100,
@@ -76,7 +76,7 @@ NO_PAGES: dict[str, list[str]] = {
 
 
 def fitting_workers() -> int:
-    """Return how many workers this computer bears by its cores and memory, or what is granted of them."""
+    """Return how many workers the cores and memory of this computer allow, or those granted of them."""
     return max(1, min(dask.system.CPU_COUNT, distributed.system.MEMORY_LIMIT // WORKER_BYTES))
 
 
@@ -136,7 +136,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
 
 
 def _silence() -> None:
-    """Keep Dask's own words and tracebacks from the terminal; some of its loggers have their own level."""
+    """Keep Dask's messages and tracebacks from the terminal; some of its loggers have separate levels."""
     for name in ("distributed", *logging.root.manager.loggerDict):
         if name.split(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -170,7 +170,7 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
 
     Args:
         address: such as tcp://192.168.1.5:8786; whoever reaches a scheduler can run programs on its
-            workers, so it belongs in a network of trust. For tls:// Dask's own configuration names the
+            workers, so it belongs in a network of trust. For tls:// Dask's configuration names the
             certificates.
 
     Raises:
@@ -273,7 +273,7 @@ class DaskEngine:
                 else:
                     yield _event(what, running.pop(what)[0])
         finally:
-            with suppress(Exception):  # a scheduler that is gone cannot be told to stop
+            with suppress(Exception):  # a scheduler that is gone cannot be asked to stop
                 self.client.cancel([future for futures in running.values() for future in futures], force=True)
                 self.client.unsubscribe_topic(run)
 
@@ -329,7 +329,7 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
 
 
 class _OneThread:
-    """Holds BLAS and OpenCV to one thread, in workers that others have started, too.
+    """Limits BLAS and OpenCV to one thread, in workers that others have started, too.
 
     Those may have several threads, and the last of their calls gives the libraries theirs back.
     """

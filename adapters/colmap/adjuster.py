@@ -38,7 +38,7 @@ from sfm.network import Estimate, Network
 NEEDED_VERSION = (4, 2)
 
 # The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
-# Gauss-Newton's. Ceres' own tolerances stop long before the last digits.
+# Gauss-Newton's. Ceres' tolerances stop long before the last digits.
 START_RADIUS = 1e8
 MAX_RADIUS = 1e32
 MIN_LM_DIAGONAL = 1e-30
@@ -82,11 +82,11 @@ def adjust_with_colmap(
         network: photographs, points and image points, all of which take part.
         estimate: start values, complete, cameras in a model that COLMAP has.
         gauge: free | two_cameras | control. Free leaves the datum to Ceres' damping, which moves little;
-            two_cameras holds the first two photographs in 7 elements, from where a poor start can lose
-            points behind cameras; control holds the control points.
+            two_cameras fixes 7 elements of the first two photographs, from where a poor start can lose
+            points behind cameras; control fixes the control points.
         threads: threads of Ceres.
         max_iterations: steps per run of Ceres.
-        polish: run Ceres again from its own result until the cost stands still.
+        polish: run Ceres again from its last result until the cost stands still.
 
     Raises:
         BackendError: pycolmap is missing or of another version, a camera model or a set of free
@@ -239,7 +239,7 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
     elif gauge == "control":
         if network.control.covariance.any():
             raise BackendError(
-                "control with standard deviations: COLMAP's adjuster holds points or frees them"
+                "control with standard deviations: COLMAP's adjuster fixes points or frees them"
             )
         for j in network.control.point:
             config.add_constant_point(int(j) + 1)
@@ -249,9 +249,9 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
 
 
 def reason_of(error: BaseException) -> str:
-    """What COLMAP says of an error, without the places in its own source and its own words for them.
+    """Return COLMAP's text of an error, without the places in its source and its words for them.
 
-    It repeats what files hold, whatever that is and however long.
+    It repeats the content of files, whatever that is and however long.
     """
     text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
     text = re.sub(r"^Check failed: *", "COLMAP expected ", text)

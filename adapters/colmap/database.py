@@ -1,6 +1,6 @@
 """COLMAP databases with our image points: cameras, photographs, keypoints and matches.
 
-A database holds no object points. Which keypoints show the same point is said by matches of pairs of
+A database has no object points. Which keypoints show the same point is stated by matches of pairs of
 photographs, so points are written as matches between all photographs they were measured in and read back as
 the connected parts of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
@@ -44,7 +44,7 @@ from sfm.network import ImagePoints, Network, rows_of
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100
 PAIRS = 2**31 - 1  # the number of a pair is PAIRS times that of its first photograph, plus that of its second
-MAX_STEPS, STEPS = 1000, 300_000  # of SQLite's machine in one query, told in so many at a time
+MAX_STEPS, STEPS = 1000, 300_000  # of SQLite's machine in one query, counted in so many at a time
 
 MAX_PLACES = 100_000_000  # photographs times points, of which a table is kept
 
@@ -113,7 +113,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:
-    """Write everything; cameras and photographs are numbered from 1, each photograph has its own frame."""
+    """Write everything; cameras and photographs are numbered from 1, each photograph has a frame."""
     for k, camera in enumerate(cameras):
         written = colmap_camera(pycolmap, camera, k + 1)
         database.write_camera(written, True)
@@ -171,7 +171,7 @@ def _tracks(edges: list[tuple[IntArray, IntArray]], image: IntArray) -> IntArray
 
 @dataclass(frozen=True)
 class DatabaseCamera:
-    """A camera by the names of COLMAP's own."""
+    """A camera as COLMAP names its fields."""
 
     camera_id: int
     model_name: str
@@ -271,7 +271,7 @@ def _refuse_other_tables(path: Path, database: sqlite3.Connection) -> None:
             )
         columns = database.execute(f"PRAGMA table_xinfo({name})").fetchall()
         if not kinds[name] or any(hidden for *_, hidden in columns):
-            raise SurveyFileError(f"{path}: {name} is computed, needed a table that holds it")
+            raise SurveyFileError(f"{path}: {name} is computed, needed a table that contains it")
 
 
 class _Reader:
@@ -372,7 +372,7 @@ class _Reader:
         return tuple(found)
 
     def _rows(self, table: str, columns: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
-        """Yield where a row stands and what it holds, in the order of the first column."""
+        """Yield the place and the content of each row, in the order of the first column."""
         rows = self.database.execute(f"SELECT {columns} FROM {table} ORDER BY 1")
         for count, row in enumerate(rows, 1):
             where = f"{table}, {columns.split(',')[0]} {_shown(row[0])}"

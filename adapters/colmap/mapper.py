@@ -1,4 +1,4 @@
-"""COLMAP's own pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
+"""COLMAP's pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
 
 The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
 are compared with the survey's by sfm.comparison.baseline.
@@ -27,12 +27,12 @@ RANDOM_SEED = 0  # of RANSAC, so that a run repeats as far as threads allow
 
 @dataclass(frozen=True)
 class MapperBaseline:
-    """What COLMAP's own pipeline made of the photographs."""
+    """The result of COLMAP's pipeline on the photographs."""
 
     network: Network  # registered photographs and their SIFT points
-    estimate: Estimate  # its orientations and points, in a frame and scale of its own
+    estimate: Estimate  # its orientations and points, in its own frame and scale
     total: int  # photographs given
-    rms_px: float  # root mean square residual per coordinate of its own points, px
+    rms_px: float  # root mean square residual per coordinate of its points, px
     seconds: float  # from photographs to model, s
     name: str = "COLMAP mapper"
 

@@ -221,7 +221,7 @@ def mount_of(from_rig: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def residuals_of(scene: Any, network: Network) -> FloatArray:
-    """Computed minus measured by COLMAP's own projection, (k, 2), px."""
+    """Computed minus measured by COLMAP's projection, (k, 2), px."""
     seen = network.image_points
     xy = np.empty((len(seen), 2))
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):

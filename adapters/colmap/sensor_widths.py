@@ -1,6 +1,6 @@
 """Widths of camera sensors from COLMAP's list of cameras.
 
-pycolmap tells them only through the focal length that it infers for a photograph, so it is given a small one
+pycolmap gives them only through the focal length that it infers for a photograph, so it is given a small one
 with the make, the model and a known focal length.
 """
 

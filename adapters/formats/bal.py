@@ -7,7 +7,7 @@
 
 P = R X + t, p = -P / P_z, p' = f (1 + k1 |p|^2 + k2 |p|^4) p, in px, origin at the centre of the photograph,
 x right, y up: the camera looks along -z as Kolinear's does, R is our M, and p are our tangents. BAL gives
-neither names nor sizes of photographs; every photograph has a camera of its own.
+neither names nor sizes of photographs; every photograph has a separate camera.
 
 Source: Agarwal, Snavely, Seitz, Szeliski (2010), Bundle adjustment in the large, ECCV; and the page
 https://grail.cs.washington.edu/projects/bal/.
@@ -40,7 +40,8 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
 
     Args:
         path: the problem.
-        size_px: width and height of the photographs; the smallest that holds all image points if not given.
+        size_px: width and height of the photographs; the smallest that contains all image points if not
+            given.
 
     Raises:
         SurveyFileError: what is wrong, with file and line number.

@@ -1,6 +1,6 @@
 """All that a file of a program says of a survey, by kind, for whoever writes it in another format.
 
-A format says which kinds it holds; what else there is of a survey is named when it is written.
+A format lists the kinds that it keeps; the rest of a survey is named when it is written.
 """
 
 from __future__ import annotations
@@ -342,7 +342,7 @@ def losses(content: Content, held: frozenset[str]) -> tuple[tuple[Kind, int], ..
 
     Args:
         content: of a survey.
-        held: names of the kinds that the format holds.
+        held: names of the kinds that the format keeps.
     """
     counts = ((kind, len(kind.rows(content))) for kind in KINDS if kind.name not in held)
     return tuple((kind, count) for kind, count in counts if count)

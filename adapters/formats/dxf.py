@@ -95,7 +95,7 @@ def write_dxf(
         put((0, "LINE"), (8, _layer(line.layer)), *place(10, line.start), *place(11, line.end))
     for circle in circles:
         n = circle.normal / np.linalg.norm(circle.normal)
-        centre = _axes(n).T @ circle.centre  # in the entity's own axes
+        centre = _axes(n).T @ circle.centre  # in the axes of the entity
         put((0, "CIRCLE"), (8, _layer(circle.layer)), *place(10, centre), (40, float(circle.radius)))
         put(*place(210, n))
     for layer, text, at in texts:

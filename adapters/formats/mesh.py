@@ -1,7 +1,7 @@
 """Meshes of triangles as STL (binary and text) and PLY (binary and text), read as untrusted.
 
-Polygons of PLY are cut into triangles from their first corner. What a file says of its own size is
-checked against its size before memory is taken.
+Polygons of PLY are cut into triangles from their first corner. The size that a file states is checked
+against its actual size before memory is taken.
 
 Source: 3D Systems (1989), StereoLithography Interface Specification; Turk (1994), The PLY polygon file
 format.

@@ -41,7 +41,7 @@ from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
 HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
-MARKER_SIGMA_PX = 0.1  # Metashape's own default for markers placed by hand
+MARKER_SIGMA_PX = 0.1  # Metashape's default for markers placed by hand
 MARKER = ["markers", "marker"]  # elements below the chunk
 LOCATION = ["frames", "frame", "markers", "marker", "location"]
 

@@ -3,7 +3,7 @@
 To add a format: write its module beside this one, with a reader, a writer or both, and give it a row in
 FORMATS; where its files can be distinguished from others by their looks, say so in `format_of`.
 
-Source: the module of each format names its own.
+Source: named in the module of each format.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class FileFormat:
     models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras
     read: Reader | None  # of a file or folder; None: `read_all`, or the format is written only
     write: Writer | None  # to a new file, or into an empty folder; None: `write_all`
-    holds: frozenset[str]  # the kinds of `content` that are the same when it is read again
+    keeps: frozenset[str]  # the kinds of `content` that are the same when it is read again
     folder: bool = False  # whether it is a folder of files
     placed: bool = False  # whether it leaves out what has no coordinates in the object
     lacks: tuple[str, ...] = ()  # parameters of these models that it cannot hold, others can stand in
@@ -71,7 +71,7 @@ class FileFormat:
     straight: tuple[str, ...] = ()  # parameters that it cannot hold and nothing can stand in
     one_focal: bool = False  # whether fx and fy must be the same
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
-    read_all: Callable[..., Content] | None = None  # of a format that holds more than `read` returns
+    read_all: Callable[..., Content] | None = None  # of a format that has more than `read` returns
     write_all: Callable[[Path, Content], None] | None = None  # likewise of `write`
     control: bool = False  # whether `read_all` takes a file of control, as keyword
 
@@ -79,11 +79,11 @@ class FileFormat:
         """Return the kinds that are the same when a survey is read again."""
         cameras = content.result.estimate.cameras
         frees = all(set(_free(one)) in (set(), set(one.names) & set(self.frees)) for one in cameras)
-        return self.holds | {"free"} if frees else self.holds
+        return self.keeps | {"free"} if frees else self.keeps
 
     @property
     def readable(self) -> bool:
-        """Whether it holds photographs, and can be read."""
+        """Whether it has photographs, and can be read."""
         return self.read is not None or self.read_all is not None
 
 
@@ -228,7 +228,7 @@ def format_named(name: str) -> FileFormat:
 
 
 def format_of(path: Path) -> FileFormat:
-    """Return the format of a file or folder that is there, by what it holds.
+    """Return the format of a file or folder that is there, by its content.
 
     Raises:
         SurveyFileError: it is not there, or nothing in it is known.
@@ -289,7 +289,7 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
     """
     form = format_of(path) if name is None else format_named(name)
     if not form.readable:
-        raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
+        raise SurveyFileError(f"{path}: format {form.name} has no photographs, it is written only")
     if control is not None and not form.control:
         raise SurveyFileError(f"{path}: format {form.name} takes no file of control, photomodeler does")
     refuse_links_out(path)
@@ -322,7 +322,7 @@ def read_comparable(path: Path, name: str | None = None) -> Solution:
         return read_result(path)
     if not form.readable:
         raise SurveyFileError(
-            f"{path}: format {form.name} holds points only, results with photographs are compared"
+            f"{path}: format {form.name} has points only, results with photographs are compared"
         )
     result = read_content(path, form.name).result
     network, estimate = result.network, result.estimate
@@ -341,7 +341,7 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
 
 
 def write_content(path: Path, name: str, content: Content) -> None:
-    """Write all of a survey that a format holds; cameras must be in a model that it holds.
+    """Write all of a survey that a format keeps; cameras must be in a model that it has.
 
     Raises:
         KolinearError: the format cannot hold it, or it cannot be written.
@@ -354,7 +354,7 @@ def write_content(path: Path, name: str, content: Content) -> None:
         points_only = not form.models
         if not (estimate.determined.any() and (points_only or estimate.oriented.any())):
             raise OutputError(
-                f"{path}: format {name} holds what has a place in the object, but no "
+                f"{path}: format {name} needs coordinates in the object, but no "
                 f"{'point' if points_only else 'photograph or no point'} has coordinates"
             )
     if form.folder:
@@ -397,7 +397,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
     for camera in cameras if form.models else ():
         if camera.model not in form.models:
             raise KolinearError(
-                f"camera {camera.name}: format {form.name} holds models {', '.join(form.models)}, "
+                f"camera {camera.name}: format {form.name} has models {', '.join(form.models)}, "
                 f"not {camera.model}"
             )
         left = [
@@ -414,7 +414,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
 
 
 def written(name: str, network: Network, estimate: Estimate) -> str:
-    """Return what of a network a format holds, in words."""
+    """Return in words what of a network a format keeps."""
     form = format_named(name)
     if not form.models:
         return counted(int(estimate.determined.sum()), "point")

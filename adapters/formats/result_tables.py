@@ -1,7 +1,7 @@
 """A survey's result as CSV tables, read and written.
 
 These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are passed over.
-What a summary does not say of size and pixel is taken from the COLMAP model in the folder `colmap`.
+Sizes and pixels missing from a summary are taken from the COLMAP model in the folder `colmap`.
 """
 
 from __future__ import annotations
@@ -335,8 +335,8 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
         if name not in known:
             raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in summary.json")
     cameras, sigmas = [], []
-    told = all(entry.size_px is not None and entry.pixel_mm is not None for entry in summary.cameras)
-    beside = () if told else read_side_file(folder / COLMAP_SIDE_FILE).cameras
+    complete = all(entry.size_px is not None and entry.pixel_mm is not None for entry in summary.cameras)
+    beside = () if complete else read_side_file(folder / COLMAP_SIDE_FILE).cameras
     for number, entry in enumerate(summary.cameras):
         names = MODELS[entry.model].names
         missing = [p for p in names if (entry.name, p) not in rows]
@@ -362,7 +362,7 @@ def _size(
         size, pixel = beside[0].size_px, beside[0].pixel_mm
     if size is None or pixel is None:
         raise SurveyFileError(
-            f"{folder}: neither summary.json nor {COLMAP_SIDE_FILE} tells size and pixel of camera "
+            f"{folder}: neither summary.json nor {COLMAP_SIDE_FILE} states size and pixel of camera "
             f"{entry.name}"
         )
     return size, np.array(pixel)

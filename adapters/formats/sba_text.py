@@ -2,7 +2,7 @@
 
     cameras   one a line: [fu u0 v0 ar s] qw qx qy qz tx ty tz, x = K [R|t] X, y down
     points    one a line: X Y Z n (frame x y [covariance, 4 numbers])*n, frames from 0
-    calib     the 3 x 3 matrix K; not needed where the cameras carry their own five parameters
+    calib     the 3 x 3 matrix K; not needed where the cameras have the five parameters
     sigmas    optional: sigma_x sigma_y (px) of each projection, in the order of the points file
 
 They lie side by side and are found by their names: *cams*.txt, *pts*.txt, calib.txt, *sigmas*.txt.
@@ -86,7 +86,7 @@ def read_sba_text(
 
 
 def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Estimate) -> None:
-    """Write a network as sba's two files, cameras with their own parameters, projections with covariances.
+    """Write a network as sba's two files, cameras with their parameters, projections with covariances.
 
     Names of photographs and points are lost.
 
@@ -246,7 +246,7 @@ def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
 
 
 def _rows(path: Path, most: int = MAX_LINES) -> Iterator[tuple[int, list[float]]]:
-    """Yield line number and numbers of each line that holds any, one at least; # starts a comment."""
+    """Yield line number and numbers of each line that has any, one at least; # starts a comment."""
     text, count = Lines.of(path), 0
     while (words := text.row()) is not None:
         count += 1

@@ -34,7 +34,7 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
 
     Args:
         folder: that the tables are in.
-        content: of the survey; its control holds the network where it is enough for that and no other datum
+        content: of the survey; its control defines the datum where it is enough for that and no other datum
             is known.
         title: name of the survey.
     """
@@ -97,7 +97,7 @@ def _rigs(folder: Path, network: Network, estimate: Estimate) -> list[str]:
 
 
 def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, list[str], tuple[str, ...]]]:
-    """Yield cameras, their photographs and the parameters of which each of these has a value of its own.
+    """Yield cameras, their photographs and the parameters that vary from photograph to photograph.
 
     Cameras that share parameters and are of one photograph each are one camera.
     """

@@ -150,7 +150,7 @@ def read_xml(path: Path, taken: Taken | None = None) -> Node:
 
 
 class _Reader:
-    """Makes nodes of what expat tells."""
+    """Makes nodes of the events of expat."""
 
     def __init__(self, path: Path, taken: Taken) -> None:
         self.path, self.taken = path, taken
@@ -161,7 +161,7 @@ class _Reader:
         self.kept = 0  # bytes of memory
         self.kept_before: list[int] = []  # each of the open elements
         self.parser = expat.ParserCreate()
-        self.parser.buffer_text = True  # else every line is a piece of its own
+        self.parser.buffer_text = True  # else every line is a separate piece
         self.parser.StartElementHandler = self.start
         self.parser.EndElementHandler = self.end
         self.parser.CharacterDataHandler = self.text

@@ -219,7 +219,7 @@ def test_what_has_no_coordinates_is_named_where_it_goes(tmp_path: Path) -> None:
     estimate = replace(result.estimate, position=position, points=points)
     content = replace(content, result=replace(result, estimate=estimate))
     for form in ("tables", "colmap-text"):
-        named = {kind.name: count for kind, count in losses(content, format_named(form).holds)}
+        named = {kind.name: count for kind, count in losses(content, format_named(form).keeps)}
         assert named["unplaced"] == 2
         write_content(tmp_path / form, form, content)
         again = read_content(tmp_path / form).result
@@ -236,7 +236,7 @@ def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.Cap
     write_content(tmp_path / "in", "tables", content)
     convert(tmp_path / "in", tmp_path / "out.xml")
     told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
-    assert len(told) == len(losses(content, format_named("metashape").holds)) and len(told) >= 5
+    assert len(told) == len(losses(content, format_named("metashape").keeps)) and len(told) >= 5
     convert(tmp_path / "in", tmp_path / "same", to_format="tables")
     assert "left out" not in capsys.readouterr().out
     assert (tmp_path / "same" / "given.csv").read_text() == (tmp_path / "in" / "given.csv").read_text()

@@ -493,11 +493,11 @@ def test_what_was_written_is_told(tmp_path: Path) -> None:
     ):
         read_comparable(tmp_path / "c.db")
     write_any(tmp_path / "c.ply", "ply", network, truth)
-    with pytest.raises(SurveyFileError, match=r"c\.ply: format ply holds points only"):
+    with pytest.raises(SurveyFileError, match=r"c\.ply: format ply has points only"):
         read_comparable(tmp_path / "c.ply")
     bare = read_any(tmp_path / "c.db")
     for name in ("tables", "colmap", "ply"):
-        with pytest.raises(OutputError, match=f"format {name} holds what has a place in the object, but no"):
+        with pytest.raises(OutputError, match=f"format {name} needs coordinates in the object, but no"):
             write_any(tmp_path / "none", name, *bare)
     assert not (tmp_path / "none").exists()
 
@@ -538,7 +538,7 @@ def test_formats_refuse_by_name(tmp_path: Path) -> None:
     network, truth = network_in("brown")
     with pytest.raises(SurveyFileError, match="format 'dxf', expected one of colmap"):
         format_named("dxf")
-    with pytest.raises(KolinearError, match="format bal holds models opencv, radial, not brown"):
+    with pytest.raises(KolinearError, match="format bal has models opencv, radial, not brown"):
         write_any(tmp_path / "x", "bal", network, truth)
     (tmp_path / "note.txt").write_text("hello\n")
     with pytest.raises(SurveyFileError, match=r"note\.txt, line 1: this is no format that is known"):
