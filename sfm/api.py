@@ -53,8 +53,8 @@ def run_survey(
 
     Args:
         survey: settings and given data, or the survey file.
-        images: folder of the photographs in place of the survey's own.
-        compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
+        images: folder of the photographs in place of those of the survey.
+        compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey asks for.
         jobs: photographs measured at a time; as many as there are cores if not given.
         store: folder that keeps what was measured, so that a photograph is not measured twice.
         progress: whether to draw a bar on a terminal, or an object that receives stages and photographs.
@@ -134,7 +134,7 @@ def write_result(
         The path of report.html, or of points.csv.
 
     Raises:
-        OutputError: the folder cannot be written, or holds something else than an earlier result.
+        OutputError: the folder cannot be written, or contains something else than an earlier result.
 
     Example:
         >>> import sfm
@@ -269,7 +269,7 @@ def measure(
     Args:
         result: of a survey, or read from files.
         features: the features file that says what is asked for, docs/measuring.md; points alone if not given.
-        allow_outside: whether it may name files outside its own folder.
+        allow_outside: whether it may name files outside its folder.
 
     Raises:
         KolinearError: what it asks for cannot be done; the message says why.

@@ -1,6 +1,6 @@
 """Camera: interior orientation, and the way between pixels and rays.
 
-The distortion models are in `sfm.distortion`; a camera holds the values of one of them.
+The distortion models are in `sfm.distortion`; a camera has the values of one of them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from sfm.kernels.options import compiled
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-10
 CURVATURE_STEP = 1e-3  # of tangents; a pixel or a few
-STEP_TOLERANCE = (
-    1e-11  # of tangents; what Newton's method leaves after such a step is its square, or rounding
-)
+# Of tangents; what Newton's method leaves after such a step is its square, or rounding.
+STEP_TOLERANCE = 1e-11
 # Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
 # apart from true ones. A parameter that the network knows worse is better held.
 KNOWN_WITHOUT = 0.01
@@ -48,7 +47,7 @@ class Camera:
     """which parameters are to be adjusted; none by default, shape (n,)"""
     shared: tuple[str, ...] = ()
     """of each parameter, the group of cameras that have one value of it, such as the camera whose photographs
-    differ in c only; "" = this camera's own, () = all its own, length n"""
+    differ in c only; "" = this camera's alone, () = all this camera's alone, length n"""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -135,7 +134,7 @@ class Camera:
         return float(self.parameters[self.names.index(name)])
 
     def group_of(self, parameter: int) -> str:
-        """Return the group of cameras that share a parameter, given by its index; "" if it is their own."""
+        """Return the group of cameras that share a parameter, given by its index; "" if it is not shared."""
         return self.shared[parameter] if self.shared else ""
 
     def owner_of(self, parameter: int) -> str:
@@ -144,13 +143,13 @@ class Camera:
 
     @property
     def shared_name(self) -> str:
-        """Name of the cameras that share parameters with this one; its own where none does."""
+        """Name of the cameras that share parameters with this one; its name where none does."""
         return next(filter(None, self.shared), self.name)
 
     def reduced(self, shrink: int) -> Camera:
         """Return the camera of the same photographs with the mean of `shrink` pixels a side in one.
 
-        What is left of whole squares at the right and the lower border is cut off.
+        The rest beyond whole squares at the right and the lower border is cut off.
         """
         width, height = (side // shrink for side in self.size_px)
         cut = (np.array(self.size_px) - shrink * np.array([width, height])) / 2 * self.pixel_mm
@@ -237,7 +236,7 @@ def camera_from_values(
 def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tuple[str, ...], IntArray]:
     """Return the families of cameras that share parameters, such as the photographs of one zoom lens.
 
-    A camera that shares nothing is a family of its own. The name of another is that of the group that
+    A camera that shares nothing is a family by itself. The name of another is that of the group that
     most photographs have in common.
 
     Args:

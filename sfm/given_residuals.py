@@ -1,4 +1,4 @@
-"""What was given with a standard deviation beside the image points, and its residuals: the rows of given.csv.
+"""Values given with a standard deviation beside the image points, and their residuals: the rows of given.csv.
 
 Each value is judged by Baarda's w, its residual over the standard deviation of that residual, sigma sqrt(r)
 with the standard deviation stated for it and its redundancy number r. A value with r = 0 is met exactly

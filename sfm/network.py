@@ -277,15 +277,15 @@ class Network:
             (len(self.control), "control point"),
             (len(self.scale_bars), "scale bar"),
         )
-        told = [counted(count, what) for count, what in parts if count]
-        return f"<Network: {', '.join(told)}>"
+        counts = [counted(count, what) for count, what in parts if count]
+        return f"<Network: {', '.join(counts)}>"
 
 
 @dataclass(frozen=True)
 class Mounts:
     """Where the cameras of rigs are mounted: R_photograph = R_pose R, X0 = X_pose + R_pose X.
 
-    The pose of a rig is that of its reference camera, whose own position is 0 and own rotation the unit
+    The pose of a rig is that of its reference camera, whose position is 0 and whose rotation is the unit
     matrix. So are those of a camera without a rig.
     """
 

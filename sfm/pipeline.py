@@ -49,7 +49,7 @@ def run_survey(
 
     Args:
         survey: settings and given data.
-        images_dir: folder of the photographs in place of the survey's own.
+        images_dir: folder of the photographs in place of those of the survey.
         jobs: threads; photographs measured at a time.
         others: the programs to compare with.
         store: of what was measured, so that a photograph is not measured twice.

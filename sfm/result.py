@@ -235,7 +235,7 @@ class SurveyResult:
             pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies beside it.
 
         Raises:
-            OutputError: the folder cannot be written, or holds something else than an earlier result.
+            OutputError: the folder cannot be written, or contains something else than an earlier result.
         """
         import sfm  # the report stands above the result, and is reached by its public name
 
@@ -297,7 +297,7 @@ def _reason(flag: int) -> str:
 def likest_first(reasons: Iterable[str]) -> list[str]:
     """Return reasons against candidates in words, those of candidates that are most like targets first.
 
-    What is no reason against a candidate, such as that a target was measured and not used, comes before them.
+    Reasons that are not against a candidate, such as a target measured and not used, come before them.
     """
     rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKEST_FIRST)}
     return sorted(reasons, key=lambda reason: (rank.get(reason, -1), reason))

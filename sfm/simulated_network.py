@@ -18,7 +18,7 @@ def simulate_network(
     """Return a network with the values that a truth gives, and the truth.
 
     Args:
-        network: says what is measured, and how precisely; its own values do not matter, but for coordinates
+        network: gives what is measured, and how precisely; its values do not matter, but for coordinates
             of rigid frames and offsets, which are near what they will be.
         truth: true values of all unknowns.
         rng: source of the errors, normally distributed with the covariances stated; no errors if None.

@@ -26,7 +26,7 @@ from sfm.point_table import Point, PointTable
 NO_SCALE = "network units"
 """unit of lengths in a network whose scale is undefined"""
 OBJECT_UNITS = "object units"
-"""unit of lengths in a network of which nobody has said which one it is"""
+"""unit of lengths in a network where none is stated"""
 CONTROL_COVARIANCE = "control covariance"  # kind of a row of given.csv
 MOUNT = ("X", "Y", "Z", "omega", "phi", "kappa")  # of a camera in the axes of its rig
 MEASURED = "measured"
@@ -79,7 +79,7 @@ their indices, in object units and rad, (3 p + 6 m, 3 p + 6 m)."""
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Solution:
-    """A network with its solution: Kolinear's own, COLMAP's or another program's.
+    """A network with its solution: Kolinear's, COLMAP's or another program's.
 
     Example:
         >>> import sfm
@@ -95,9 +95,9 @@ class Solution:
     position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
-    unit: str = ""  # of lengths, as people call it; empty where nobody knows
+    unit: str = ""  # of lengths, as people call it; empty where it is not known
     covariance: FloatArray | None = None  # of all coordinates of points together, object unit^2, (3k, 3k)
-    datum: str = ""  # free | minimal | control; empty where nobody knows
+    datum: str = ""  # free | minimal | control; empty where it is not known
     points_named: bool = True  # whether names of points identify them, or are mere numbers
     images_named: bool = True  # likewise of photographs
     covariance_points: IntArray | None = (

@@ -1,7 +1,7 @@
 """Compile the kernels of a survey ahead of the first one: `python -m sfm.warm_up`.
 
 Numba keeps compiled kernels on disk; the first run of each would take most of a minute otherwise. Every part
-works on a small made-up problem in a process of its own, since numba compiles one function at a time.
+works on a small made-up problem in a separate process, since numba compiles one function at a time.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def main(progress: Progress = SILENT) -> None:
 
 
 def _compile(part: Callable[[], None]) -> None:
-    """Compile a part in a process of its own, whose memory need not be tidied on the way.
+    """Compile a part in a separate process, whose memory need not be tidied on the way.
 
     Looking for cycles among the many objects of a compiler takes a tenth of the time; they are 0.2 GB.
     """
