@@ -34,7 +34,7 @@ class Fit(NamedTuple):
     difference: FloatArray  # computed minus observed, (r, c)
     Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
     H: FloatArray  # derivatives by the parameters of the group, (r, c, h)
-    own: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
+    parameters: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
 
 
 class OwnParameters(NamedTuple):
@@ -110,7 +110,7 @@ class Group(TableKind):
         HW = H.T * self.weights
         inverse = inverse_of_determined(HW @ H)
         J = -inverse @ (HW @ fit.Jx.reshape(self.sigma.size, -1))
-        return OwnParameters(fit.own, inverse, J.reshape(len(J), -1, 3))
+        return OwnParameters(fit.parameters, inverse, J.reshape(len(J), -1, 3))
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
         """Return the name of the group."""
