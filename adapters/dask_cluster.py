@@ -178,7 +178,7 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
     """
     _silence()
     try:
-        # A Client that cannot connect is never done with it, and says so half a minute later.
+        # A Client that cannot connect is never done with it, and reports it half a minute later.
         asyncio.run(_ask(address))
     except TimeoutError as error:
         raise BackendError(

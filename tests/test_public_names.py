@@ -213,7 +213,7 @@ def test_what_is_wrong_in_a_survey_made_in_python_is_one_line(wrong: dict[str, o
         (lambda: sfm.CameraSetup(name="one", c_mm=-1.0), "camera one: c_mm: found -1.0, needed more than 0"),
         (
             lambda: sfm.KnownPoints.from_arrays(["1", "1"], np.zeros((2, 3))),
-            "control, row 2: id '1' stands on",
+            "control, row 2: id '1' is on",
         ),
         (
             lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.nan]]),

@@ -15,7 +15,7 @@ from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import whole_file
 
 MAX_LINES = 2 * MAX_ROWS  # as of tables
-MAX_LINE = 10_000_000  # characters; the image points of a photograph can stand on one
+MAX_LINE = 10_000_000  # characters; the image points of a photograph can be on one
 MAX_DIGITS = 20  # of a whole number; COLMAP's largest have as many
 MAX_PHOTOGRAPHS = 100_000
 MAX_POINTS = 5_000_000  # of which a name is kept

@@ -200,7 +200,7 @@ def fingerprint(survey: SurveyFile) -> str:
     """
     digest = hashlib.sha256(survey.path.read_bytes())
     for table in survey.tables():
-        if table.is_file():  # what cannot be read is said by who reads it; a pipe would never end
+        if table.is_file():  # its reader reports what cannot be read; a pipe would never end
             with table.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
     if survey.observations is None:

@@ -41,7 +41,7 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
 def refuse_foreign_pages(out: Path) -> None:
     """Raise OutputError where a folder has files of these names that no batch has written, or a changed one.
 
-    So it does where the path is no text that can stand in them, or leads through a link.
+    So it does where the path is no text that they can contain, or leads through a link.
     """
     if not is_plain(str(out)):
         raise OutputError(

@@ -149,14 +149,14 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
 
 
 def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
-    """Return the survey files that names on the command line stand for, each once.
+    """Return the survey files that names on the command line mean, each once.
 
     Args:
-        names: files; folders, which stand for every survey.toml in and below them or else for the *.toml
+        names: files; folders, which mean every survey.toml in and below them or else for the *.toml
             files in them; globs, for shells that leave them as they are.
 
     Raises:
-        SurveyFileError: a name stands for nothing.
+        SurveyFileError: a name matches nothing.
     """
     found: dict[Path, None] = {}
     for name in names:
@@ -173,7 +173,7 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
 
 
 def _matches(path: Path) -> list[Path]:
-    """Return what a glob on the command line stands for; with `**` in it no links out of its folder count.
+    """Return what a glob on the command line matches; with `**` in it no links out of its folder count.
 
     Raises:
         SurveyFileError: nothing, or too much to look through.

@@ -37,7 +37,7 @@ def main() -> None:
                     _run()
             finally:
                 if sys.stdout is not None:
-                    sys.stdout.flush()  # while it can still be said that the disk is full
+                    sys.stdout.flush()  # while a full disk can still be reported
     except KolinearError as error:
         _refuse(str(error))
     except OSError as error:  # a disk, a network drive: nothing that a traceback would help with
@@ -76,7 +76,7 @@ def _run() -> None:
         command = error.ctx.command_path if error.ctx else "kolinear"
         said = f"{error.format_message().rstrip()}{_decimal_comma(error, sys.argv[1:])}"
         _refuse(f"{said} (see {command} --help)".replace(". (see", " (see"))
-    if code == INTERRUPTED:  # which is what typer makes of Ctrl-C, and says nothing
+    if code == INTERRUPTED:  # which typer makes of Ctrl-C without a message
         raise KeyboardInterrupt
     if isinstance(code, int) and code:
         raise SystemExit(code)

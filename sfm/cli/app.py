@@ -24,7 +24,7 @@ from sfm.cli.commands import (
     viewing,
 )
 
-USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
+USAGE_ERROR: Any = typer.BadParameter.__base__  # of all messages of typer on wrong arguments; it has no name
 
 app = typer.Typer(
     name="kolinear",
@@ -50,7 +50,7 @@ def _commands(
         typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Take the options that stand before a command."""
+    """Take the options before a command."""
 
 
 for _command in (

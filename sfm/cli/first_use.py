@@ -6,7 +6,7 @@ import sys
 
 
 def compile_first() -> None:
-    """Compile the kernels of a survey if that has not been done for these sources, and say so on stderr."""
+    """Compile the kernels of a survey unless it was done for these sources, and report it on stderr."""
     from sfm.kernels.warmed import is_warm
 
     if is_warm():

@@ -25,7 +25,7 @@ _OF_ONE = {"f": "fx", "k": "k1"}  # where a model has one focal length or one co
 
 @dataclass(frozen=True)
 class Conversion:
-    """A camera in another model, and how well that model can say the same."""
+    """A camera in another model, and how well that model can describe the same."""
 
     camera: Camera  # in the target model; free where the source was
     source_model: str  # model converted from
@@ -211,7 +211,7 @@ def corresponding_free(camera: Camera, model: str) -> BoolArray:
 
     A parameter is free when one that plays the same part is: a free K1 frees every radial term, since a
     series cut short on one side is not cut short on the other. Where a model has two focal lengths in place
-    of one and an affinity, each stands for both.
+    of one and an affinity, each covers both.
     """
     source, target = MODELS[camera.model], MODELS[model]
     free = {one.role for one, is_free in zip(source.parameters, camera.free, strict=True) if is_free}

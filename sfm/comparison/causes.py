@@ -186,7 +186,7 @@ def _fits(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost
         given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
     except GeometryError:
         return
-    if given.agreed:  # what most names say: others are exchanged among themselves
+    if given.agreed:  # what most names show: others are exchanged among themselves
         found: Similarity | None = given.a_from_b
     else:
         found = find_pattern(pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror)

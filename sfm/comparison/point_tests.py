@@ -19,7 +19,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 from sfm.solution import Solution
 
-FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
+FREE_DATUMS = ("free", "")  # in which the covariance of single points gives about what the whole one does
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PointTest:
 
     @property
     def agrees(self) -> bool:
-        """Whether no test says that the points differ."""
+        """Whether no test shows that the points differ."""
         return not (
             self.global_statistic > self.global_critical or self.significant.any() or not self.majority
         )

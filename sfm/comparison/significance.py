@@ -1,6 +1,6 @@
 """Differences of two results of one object, with their standard deviations and tests.
 
-Points and photographs are paired as `sfm.comparison.pairing` says, and b is aligned to a: over common points,
+Points and photographs are paired as in `sfm.comparison.pairing`, and b is aligned to a: over common points,
 projection centres or control, or not at all. The scale is estimated only where one of them has none. Where
 the covariance of all points together is known, both are brought into one datum and tested by
 `sfm.comparison.congruency`, which also finds the points that moved; then the alignment is over those that did

@@ -206,7 +206,8 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
     Its source, a branch for each model, is written here, because the compiler inlines the models only from
     plain branches on their names; a chain of closures over them makes an adjustment a third slower. It is
     compiled once and called: compiled into each of its callers it took three times as long to compile, and
-    an adjustment was no faster. This file stands for its source, so that it is kept as other kernels are.
+    an adjustment was no faster. This file takes the place of its source, so that it is kept as other kernels
+    are.
     """
     arguments = "frame, p, x, y, u, v, residual, Ju, Jp"
     lines = [f"def observe(number, {arguments}):"]

@@ -1,7 +1,7 @@
 """Models of a radial distortion with focal lengths in px, perspective or wide-angle, as COLMAP has them.
 
 The ideal point (a, b) = (x/z, y/z), y down, goes to s(r2) (a, b) with r2 = a^2 + b^2, and to pixels by one
-focal length or two, as frame[4] says. All of them are smooth on the axis: s is a function of r2.
+focal length or two, by frame[4]. All of them are smooth on the axis: s is a function of r2.
 
 Its outputs are described in `sfm.distortion.models`.
 """
@@ -22,7 +22,7 @@ def radial(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Perspective with s = 1 + k1 r2 + k2 r4 + ..., as many coefficients as frame[5] says.
+    """Perspective with s = 1 + k1 r2 + k2 r4 + ..., with frame[5] coefficients.
 
     Source: COLMAP, camera models SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL and RADIAL.
     """

@@ -3,7 +3,7 @@
 The displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c,
 small rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the
 full covariance of the displacements, in the datum of the stable points outside of the group; what is left
-says whether the group moved as the model says.
+shows whether the group moved as the model assumes.
 
 Source: Chen (1983), Analysis of deformation surveys; Caspary (2000), Concepts of network and deformation
 analysis, sec. 9; Welsch, Heunecke, Kuhlmann (2000), Auswertung geodaetischer Ueberwachungsmessungen, sec. 6.
@@ -66,7 +66,7 @@ class BlockMotion:
 
     @property
     def fits(self) -> bool:
-        """Whether the points moved as the model says."""
+        """Whether the points moved as the model assumes."""
         return not self.statistic > self.critical
 
     @property

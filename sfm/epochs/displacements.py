@@ -95,7 +95,7 @@ def find_displacements(
 
     Args:
         found: the differences of two epochs.
-        reference: points that are taken as stable until a test says otherwise, (n,); all if not given.
+        reference: points that are taken as stable until a test shows otherwise, (n,); all if not given.
         alpha: probability of saying that something moved where nothing did.
 
     Raises:

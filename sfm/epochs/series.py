@@ -161,7 +161,7 @@ def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
 
 
 def _together(found: Displacements) -> BlockMotion | None:
-    """Return the motion of all points that moved as one block; None where that says nothing."""
+    """Return the motion of all points that moved as one block; None where that shows nothing."""
     if found.moved.sum() <= MIN_POINTS["rigid"]:
         return None
     try:

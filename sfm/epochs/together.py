@@ -164,7 +164,7 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
 
 
 def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
-    """Adjust an epoch from its image points as its survey did, and say so where that leads elsewhere."""
+    """Adjust an epoch from its image points as its survey did, and report it where that leads elsewhere."""
     result = epoch.result
     network = _network_of(epoch)
     control = result.datum == "control"
@@ -213,7 +213,7 @@ def _network_of(epoch: Epoch) -> Network:
     result = epoch.result
     seen = result.network.image_points
     if epoch.sigma0_px is None:
-        raise GeometryError(f"{epoch.name}: its summary.json says no sigma0_px, which its weights come from")
+        raise GeometryError(f"{epoch.name}: its summary.json has no sigma0_px, which its weights come from")
     median = float(np.sqrt(np.median(np.trace(seen.covariance, axis1=1, axis2=2)) / 2))
     factor = epoch.sigma0_px / (epoch.sigma0 * median)
     index = {camera.name: k for k, camera in enumerate(result.estimate.cameras)}

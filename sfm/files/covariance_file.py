@@ -161,7 +161,7 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
 
     Args:
         folder: of the result; the file may be missing.
-        result: that the tables beside it say.
+        result: as in the tables beside it.
 
     Raises:
         SurveyFileError: the file is damaged or belongs to other tables.

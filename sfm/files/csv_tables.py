@@ -32,7 +32,7 @@ MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products o
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Columns of a CSV file or of arrays, with what is needed to say where something is wrong."""
+    """Columns of a CSV file or of arrays, with what is needed to state where something is wrong."""
 
     path: Path  # of arrays what they are
     names: tuple[str, ...]  # of the columns of text
@@ -43,7 +43,7 @@ class CsvTable:
     numbers: tuple[str, ...] = ()  # of the columns of numbers
 
     def place(self, row: int) -> str:
-        """Return in words where a row stands."""
+        """Return in words where a row is."""
         return f"{self.path}, {self.word} {self.line[row]}"
 
     def keys(self, column: str) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ class CsvTable:
                 names = key if isinstance(key, tuple) else (key,)
                 what = ", ".join(f"{c} '{name}'" for c, name in zip(columns, names, strict=True))
                 raise SurveyFileError(
-                    f"{self.path}, {self.word} {line}: {what} stands on {self.word} {first[key]} already"
+                    f"{self.path}, {self.word} {line}: {what} is on {self.word} {first[key]} already"
                 )
             first[key] = line
 

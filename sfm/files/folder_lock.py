@@ -90,7 +90,7 @@ def owner_of(path: Path) -> Owner | None:
 
 
 def _open_and_lock(path: Path, folder: Path) -> int:
-    """Open and lock the file that stands at `path` now, not one that its owner has just removed."""
+    """Open and lock the file that is at `path` now, not one that its owner has just removed."""
     while True:
         handle = open_own(path, os.O_RDWR | os.O_CREAT)
         if not lock_descriptor(handle, blocking=False):

@@ -50,7 +50,7 @@ def find_files(
         enter: called with every link to a folder, and every `..`, before what is in it is looked at; raises
             where it may not be.
         folders: whether folders are returned, too.
-        hidden: whether wildcards stand for names that begin with a dot.
+        hidden: whether wildcards match names that begin with a dot.
 
     Raises:
         SurveyFileError: there is too much to look through.

@@ -2,7 +2,7 @@
 
 Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, after spaces, too, and
 some begin a cell after each semicolon. In every such place of a text an apostrophe is put before it where CSV
-is written, and taken away where it is read; apostrophes that stand there already get one more, so that texts
+is written, and taken away where it is read; apostrophes that are there already get one more, so that texts
 come back as they were. Control characters (a tab or carriage return begins formulas, too) are no part of
 names, and written out in other texts.
 
@@ -113,7 +113,7 @@ def _quoted(cell: str) -> str:
 
 
 def _cell(value: object) -> str:
-    """Return what stands in the table."""
+    """Return the text as it is in the table."""
     if isinstance(value, str):
         return _text_cell(value)
     if isinstance(value, float | np.floating):
@@ -123,5 +123,5 @@ def _cell(value: object) -> str:
 
 @lru_cache(maxsize=4096)
 def _text_cell(text: str) -> str:
-    """Return the cell of a text; most are names of photographs that stand in thousands of rows."""
+    """Return the cell of a text; most are names of photographs that are in thousands of rows."""
     return _quoted(as_cell(as_plain(text)))

@@ -3,7 +3,7 @@
 Degrees in files, lengths in the object unit of the survey, sigmas are standard deviations a posteriori (those
 of image points: as measured). Numbers are written with enough digits to give the same number back.
 
-Source: RFC 4180 for CSV; docs/reference/results.md says what each column is.
+Source: RFC 4180 for CSV; docs/reference/results.md describes each column.
 """
 
 from __future__ import annotations

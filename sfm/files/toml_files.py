@@ -12,7 +12,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 
 MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger is another file
-MAX_SAID = 200  # characters of what the parser says
+MAX_SAID = 200  # characters of the text of the parser
 MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
 
 # What people write in place of TOML: what the line looks like, and what to write.
@@ -21,7 +21,7 @@ SLIPS = (
         re.compile(r"=\s*(?:[-+]?\d+,\d+\s*(?:#.*)?$|\[[^\]\"']*\d,0\d)"),
         "a number has a decimal point, not a comma",
     ),
-    (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text stands between straight quotation marks, \" or '"),
+    (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text must be in straight quotation marks, \" or '"),
     (
         re.compile(r'"[^"\n]*\\[^"\n]*"'),
         "write / in a path, or put it between single quotation marks",
@@ -29,10 +29,10 @@ SLIPS = (
     (re.compile(r"=\s*(?:True|False|yes|no|on|off)\b", re.IGNORECASE), "write true or false"),
     (
         re.compile(r"^\s*\[{1,2}[^\]]*$|^\s*\[\[[^\]]*\][^\]]*$"),
-        "a section stands in [ ] or [[ ]]",
+        "a section must be in [ ] or [[ ]]",
     ),
     (re.compile(r"=\s*(?:#.*)?$"), "no value follows the ="),
-    (re.compile(r"=\s*[^\W\d][^\"']*$"), "text stands between quotation marks"),
+    (re.compile(r"=\s*[^\W\d][^\"']*$"), "text must be in quotation marks"),
     (re.compile(r"^[^=\[#]+$"), "neither a section in [ ] nor a key with = and its value"),
 )
 
@@ -79,14 +79,14 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
 
 
 def _slip(text: str, message: str, repeated: Collection[str]) -> str:
-    """Return where and what is wrong in words for people; what the parser says where it is nothing usual."""
+    """Return where and what is wrong in words; the text of the parser where it is nothing usual."""
     found = re.search(r"\(at line (\d+), column \d+\)$", message)
     number = int(found[1]) if found else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
     if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
         return f", line {number}: {_doubled(text.splitlines(), number, section[1], repeated)}"
     if message.startswith("Cannot overwrite a value"):
-        return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} stands twice"
+        return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} is there twice"
     for looks, write in SLIPS if len(line) <= MAX_SAID else ():
         if looks.search(line):
             return f", line {number}: {as_plain(line.strip())}: {write}"
@@ -94,17 +94,17 @@ def _slip(text: str, message: str, repeated: Collection[str]) -> str:
 
 
 def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
-    """Return where a section that stands twice stands first, and what to write."""
+    """Return where a section that is there twice is first, and what to write."""
     found = (_SECTION.match(one) for one in lines[: number - 1])
     first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
     shown = as_plain(name[:MAX_SAID])
     where = "" if first is None else f", first in line {first}"
     write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"
-    return f"[{shown}] stands twice{where}; {write}"
+    return f"[{shown}] is there twice{where}; {write}"
 
 
 def _cut(message: str) -> str:
-    """Return what the parser says without the middle of a long key; where it stands comes last."""
+    """Return the text of the parser without the middle of a long key; the place comes last."""
     kept = (
         message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
     )

@@ -40,7 +40,7 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
 
     Args:
         out: the folder; absent, empty, or an unchanged earlier one, which is kept until the new one is there.
-        what: what is written, for the message, if the path alone does not say it.
+        what: what is written, for the message, if the path alone does not show it.
         replaceable: whether it gets a list of its files, by which a later one may take its place.
 
     Yields:
@@ -69,7 +69,7 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
 
     Args:
         path: the file.
-        what: what is written, for the message, if the path alone does not say it.
+        what: what is written, for the message, if the path alone does not show it.
         replaces: whether the caller knows an earlier file to be written by the program, which is replaced.
 
     Yields:
@@ -96,7 +96,7 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
 
     Args:
         folder: it gets a list of them, by which later ones may take their place.
-        what: what is written, for the message, if the path alone does not say it.
+        what: what is written, for the message, if the path alone does not show it.
 
     Yields:
         An empty folder; what is made in it is files.

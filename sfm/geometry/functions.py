@@ -72,7 +72,7 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
     Args:
         a: first vector, of any length.
         b: second vector.
-        undirected: whether they stand for lines or planes, whose angle is at most a right one.
+        undirected: whether they are those of lines or planes, whose angle is at most a right one.
 
     Raises:
         GeometryError: parallel vectors, whose angle has no derivative, or one without length.

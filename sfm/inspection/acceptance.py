@@ -202,7 +202,7 @@ def _refuse_own_scale(
     """Refuse lengths on a bar that gave the scale."""
     if bars is None or not (bars or control):
         raise GeometryError(
-            f"{name}: nothing says what its scale comes from, it must come from other bars than those tested"
+            f"{name}: the origin of its scale is not stated, it must come from other bars than those tested"
         )
     given, fixed = set(bars), set(control)
     for line in dict.fromkeys(lengths.line):

@@ -1,6 +1,6 @@
 """Whether kernels are being compiled, which takes a minute that a person wants to know of.
 
-Numba itself says when it begins to compile, and says nothing when it takes a form that it has kept.
+Numba itself reports when it begins to compile, and reports nothing when it takes a form that it has kept.
 
 Source: numba, developer manual, "Notes on the event API", event numba:compile.
 """

@@ -36,7 +36,7 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
 
 @cache
 def cache_folder(module: str) -> str:
-    """Return where the compiled functions of a module are kept; where numba says if none can write here."""
+    """Return where the compiled functions of a module are kept; elsewhere by numba if none can write here."""
     sources = source_hash(module)
     if sources is None or not os.access(KEPT.parent, os.W_OK):
         return ""

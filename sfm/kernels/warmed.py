@@ -43,7 +43,7 @@ def _folder() -> Path:
 
 @cache
 def _mark() -> str:
-    """Name of the file that stands for the sources of all kernels."""
+    """Name of the file that represents the sources of all kernels."""
     digest = hashlib.sha256(numba.__version__.encode())
     for module, source in sorted(sources_of(WARM_UP).items()):
         if DECORATORS in source:

@@ -32,7 +32,7 @@ START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make
 
 @dataclass(frozen=True)
 class ConjugatePoints:
-    """Points of the left photograph and where they are in the right one; NaN where the reason says why."""
+    """Points of the left photograph and where they are in the right one; NaN where there is a reason."""
 
     method: str  # ncc | lsm | lsm8 | shift
     left: FloatArray  # px, (k, 2)

@@ -82,5 +82,5 @@ class AntennaPositions(RowKind):
 
     @classmethod
     def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
-        """Return the observations of a table; the lever arms stand before the values."""
+        """Return the observations of a table; the lever arms come before the values."""
         return cls(indices[0], value[:, :3], value[:, 3:], sigma)

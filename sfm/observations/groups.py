@@ -51,7 +51,7 @@ class Group(TableKind):
 
     texts: ClassVar[tuple[str, ...]] = ("group", "point")
     labelled: ClassVar[bool] = True  # whether the first of these names the group alone, and no point
-    least: ClassVar[int]  # points that a group needs to say anything
+    least: ClassVar[int]  # points that a group needs to be of use
 
     group: str
     point: IntArray  # indices of the points, (p,)

@@ -46,5 +46,5 @@ class HorizontalDirections(Group):
     def of_group(
         cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
-        """Return the directions from a station, whose point stands before those of its targets."""
+        """Return the directions from a station, whose point comes before those of its targets."""
         return cls(group, np.concatenate([[number[group]], points[:, 0]]), value, sigma)

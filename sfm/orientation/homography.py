@@ -48,7 +48,7 @@ def transfer_residuals(H: FloatArray, first: FloatArray, second: FloatArray) -> 
 def decompose_homography(
     H: FloatArray, first: FloatArray, second: FloatArray
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return (base, rotation, normal) of the camera pairs that a homography stands for.
+    """Return (base, rotation, normal) of the camera pairs that a homography describes.
 
     Args:
         H: r2 ~ H r1 for rays r = (u, v, -1), its sign such that depths are positive, shape (3, 3).

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from sfm.photographs.file_checks import opened_header
 from sfm.photographs.satellite_positions import SatellitePosition, satellite_position
 
-# Beyond these what EXIF data say is no camera: principal distance and pixel in mm.
+# Beyond these EXIF data describe no camera: principal distance and pixel in mm.
 FOCAL_MM = (0.1, 1e5)
 PIXEL_MM = (1e-5, 1.0)
 
@@ -41,7 +41,7 @@ class Metadata:
     lens: str | None = None
     """model of the lens"""
     taken_px: tuple[int, int] | None = None
-    """width and height as the camera says it took them, px"""
+    """width and height as the camera states them, px"""
     taken: datetime | None = None
     """when, by the clock of the camera"""
     position: SatellitePosition | None = None

@@ -155,7 +155,7 @@ def _nouns(names: tuple[str, ...], other: str) -> list[str]:
 
 
 def _number(one: Quantity, spec: str) -> str:
-    """Write a number with three significant digits, or as the format says, and its unit."""
+    """Write a number with three significant digits, or as the format asks, and its unit."""
     if not np.isfinite(one.value):
         return "not known"
     if spec == "<":

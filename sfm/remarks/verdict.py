@@ -49,7 +49,7 @@ class Verdict:
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     """Return the verdict on a result; what others of its remarks explain is left out.
 
-    A warning that explains an error takes its severity: the result is as bad, and the reason is said.
+    A warning that explains an error takes its severity: the result is as bad, and the reason is stated.
 
     Args:
         remarks: all that was found, in the order in which it is to be read within a severity.

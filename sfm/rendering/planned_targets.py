@@ -1,7 +1,7 @@
 """Photographs of a plan: its points as circular targets, coded ones with their ring.
 
 Each target is on a separate card that faces as its point does. Cards and background are of one brightness,
-so that nothing but targets is seen; a photograph has those that the plan says it shows, since what hides the
+so that nothing but targets is seen; a photograph has those that the plan predicts, since what hides the
 others is not painted.
 """
 

@@ -405,7 +405,7 @@ def project_targets(
 
 
 def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -> bool:
-    """Return whether any face stands between the camera and any of the points of one face."""
+    """Return whether any face is between the camera and any of the points of one face."""
     faces = scene.faces
     direction = points - position
     for f, normal in enumerate(faces.normals()):

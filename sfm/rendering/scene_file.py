@@ -169,7 +169,7 @@ def read_scene(path: Path) -> Staging:
         The scene, camera, stations and what else is needed to render its photographs.
 
     Raises:
-        SurveyFileError: the file is missing, is no TOML, or says something that a scene file may not say.
+        SurveyFileError: the file is missing, is no TOML, or has an entry that a scene file may not have.
     """
     _, table = read_toml(path, "a scene file")
     try:

@@ -74,7 +74,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
     placed = "shift, rotation and scale; the scale was taken from the control."
     if adjustment.network.scale_bars:
         placed = (
-            "shift and rotation, in the scale of the scale bars; the control says lengths are "
+            "shift and rotation, in the scale of the scale bars; by the control lengths are "
             f"{general(check.scale, 9)} times those of the scale bars."
         )
     note = Note(

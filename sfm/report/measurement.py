@@ -112,7 +112,7 @@ def _tolerances(found: Measurement) -> tuple[Part, ...]:
         for one in found.tolerances
     ]
     note = Note(
-        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma where a tolerance says nothing else: in "
+        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma where a tolerance states nothing else: in "
         "and out are proven, undecided is what lies within U of a limit."
     )
     parts: list[Part] = [Table(columns, rows), note]

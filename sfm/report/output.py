@@ -68,7 +68,7 @@ def write_result(
     """Write everything that a survey gives into one folder, whole or not at all.
 
     Args:
-        findings: the result and what is said of it.
+        findings: the result and the remarks on it.
         out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
         finish: is given the folder when all else is in it, and may add log.jsonl.

@@ -1,7 +1,8 @@
 """Declared pages: what a page shows, and its tables as text, CSV and JSON. `html` renders it as HTML.
 
-A page is sections of tables, figures and words below a verdict. Its tables hold plain values; columns say how
-a value is named and written, so that the page, the terminal and the files beside the page share one table.
+A page is sections of tables, figures and words below a verdict. Its tables hold plain values; columns state
+how a value is named and written, so that the page, the terminal and the files beside the page share one
+table.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sentences that more than one report says, and the terminal: the same words everywhere."""
+"""Sentences that several reports and the terminal print: the same words everywhere."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def describe_neighbours(a: Adjustment) -> str:
 
 
 def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
-    """Return what a global test says, with what would fit where the stated values are too cautious.
+    """Return the outcome of a global test, with what would fit where the stated values are too cautious.
 
     Args:
         test: of all observations, or of a kind.

@@ -19,7 +19,7 @@ from sfm.report.numbers import fixed, general
 from sfm.report.page import YES, Column, Folded, Note, Page, Paragraph, Section, Table
 
 TIME_CAPTION = (
-    "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
+    "Seconds of adjustment on one thread. The other adjuster runs until its cost is constant, for the sake "
     "of the comparison; in everyday use it stops earlier."
 )
 TRIALS = (

@@ -32,7 +32,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Sent:
-    """A function at work said something."""
+    """A function at work sent a message."""
 
     key: str
     message: dict[str, Any]

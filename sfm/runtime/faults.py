@@ -81,7 +81,7 @@ def keep_traceback(error: Exception) -> Path | None:
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error says so, or one that it was raised in the handling of."""
+    """Whether an error is of memory, or one that it was raised in the handling of."""
     while error is not None:
         said = isinstance(error, ImportError | RuntimeError) and any(one in str(error) for one in NO_MEMORY)
         if said or isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:

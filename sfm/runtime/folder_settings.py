@@ -55,5 +55,5 @@ def closed_current_folder() -> Iterator[None]:
 
 
 def _folders(variable: str) -> str:
-    """Return a path of folders without empty ones, which stand for the current folder."""
+    """Return a path of folders without empty ones, which mean the current folder."""
     return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)

@@ -18,7 +18,7 @@ MIN_SINGULAR_RATIO = 1e-9  # second singular value over the first
 
 @dataclass(frozen=True)
 class FiducialTransformation:
-    """photo = matrix @ measured + shift, with what the fiducial marks say about it."""
+    """photo = matrix @ measured + shift, with its precision by the fiducial marks."""
 
     kind: str  # similarity (4 parameters) | affine (6 parameters)
     matrix: FloatArray  # [[a11, a12], [a21, a22]], mm per comparator unit, (2, 2)

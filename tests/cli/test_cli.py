@@ -268,7 +268,7 @@ def test_fewer_than_two_orientable_photographs(
         ("unit =", "units =", "survey.toml, line 3: unknown key 'units' in [survey]"),
         ("c_mm = 10.2", 'c_mm = "10.2"', "line 8: camera 1.c_mm: found '10.2', needed a number"),
         ('"ring14"', '"ring15"', "targets.codes = 'ring15' is neither one of"),
-        ("[[scale_bar]]", "[[scale_bar]", "a section stands in [ ] or [[ ]]"),
+        ("[[scale_bar]]", "[[scale_bar]", "a section must be in [ ] or [[ ]]"),
     ],
 )
 def test_wrong_survey_files(

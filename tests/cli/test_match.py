@@ -150,7 +150,7 @@ def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -
         ("id,x\n1,2\n", "unknown column 'id', needed point,x_px,y_px"),
         ("point,x_px,y_px\n1,2,nan\n", "line 2: column y_px contains 'nan'"),
         ("point,x_px,y_px\na,60,60\nb,240\n", "line 3: 2 columns, the header has 3"),
-        ("point,x_px,y_px\na,60,60\na,70,60\n", "line 3: point 'a' stands on line 2 already"),
+        ("point,x_px,y_px\na,60,60\na,70,60\n", "line 3: point 'a' is on line 2 already"),
         ("point,x_px,y_px\n", "no rows below the header"),
         ("", "no column point"),
     ):

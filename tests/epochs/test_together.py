@@ -186,7 +186,7 @@ def test_what_cannot_be_adjusted_together_is_one_line() -> None:
         adjust_together((first, with_camera(name="another")))
     with pytest.raises(GeometryError, match="has another model, size or other free parameters in epoch 85"):
         adjust_together((first, with_camera(free=np.zeros(len(camera.free), dtype=bool))))
-    with pytest.raises(GeometryError, match=r"epoch 85: its summary\.json says no sigma0_px"):
+    with pytest.raises(GeometryError, match=r"epoch 85: its summary\.json has no sigma0_px"):
         adjust_together((first, replace(second, sigma0_px=None)))
     heavier = replace(second, sigma0_px=10.0)
     with pytest.raises(GeometryError, match="epoch 85: adjusting its image points again leads"):

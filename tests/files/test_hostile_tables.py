@@ -146,7 +146,7 @@ def test_of_very_many_missing_keys_some_are_named(tmp_path: Path) -> None:
 def test_what_the_parser_says_of_a_long_key_is_cut(tmp_path: Path) -> None:
     key = f"[{'x' * 5000}]\n"
     (tmp_path / "s.toml").write_text(key + key, encoding="utf-8")
-    with pytest.raises(SurveyFileError, match=r"line 2: .*xxx.* stands twice, first in line 1") as refused:
+    with pytest.raises(SurveyFileError, match=r"line 2: .*xxx.* is there twice, first in line 1") as refused:
         read_survey(tmp_path / "s.toml")
     assert len(str(refused.value)) < 500
 

@@ -118,8 +118,8 @@ def test_a_scale_from_what_is_tested_is_refused() -> None:
     for options, told in (
         ({"bars": ["1.3 - 1.0"]}, "line 1: bar 1.3 - 1.0 gave the scale"),
         ({"bars": ["1.2 - 1.5"]}, "line 1: bar 1.2 - 1.5 gave the scale"),  # on the same line
-        ({"bars": None}, "nothing says what its scale comes from"),
-        ({"bars": []}, "nothing says what its scale comes from"),
+        ({"bars": None}, "the origin of its scale is not stated"),
+        ({"bars": []}, "the origin of its scale is not stated"),
         ({"bars": [], "control": ["2.0", "2.4"]}, "line 2: 2.0 and 2.4 are control points"),
         ({"a": -1.0}, "expected A and K not negative"),
     ):
@@ -136,7 +136,7 @@ def test_a_scale_from_what_is_tested_is_refused() -> None:
     [
         ("line,from,to,length\n1,a,b,0\n", "line 2: column length contains 0, needed more than 0"),
         ("line,from,to,length\n1,a,a,5\n", "line 2: both ends are point a, two points are needed"),
-        ("line,from,to,length\n1,a,b,5\n2,b,a,5\n", "line 3: from 'a', to 'b' stands on line 2 already"),
+        ("line,from,to,length\n1,a,b,5\n2,b,a,5\n", "line 3: from 'a', to 'b' is on line 2 already"),
         ("line,from,to,length,sigma\n1,a,b,5,-1\n", "column sigma contains -1, needed more than 0"),
         ("from,to,length\na,b,5\n", "no column line, needed line,from,to,length"),
     ],
@@ -163,7 +163,7 @@ def test_the_command_knows_where_the_scale_comes_from(tmp_path: Path) -> None:
     ]
     assert read_scale_sources(tmp_path / "result") == (None, ())
     refused = CliRunner().invoke(app, [*words, "--limit-a", "0.1"])
-    assert "nothing says what its scale comes from" in str(refused.exception)
+    assert "the origin of its scale is not stated" in str(refused.exception)
     head = "kind,name,coordinate,unit,given,difference,sigma,r,w\n"
     (tmp_path / "result" / "given.csv").write_text(head + "scale bar,p1 - p25,length,m,1.7,0,1e-5,0.5,\n")
     bare = tmp_path / "bare.csv"

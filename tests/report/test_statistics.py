@@ -468,7 +468,7 @@ def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate])
     bars = with_bars(known, truth, (0.0,), 1e-4)
     barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
     page = " ".join(html_of(findings_of(barred)).split())
-    assert "the control says lengths are 1.0025 times those of the scale bars" in page
+    assert "by the control lengths are 1.0025 times those of the scale bars" in page
     words = describe_check(check, "m")
     assert "largest 173 µm" in words and words in page and words in text_report(findings_of(barred))
     assert "A single bar gives the scale" in page

@@ -286,7 +286,7 @@ def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> No
         (CENTRES + "image 1,1,2,3,1,-1,1\n", r"line 2: column sY contains -1, needed 0 \(fixed\) or more"),
         (CENTRES + "image 1,1,2,3,1,,1\n", r"line 2: column sY is empty beside a value in Y; needed both"),
         (CENTRES + "image 1,1,,3,1,1,1\n", r"line 2: column Y is empty beside a value in sY; needed both"),
-        (CENTRES + "image 1,0,0,0,1,1,1\nimage 1,1,1,1,1,1,1\n", r"line 3: image 'image 1' stands on line 2"),
+        (CENTRES + "image 1,0,0,0,1,1,1\nimage 1,1,1,1,1,1,1\n", r"line 3: image 'image 1' is on line 2"),
         (
             CENTRES + "image 1,0,0,0,1,1,1\nimage 9,1,1,1,1,1,1\n",
             r"line 3: column image: 'image 9' has no obs",

@@ -197,7 +197,7 @@ def test_start_values_of_cameras_are_read_and_refused(tmp_path: Path) -> None:
     assert run_survey(good).adjustment.converged
     with pytest.raises(SurveyFileError, match=r"line 2: camera 'other' is not in the survey"):
         run_survey(started("camera,parameter,value\nother,c,10.1\n"))
-    with pytest.raises(SurveyFileError, match="stands on line 2 already"):
+    with pytest.raises(SurveyFileError, match="is on line 2 already"):
         started("camera,parameter,value\nsynthetic,c,10.1\nsynthetic,c,10.1\n")
     settings = {"name": "a", "images": "*", "size_px": [100, 80], "pixel_mm": [0.01, 0.01]}
     with pytest.raises(SurveyFileError, match="'K1' is not in free"):

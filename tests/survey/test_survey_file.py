@@ -169,24 +169,24 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         ),
         ("c_mm = 7.3", "c_mm = 7.3\nsensor_mm = [7, 5]", r"pixel_mm and sensor_mm are both given"),
         ('[control]\nfile = "control.csv"', "", None),
-        ("[survey]", "[survey", r"line 1: \[survey: a section stands in \[ \]"),
+        ("[survey]", "[survey", r"line 1: \[survey: a section must be in \[ \]"),
         ("c_mm = 7.3", "c_mm = 7,3", r"line \d+: c_mm = 7,3: a number has a decimal point, not a comma"),
-        ('name = "camcal"', "name = camcal", r"line 2: name = camcal: text stands between quotation marks"),
+        ('name = "camcal"', "name = camcal", r"line 2: name = camcal: text must be in quotation marks"),
         (
             'name = "camcal"',
             "name = \u201ccamcal\u201d",
-            r"line 2: .*: text stands between straight",
+            r"line 2: .*: text must be in straight",
         ),
         ('name = "camcal"', 'name = "C:\\Users\\x"', r"line 2: .*: write / in a path, or put it"),
         ('name = "camcal"', "name = True", r"line 2: name = True: write true or false"),
         ('name = "camcal"', "name =", r"line 2: name =: no value follows"),
         ('name = "camcal"', "camcal", r"line 2: camcal: neither a section in \[ \] nor a key"),
-        ('name = "camcal"', 'name = "camcal"\nname = "b"', r"line 3: name stands twice"),
-        ("[control]", "[survey]", r"line \d+: \[survey\] stands twice, first in line 1; put"),
+        ('name = "camcal"', 'name = "camcal"\nname = "b"', r"line 3: name is there twice"),
+        ("[control]", "[survey]", r"line \d+: \[survey\] is there twice, first in line 1; put"),
         (
             "[control]",
             "[camera]",
-            r"line \d+: \[camera\] stands twice, first in line 4; write \[\[camera\]\]",
+            r"line \d+: \[camera\] is there twice, first in line 4; write \[\[camera\]\]",
         ),
         ("c_mm = 7.3", "c_mm = 7.3\npixel_mm = [0,005, 0,005]", r"line \d+: .*: a number has a decimal"),
         ('name = "camcal"', "name = [1 2]", r"not a TOML file: .*line 2"),
@@ -458,7 +458,7 @@ def test_bad_tables_are_named_with_their_line(tmp_path: Path, table: str, match:
 def test_bad_control_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n')
     for table, match in (
-        ("id,X,Y,Z\n1,0,0,0\n1,1,1,1\n", "line 3: id '1' stands on line 2 already"),
+        ("id,X,Y,Z\n1,0,0,0\n1,1,1,1\n", "line 3: id '1' is on line 2 already"),
         ("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,0,-1,0\n", r"column sY contains -1, needed 0 \(fixed\) or more"),
         ("id,X,Y\n1,0,0\n", "no column Z"),
     ):

@@ -41,7 +41,7 @@ CENTRE_PX = 0.1  # largest error of a drawn dot
 def doctor() -> None:
     """Check this installation by a short measurement and adjustment.
 
-    Prints versions, cores and folders, too. Exit code 1 if a check fails; the line says what to do.
+    Prints versions, cores and folders, too. Exit code 1 if a check fails; the line states what to do.
     """
     with loading():
         from sfm.files.user_cache import user_folder

@@ -29,7 +29,7 @@ def epochs(
         typer.Option(
             "--reference",
             metavar="P,Q,...",
-            help="Points taken as stable until a test says otherwise: names, patterns such as R*, ranges "
+            help="Points taken as stable until a test shows otherwise: names, patterns such as R*, ranges "
             "such as 501-520.  [default: all]",
         ),
     ] = "",

@@ -1,4 +1,4 @@
-"""Commands on finished results: what their coordinates say of the object, and acceptance tests."""
+"""Commands on finished results: shapes and distances of the object, and acceptance tests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sfm.display import counted
 from sfm.runtime.faults import working_on
 
 NOT_KEPT = 1  # exit code where a limit is proven not to be kept
-MAX_PRINTED = 40  # distances, angles and heights; all of them stand in quantities.csv
+MAX_PRINTED = 40  # distances, angles and heights; all of them are in quantities.csv
 
 if TYPE_CHECKING:
     from sfm.inspection.measure import Measurement

@@ -1,4 +1,4 @@
-"""Commands before a survey: where to stand, what that will give, and how large targets must be."""
+"""Commands before a survey: where to stand, the precision expected, and how large targets must be."""
 
 from __future__ import annotations
 
@@ -256,7 +256,7 @@ def network_command(
         )
     if sigma_px is None and diameter is None:
         raise SurveyFileError(
-            "plan: needed --sigma-px or --target-diameter, which say how precise image points are"
+            "plan: needed --sigma-px or --target-diameter, which state how precise image points are"
         )
     if (camera is None) == (survey is None):
         raise SurveyFileError("plan: needed --camera or --survey, one of them")

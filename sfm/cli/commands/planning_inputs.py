@@ -170,7 +170,7 @@ def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera
     names = [camera.name for camera in cameras]
     if name is None and len(cameras) > 1:
         raise SurveyFileError(
-            f"{where}: {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), say one with "
+            f"{where}: {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
             "--camera-name"
         )
     found = [camera for camera in cameras if name in (None, camera.name)]
@@ -186,7 +186,7 @@ def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
     found = [one for one in setups if name in (None, one.name)]
     if len(found) != 1:
         names = ", ".join(one.name for one in setups)
-        raise SurveyFileError(f"{path}: cameras {names:.80}, say one of them with --camera-name")
+        raise SurveyFileError(f"{path}: cameras {names:.80}, choose one of them with --camera-name")
     return _of_settings(path, found[0], c_mm)
 
 

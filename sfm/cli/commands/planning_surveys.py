@@ -27,7 +27,7 @@ def simulate_command(
     """Photograph a plan by rendering, run the survey, and compare it.
 
     Its points become targets, its rig, scale bars and observations have errors as planned; predicted standard
-    deviations stand beside those achieved and the true errors.
+    deviations are beside those achieved and the true errors.
     """
     with loading():
         from sfm.api import run_survey

@@ -28,7 +28,7 @@ def loading() -> Iterator[None]:
     """Import what a command needs, which takes a second.
 
     Ctrl-C ends the program right there, since nothing is begun that could be left half-done: an exception
-    would be swallowed by the machinery of imports, or come out of it as an ImportError. From here on the
+    would be swallowed by the machinery of imports, or leave it as an ImportError. From here on the
     compiling of kernels is announced.
     """
     before = signal.getsignal(signal.SIGINT)

@@ -156,7 +156,7 @@ def adjust(
     """Run a survey from measured image points to the report.
 
     They are those of [observations] in the survey file, in place of photographs.  Exit code 0 with a
-    result, remarks or none; 1 if the result cannot be depended on, the report says why; 2 where a person
+    result, remarks or none; 1 if the result cannot be depended on, the report states why; 2 where a person
     must put something right.
     """
     _run_survey(

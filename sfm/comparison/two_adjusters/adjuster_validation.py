@@ -281,7 +281,7 @@ def apart(a: float, b: float, sigma_px: float) -> float:
 
 def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> str:
     """Return how two adjusters ended, a kind of remark, by their costs (px^2) and why they failed."""
-    # An adjuster that ends at the optimum of the other has solved the network, whatever it says of itself.
+    # An adjuster that ends at the optimum of the other has solved the network, whatever it reports.
     if apart(a, b, sigma_px) <= SAME_SIGMAS:
         return "same_optimum"
     if ours and theirs:

@@ -7,7 +7,7 @@ survey in `brown` is `full_opencv`.
 With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
 the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
 all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's
-result in both adjusters, and the comparison says so.
+result in both adjusters, and the comparison reports it.
 
 Cameras that share single parameters, for adjusters that know no such sharing.
 """
@@ -101,7 +101,7 @@ class BackendAdjustment(Protocol):
 
     @property
     def converged(self) -> bool:
-        """Whether it says that it has converged."""
+        """Whether it reports that it has converged."""
 
     @property
     def seconds(self) -> float:

@@ -1,7 +1,7 @@
 """Whether the other adjuster's camera fits the image points better than that of the survey, and what to free.
 
 COLMAP frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
-that has more free than the survey's; that they agree then says nothing about the survey.
+that has more free than the survey's; that they agree then proves nothing about the survey.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class ShapeFit:
 
     @property
     def fits(self) -> bool | None:
-        """Whether the residuals are as the covariance of the points says; None where that is not tested."""
+        """Whether the residuals agree with the covariance of the points; None where that is not tested."""
         return None if np.isnan(self.statistic) else bool(self.statistic <= self.critical)
 
     @property

@@ -69,7 +69,7 @@ def refine_weighted(
         free: which of the six motions and the form are adjusted, (6 + q,).
         offset: signed distances that the points shall have, (c,).
         size: unit of the points in those of the covariance.
-        placed: whether the origin may stand anywhere along the axis.
+        placed: whether the origin may be anywhere along the axis.
 
     Raises:
         GeometryError: the covariance is singular beyond what the free parameters take up, or the adjustment

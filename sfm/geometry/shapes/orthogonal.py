@@ -34,7 +34,7 @@ def refine_orthogonal(
         free: which of the six motions and the form are adjusted, (6 + q,).
         offset: signed distances that the points shall have, (c,).
         weight: of each point, (n,); equal if not given.
-        placed: whether the origin may stand anywhere along the axis.
+        placed: whether the origin may be anywhere along the axis.
         iterations: at most.
 
     Returns:
@@ -73,7 +73,7 @@ def refine_orthogonal(
             damping *= max(1 / 3, 1 - (2 * min(gain, 2.0) - 1) ** 3)
             growth = 2.0
         elif abs(new_cost - cost) <= 1e-13 * cost and size < 1e-5:
-            # rounding hides the gain: the gradient still says where to go
+            # rounding hides the gain: the gradient still shows where to go
             if float(np.abs(new_A.T @ new_e).max()) >= float(np.abs(h).max()):
                 return shape, cost, True
             shape, e, A, cost = trial, new_e, new_A, new_cost

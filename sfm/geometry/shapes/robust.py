@@ -46,7 +46,7 @@ def robust_shape(
         origin: where it must lie, None if that is free.
         axis: its direction, None if that is free.
         form: held form parameters, NaN of the free ones, (q,).
-        placed: whether the origin may stand anywhere along the axis.
+        placed: whether the origin may be anywhere along the axis.
 
     Raises:
         GeometryError: too few points to separate the good ones from the others.

@@ -41,7 +41,7 @@ MIN_CONTRAST = 1.0 / 255.0
 
 @dataclass(frozen=True)
 class NccMatches:
-    """Best places of templates in their search windows; NaN in `xy` where the flag says why."""
+    """Best places of templates in their search windows; NaN in `xy` where the flag gives the reason."""
 
     xy: FloatArray  # place in the right photograph, px, (k, 2)
     peak: FloatArray  # best place to a whole pixel, whatever the flag, px, (k, 2)

@@ -65,7 +65,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True)
 class LsmMatches:
-    """Positions in the right photograph found by least squares matching; NaN where the flag says why."""
+    """Positions in the right photograph found by least squares matching; NaN with the reason in the flag."""
 
     xy: FloatArray  # place of the left point in the right photograph, px, (k, 2)
     covariance: FloatArray  # of xy, px^2, (k, 2, 2)

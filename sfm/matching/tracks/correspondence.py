@@ -79,7 +79,7 @@ def match_targets(
         tolerance_px: largest distance of a target from its projected point; it must cover the error of
             the orientation and should stay below a quarter of the spacing of the targets.
         min_rays: fewest photographs that make a point; with 2, pairs that have no rival are added.
-        kinds: only targets of the same number match (dark and bright, say), m arrays (k_i,).
+        kinds: only targets of the same number match (as dark and bright), m arrays (k_i,).
         diameters_px: diameters of the targets; with them, only targets match whose sizes at the object
             agree, m arrays (k_i,).
         max_size_ratio: largest ratio of two diameters at the object for one target.
@@ -290,7 +290,7 @@ def _window(camera: Camera) -> FloatArray:
 
 
 def _pairs(estimate: Estimate, max_partners: int) -> IntArray:
-    """Return pairs of photographs: each with the nearest ones that do not stand in the same place."""
+    """Return pairs of photographs: each with the nearest ones that are not in the same place."""
     index = np.flatnonzero(estimate.oriented)
     base = np.linalg.norm(estimate.position[index][:, None] - estimate.position[index][None], axis=2)
     apart = base > 1e-3 * base.max(initial=0.0)

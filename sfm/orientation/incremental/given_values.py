@@ -1,7 +1,7 @@
 """Given start values of a network: completed and adjusted as they are, judged afterwards.
 
 A photograph is oriented anew only where most of its image points do not fit the others after the adjustment;
-where most photographs do not, the given values are not what they say, and the caller starts without them.
+where most photographs do not, the given values are wrong, and the caller starts without them.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class Support:
 
     @property
     def doubtful(self) -> BoolArray:
-        """Photographs of whose image points fewer than half are where the network says, (m,).
+        """Photographs of whose image points fewer than half are where the network predicts, (m,).
 
         Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be distinguished from its contrary
         if more than half of what it rests on contradicts it.

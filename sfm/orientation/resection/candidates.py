@@ -147,7 +147,7 @@ def ordered(solutions: list[ResectionSolution]) -> tuple[ResectionSolution, ...]
 def checked_points(
     method: str, tangents: FloatArray, points: FloatArray, *, needed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return image and object points as arrays, or say why a method cannot use them.
+    """Return image and object points as arrays, or raise with the reason why a method cannot use them.
 
     Raises:
         GeometryError: too few points, unequal numbers, values that are not finite, coincident points, or

@@ -29,7 +29,7 @@ ROWS = (
         SHIFT,
         "{photographs}, taken as one camera[[ {camera}]], are not of one[[: from the first to the second c "
         f"changes by {{change:+}}]][[, the principal point by {{away}}]]. {SHIFTED}{INSTEAD}",
-        "zoom, focus or camera changed between the two, or one was cropped or resampled; nothing says which",
+        "zoom, focus or camera changed between the two, or one of them was cropped or resampled",
         "Give each a camera in the survey file, or set per_photograph.",
         short="another camera in one of two photographs",
         explains=OF_GIVEN,

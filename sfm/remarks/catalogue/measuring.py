@@ -170,7 +170,7 @@ ROWS = (
         "temperature_unknown",
         "note",
         "The temperature of the lengths, and whether they were corrected for it, are not known here.",
-        "no file says so",
+        "no file states it",
         "Correct the lengths for temperature before the test.",
     ),
 )

@@ -18,7 +18,7 @@ ROWS = (
         "The image points do not separate the solutions of Kolinear and {program}: v'Pv differs by {gap} "
         "variances.",
         "the network hardly determines the camera model of the comparison",
-        "The survey stands; photograph from more directions and distances for a comparison of cameras.",
+        "The survey is valid; photograph from more directions and distances for a comparison of cameras.",
     ),
     Kind(
         "adjuster_fits_better",
@@ -33,14 +33,14 @@ ROWS = (
         "warning",
         "The comparison with another adjuster failed: {reason}.",
         "the other program refused the network",
-        "The survey stands without it.",
+        "The survey is valid without it.",
     ),
     Kind(
         "pipeline_failed",
         "warning",
         "The comparison with another pipeline failed: {reason}.",
         "the other program refused the photographs",
-        "The survey stands without it.",
+        "The survey is valid without it.",
     ),
     Kind(
         "adjuster_not_compared",

@@ -1,4 +1,4 @@
-"""Everything that the reports of a survey say, computed once: Findings.
+"""Everything that the reports of a survey state, computed once: Findings.
 
 Whatever prints a result takes its numbers from here: statistics, checks, geometry, given values, precision,
 protocol, verdict.
@@ -53,7 +53,7 @@ UNCODED = -1
 
 @dataclass(frozen=True)
 class Findings:
-    """A result and everything that is said about it."""
+    """A result and everything that is reported of it."""
 
     result: SurveyResult
     verdict: Verdict
@@ -82,7 +82,7 @@ def with_remark(findings: Findings, new: Remark) -> Findings:
 
 
 def findings_of(result: SurveyResult) -> Findings:
-    """Return everything that the reports say of a result."""
+    """Return everything that the reports state of a result."""
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given = given_of(a, result.length_unit)

@@ -81,7 +81,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return the farthest other solution that the image points allow, and the farthest reversed in depth.
 
-    Along a flat valley of c there are many; what lies between them says nothing more.
+    Along a flat valley of c there are many; those between them add nothing.
     """
     found: list[Remark] = []
     for other in sorted(result.other_solutions, key=lambda one: -one.moved):

@@ -36,7 +36,7 @@ def displacements_viewer(found: EpochSeries) -> Viewer | None:
 
 
 def _scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
-    """Return the scene of an epoch with the displacement of every point and what the test says of it.
+    """Return the scene of an epoch with the displacement of every point and the outcome of its test.
 
     Standard deviations and ellipsoids are those of the displacements.
 

@@ -112,7 +112,7 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
                 continue
             larger = max(float(np.median(size[here])), 0.0)
             gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())
-            if (code == UNCODED).any():  # few plates are larger than is said
+            if (code == UNCODED).any():  # few plates are larger than stated
                 gain += math.log(STRANGE_PROBABILITY)
             found.append((gain, code))
     if not found:

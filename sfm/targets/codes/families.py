@@ -21,7 +21,7 @@ from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, rin
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
 
 Family = CodeFamily | TagFamily | ConcentricFamily
-TargetFamily = Family | PlateFamily | PlateGroup  # a plate has no name that says all of it
+TargetFamily = Family | PlateFamily | PlateGroup  # a plate has no name that describes all of it
 FAMILIES: dict[str, Callable[[], Family | None]] = {
     **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,
@@ -31,7 +31,7 @@ FAMILIES: dict[str, Callable[[], Family | None]] = {
 
 
 def is_table(codes: str) -> bool:
-    """Return whether what a survey says of its codes is the path of a table and no name."""
+    """Return whether what a survey states as its codes is the path of a table and no name."""
     return codes not in FAMILIES and codes not in PLATES
 
 

@@ -44,7 +44,7 @@ POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST_SHARE = 0.1, 0.4, 0.3
 # residuals of others go together: without, their errors are 3 to 4 sigmas in shadows of 20 to 40 %.
 MAX_NOISE_RATIO, TOGETHER_PX = 1.3, 16.0
 NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE | Flag.POOR_FIT)
-# Radius of the circle that stands for a corner where outlines are drawn, px.
+# Radius of the circle that marks a corner where outlines are drawn, px.
 DRAWN_PX = 4.0
 
 

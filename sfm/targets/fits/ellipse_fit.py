@@ -155,7 +155,7 @@ def _fit_one(
     N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
     steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
     if steps > 0 and theta[model.CONTRAST] * sign > 0:
-        # the edges of neighbours are as soft: their skirts begin farther away from them than the rays say
+        # the edges of neighbours are as soft: their skirts begin farther away from them than the rays show
         wide = np.empty(RAYS)
         trace_rays(image, theta, sign, noise, margin, _skirt(theta[model.BLUR]), edge, wide)
         nearer = False

@@ -1,6 +1,6 @@
 """Crossings of a checkerboard: the point that all edges around it run through, with its covariance.
 
-Every pixel of an edge says that the crossing lies on the line through it across its gradient. Their
+Every pixel of an edge shows that the crossing lies on the line through it across its gradient. Their
 intersection, weighted by the squared gradient, is the crossing; blur, which is the same on both sides of an
 edge, does not move it. The covariance is that of the noise of the intensities, carried through the filters
 and the window, which moves with the crossing.

@@ -80,7 +80,7 @@ def fit_whole_tags(
     The four corners of a tag share background, step, blur and noise. Gains and sharpening are 0.
 
     Source: Gauss-Markov model with Levenberg-Marquardt steps; covariance of the corners by propagation, wider
-    where modules scatter more than their pixels say.
+    where modules scatter more than their pixels show.
     """
     k = len(quads)
     fits = CornerFits(

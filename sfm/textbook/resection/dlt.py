@@ -132,7 +132,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
         norm = np.linalg.norm(h[8:11])
         h /= norm * (np.sign(np.mean(X1 @ h[8:12])) or 1.0)
         A = X1 @ h[8:12]
-        # rows were divided by the last A: distortion parameters come out relative to the new one
+        # rows were divided by the last A: distortion parameters are relative to the new one
         new_k = np.zeros(5)
         if step > 0:
             new_k[columns] = h[12:] / np.mean(A * weight)

@@ -91,7 +91,7 @@ def _position_over_plane(T: FloatArray) -> FloatArray:
     theta = np.arctan(DI_inverse)
     DO = abs(b @ c) / (abs(c[2]) * np.hypot(b[0], b[1]))
     DCP = DO * np.sin(theta)
-    # the camera stands between the foot of its axis and the vanishing line (eqs. 2.28, 2.29)
+    # the camera is between the foot of its axis and the vanishing line (eqs. 2.28, 2.29)
     towards = -np.sign((b @ c) / c[2]) * b[:2] / np.hypot(b[0], b[1])
     xy = foot + towards * DCP * np.sin(theta)
     return np.array([xy[0], xy[1], DCP * np.cos(theta)])

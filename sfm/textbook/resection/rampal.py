@@ -136,7 +136,7 @@ def _further_distance(S: FloatArray, rays: FloatArray, X: FloatArray, i: int) ->
 def _position(S: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
     """Projection centre from distances: differences of the spheres are linear in it, eqs. 2.40-2.43.
 
-    Across the plane of coplanar points (and of three) the linear equations say nothing; there the
+    Across the plane of coplanar points (and of three) the linear equations determine nothing; there the
     spheres of the first three points close the solution.
     """
     closing = trilaterate(X[:3], S[:3], direction_test(rays[:3]))

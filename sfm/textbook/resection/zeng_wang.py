@@ -92,7 +92,7 @@ def direction_test(rays: FloatArray) -> float:
 
 @checked_arguments(points="3 3", distances="3")
 def trilaterate(points: FloatArray, distances: FloatArray, T: float) -> FloatArray:
-    """Return the point at three distances from three points, on the side of their plane that T says.
+    """Return the point at three distances from three points, on the side of their plane that T gives.
 
     Args:
         points: object points, shape (3, 3), object unit.

@@ -98,15 +98,15 @@ def test_bad_summaries_are_refused(folder: Path, text: str, message: str) -> Non
         ),
         ("points.csv", "X", "nan", "points.csv, line 2: column X contains 'nan', a finite number"),
         ("points.csv", "sX", "-0.1", "points.csv, line 2: column sX contains -0.1, needed 0 or more"),
-        ("points.csv", "id", "2", "points.csv, line 3: id '2' stands on line 2 already"),
+        ("points.csv", "id", "2", "points.csv, line 3: id '2' is on line 2 already"),
         ("images.csv", "sZ", "-1", "images.csv, line 2: column sZ contains -1, needed 0 or more"),
-        ("images.csv", "image", "p1.jpg", "images.csv, line 3: image 'p1.jpg' stands on line 2 already"),
+        ("images.csv", "image", "p1.jpg", "images.csv, line 3: image 'p1.jpg' is on line 2 already"),
         ("images.csv", "camera", "x", "images.csv, line 2: camera 'x' is not in cameras.csv"),
         ("cameras.csv", "value", "0", "cameras.csv, line 2: column value contains 0, needed a positive c"),
         ("cameras.csv", "value", "-9", "cameras.csv, line 2: column value contains -9, needed a positive c"),
         ("cameras.csv", "sigma", "-1", "cameras.csv, line 2: column sigma contains -1"),
         ("cameras.csv", "camera", "y", "cameras.csv, line 2: camera 'y' is not in summary.json"),
-        ("cameras.csv", "parameter", "fy", "line 3: camera 'camera 1', parameter 'fy' stands on line 2"),
+        ("cameras.csv", "parameter", "fy", "line 3: camera 'camera 1', parameter 'fy' is on line 2"),
         (
             "image_points.csv",
             "sx_px",
@@ -131,7 +131,7 @@ def test_an_image_point_twice_is_refused(folder: Path) -> None:
     path = folder / "image_points.csv"
     text = path.read_text()
     path.write_text(text + text.splitlines()[1] + "\n")
-    with pytest.raises(SurveyFileError, match=r"image 'p0\.jpg', point '\d' stands on line 2 already"):
+    with pytest.raises(SurveyFileError, match=r"image 'p0\.jpg', point '\d' is on line 2 already"):
         read_result(folder)
 
 
