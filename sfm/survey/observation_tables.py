@@ -169,7 +169,7 @@ def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
 
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
-    """Return the remark on observations whose points or photographs are not in a network."""
+    """Return the remarks on observations whose points or photographs are not in a network."""
     frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
@@ -183,7 +183,11 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
             kind.group for kind in network.observations if isinstance(kind, Group) and type(kind) is one.of
         }
         unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
-    return (remark("observations_unused", observations=unused),) if unused else ()
+    computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
+    return (
+        *([remark("observations_unused", observations=unused)] if unused else []),
+        *([remark("frame_points_computed", points=computed)] if computed else []),
+    )
 
 
 def _names(one: ObservationTable, network: Network) -> tuple[str, ...]:

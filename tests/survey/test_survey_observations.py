@@ -516,6 +516,8 @@ def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
     lines += '[[survey_observations]]\nkind = "rigid frame"\nfile = "probe.csv"\n\n'
     result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
     assert "observations_unused" not in {one.kind for one in result.remarks}
+    (computed,) = [one for one in result.remarks if one.kind == "frame_points_computed"]
+    assert computed.names("points") == ("probe beside", "probe tip")
     (found,) = result.adjustment.group_parameters
     sigma = np.sqrt(np.diagonal(found.covariance))
     assert np.isinf(sigma[:3]).any() and (sigma[3:] < 1e-3).all()

@@ -39,6 +39,14 @@ ROWS = (
         "Correct the names, or look among the points that were left out.",
     ),
     Kind(
+        "frame_points_computed",
+        "note",
+        "{points:point} of rigid frames {points:is|are} in no photograph and computed from the other points of "
+        "the frame: {points}.",
+        "a tip that touches the object, or a mistyped name",
+        "Nothing needs to be done if photographs do not show {points:it|them}; otherwise correct the name.",
+    ),
+    Kind(
         "bar_left_out",
         "warning",
         "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length by the other given "
