@@ -47,6 +47,10 @@ class AntennaPositions(RowKind):
         """Return them with other positions."""
         return replace(self, position=values)
 
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return them with other standard deviations."""
+        return replace(self, sigma=sigma)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the photographs."""
         return (Block(PHOTOGRAPH, self.image),)

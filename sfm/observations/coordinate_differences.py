@@ -26,4 +26,4 @@ class CoordinateDifferences(PointPairs):
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the differences between exchanged points."""
-        return {"exchanged": replace(self, value=-self.value)}
+        return {**super().mistakes(), "exchanged": replace(self, value=-self.value)}

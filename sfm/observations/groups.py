@@ -88,6 +88,10 @@ class Group(TableKind):
         """Return the group with other observed values."""
         return replace(self, value=values.reshape(self.value.shape))
 
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return them with other standard deviations."""
+        return replace(self, sigma=sigma)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return the points, each a block."""
         return tuple(Block(POINT, self.point[k : k + 1][: len(self)]) for k in range(len(self.point)))

@@ -40,7 +40,7 @@ class HorizontalDirections(Group):
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the directions counted the other way round."""
-        return {"counter-clockwise": replace(self, value=-self.value)}
+        return {**super().mistakes(), "counter-clockwise": replace(self, value=-self.value)}
 
     @classmethod
     def of_group(

@@ -211,6 +211,25 @@ class TableKind(Kind):
     numbers: ClassVar[tuple[str, ...]] = ()  # columns of numbers without a standard deviation
     angles: ClassVar[tuple[str, ...]] = ()  # components that are angles: rad, and degrees in tables
 
+    sigma: FloatArray  # of each component, object unit or rad, (n, d); of groups (r, c)
+
+    @abstractmethod
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return the observations with other standard deviations."""
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the observations in other units, and what a kind knows besides."""
+        is_angle = np.resize([name in self.angles for name in self.components], self.values.shape)
+        found: dict[str, Self] = {}
+        if not is_angle.all():
+            units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048}
+            found |= {
+                name: self.with_values(self.values * np.where(is_angle, 1.0, f)) for name, f in units.items()
+            }
+        if is_angle.any():
+            found["gon"] = self.with_values(self.values * np.where(is_angle, 0.9, 1.0))
+        return found
+
     @classmethod
     def columns(cls) -> tuple[str, ...]:
         """Return the columns of numbers: those without standard deviation, values, standard deviations."""
@@ -233,8 +252,6 @@ class TableKind(Kind):
 
 class RowKind(TableKind):
     """A kind of table of which each row is an observation."""
-
-    sigma: FloatArray  # of each component, object unit or rad, (n, d)
 
     def covariances(self) -> FloatArray:
         """Return the covariance of each, (n, d, d)."""

@@ -36,6 +36,10 @@ class Pairs(RowKind):
         """Return them with other observed values."""
         return replace(self, value=values)
 
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return them with other standard deviations."""
+        return replace(self, sigma=sigma)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return both ends."""
         return Block(self.texts_of, self.start), Block(self.texts_of, self.end)

@@ -42,4 +42,4 @@ class RelativeOrientations(Pairs):
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the orientations of exchanged photographs."""
-        return {"exchanged": replace(self, start=self.end, end=self.start)}
+        return {**super().mistakes(), "exchanged": replace(self, start=self.end, end=self.start)}

@@ -96,7 +96,7 @@ class RigidFrames(Group):
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the coordinates of a mirrored system."""
-        return {"mirrored": replace(self, value=self.value * [1.0, 1.0, -1.0])}
+        return {**super().mistakes(), "mirrored": replace(self, value=self.value * [1.0, 1.0, -1.0])}
 
     def _by_motion(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).

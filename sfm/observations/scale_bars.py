@@ -43,6 +43,10 @@ class ScaleBars(Kind):
         """Return the bars with other lengths."""
         return replace(self, length=values[:, 0])
 
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return the bars with other standard deviations, (b,)."""
+        return replace(self, sigma=sigma)
+
     def blocks(self) -> tuple[Block, ...]:
         """Return both ends."""
         return Block(POINT, self.start), Block(POINT, self.end)

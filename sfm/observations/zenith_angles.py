@@ -33,6 +33,7 @@ class ZenithAngles(PointPairs):
     def mistakes(self) -> Mapping[str, Self]:
         """Return the angles counted from the horizon, and between exchanged points."""
         return {
+            **super().mistakes(),
             "elevation": replace(self, value=np.pi / 2 - self.value),
             "exchanged": replace(self, value=np.pi - self.value),
         }

@@ -44,7 +44,11 @@ NOUNS = {  # what a remark may be of, by the names in its data
     "counter-clockwise": "directions are counted counter-clockwise",
     "elevation": "angles are counted from the horizon",
     "exchanged": "both ends are exchanged",
+    "feet": "lengths are in feet",
+    "gon": "angles are in gon",
     "mirrored": "coordinates are those of a mirrored system",
+    "thousandfold": "lengths are divided by 1000, as from mm to m",
+    "thousandth": "lengths are multiplied by 1000, as from m to mm",
 }
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)

@@ -93,6 +93,8 @@ def observation_table(kind: str, table: CsvTable) -> ObservationTable:
     d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
+    if "length" in of.components:
+        table.refuse(table.values[:, :1], table.values[:, :1] <= 0, columns[:1], "more than 0, a length")
     if issubclass(of, Group) and len(of.texts) == 2:  # a second set of directions is another table
         table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), of.texts)
     ends = [column for name, column in zip(of.texts, table.texts, strict=True) if name in ("from", "to")]

@@ -2,8 +2,8 @@
 
 Image points leave these seven open. Start values are brought into the frame of the adjustment, and adjusted
 free networks to the coordinates that their datum refers to, without a change of their shape. Heights,
-coordinate differences, antenna positions and distances determine a part of the seven: they are found by least
-squares, from attitudes all round, so that the adjustment starts near.
+coordinate differences, antenna positions and distances determine a part of the seven: a robust adjustment
+finds them, from attitudes all round, so that the adjustment starts near.
 
 Observed exterior orientation takes part in the datum `control` beside the control, and in no other.
 
@@ -12,8 +12,10 @@ Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 2
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,12 +24,18 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angle
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, values_of
-from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, inverse_of_observed
+from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
 from sfm.observations.mounts import MountObservations
+from sfm.observations.scale_bars import ScaleBars
 from sfm.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity, nearest_rotation
 
+K = TypeVar("K", bound=Kind)
+Weighted = TableKind | ScaleBars  # with one standard deviation for each value
+
 ROUNDS = 20  # of Gauss-Newton from each attitude
+FAR = 100.0  # standard deviations from which on an observation is taken for wrong before anything is adjusted
+OPEN = 1e-9  # of the derivatives, below which what is left of a motion is rounding
 LARGEST_STEP = 0.5  # turn of one step, rad, and change of the scale
 MIN_POINTS = 3  # that fix position, attitude and scale
 NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
@@ -44,8 +52,8 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
         network: with observations of points and photographs.
         estimate: start values.
     """
-    kinds = [one for one in (_usable(kind, estimate) for kind in network.observations) if len(one)]
-    if not kinds:
+    kinds = _of_motions(network, estimate)
+    if not kinds or not network.observations:
         return estimate
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
@@ -55,22 +63,58 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     return min(tried, key=lambda one: one[1])[0]
 
 
+def loosen_far(network: Network, estimate: Estimate) -> Network:
+    """Return the network with larger standard deviations of observations that are far from an estimate.
+
+    Within least squares one that is 1e5 of them off would bend the whole network. With the root of that in
+    place of it, it stays the one that is most off.
+
+    Args:
+        network: with observations of points and photographs.
+        estimate: on the observations, see `place_on_observations`.
+    """
+    kinds: list[Kind] = []
+    for kind in network.observations:
+        if isinstance(kind, TableKind) and len(kind) == len(_usable(kind, estimate)):
+            over = _over_sigma(kind, kind, estimate)
+            kind = kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over / FAR, 1.0)))
+        kinds.append(kind)
+    return replace(network, observations=tuple(kinds))
+
+
 def scale_sigma(network: Network, estimate: Estimate) -> float:
     """Return the relative standard deviation of the scale that observations of points and photographs give.
 
     It is that of a network in which nothing else gives one; infinite where they do not either.
     """
-    kinds = [one for one in (_usable(kind, estimate) for kind in network.observations) if len(one)]
+    kinds = _of_motions(network, estimate)
     if not kinds:
         return float("inf")
     centre = np.nanmean(estimate.points, axis=0)
     rows, _ = _rows(kinds, Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate))
-    N, others = rows.T @ rows, rows[:, :6]
-    left = N[6, 6] - N[6, :6] @ np.linalg.pinv(others.T @ others, hermitian=True) @ N[:6, 6]
-    return float(1 / np.sqrt(left)) if left > 0 else float("inf")
+    size = float(np.nanmax(np.abs(estimate.points - centre)))
+    rows[:, :3] *= size  # shifts in units of the extent, beside turns in rad
+    largest = sum(_largest(kind, estimate) for kind in kinds) * size
+    U, singular, _ = np.linalg.svd(rows[:, :6], full_matrices=False)
+    U = U[:, singular > OPEN * largest]
+    left = float(np.linalg.norm(rows[:, 6] - U @ (U.T @ rows[:, 6])))
+    return 1 / left if left > OPEN * largest else float("inf")
 
 
-def _usable(kind: Kind, estimate: Estimate) -> Kind:
+def _largest(kind: Kind, estimate: Estimate) -> float:
+    """Return the norm of the whitened derivatives of observations, before those of motions cancel out."""
+    J = np.concatenate([by.ravel() for by in kind.linearise(values_of(estimate)).J])
+    return float(np.linalg.norm(J) * np.sqrt(inverse_of_observed(kind.covariances()).max()))
+
+
+def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
+    """Return scale bars and observations of tables whose points and photographs have start values."""
+    tables = (kind for kind in network.observations if isinstance(kind, TableKind))
+    kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
+    return [one for one in (_usable(kind, estimate) for kind in kinds) if len(one)]
+
+
+def _usable(kind: K, estimate: Estimate) -> K:
     """Return the observations of a kind whose points and photographs have start values."""
     on = np.ones(len(kind), dtype=bool)
     for of, at in kind.blocks():
@@ -81,22 +125,36 @@ def _usable(kind: Kind, estimate: Estimate) -> Kind:
     return kind.select(on)
 
 
-def _fitted(kinds: list[Kind], estimate: Estimate, *, scaled: bool) -> tuple[Estimate, float]:
-    """Return the estimate moved, and scaled, to least v'Pv of observations, and it."""
+def _fitted(kinds: list[Weighted], estimate: Estimate, *, scaled: bool) -> tuple[Estimate, float]:
+    """Return the estimate moved, and scaled, to the least sum of residuals over their sigmas, and it.
+
+    The sum of squares would let one mistyped value decide; weights of 1 over the residual make it that of
+    absolute values (Foerstner and Wrobel 2016, sec. 4.7.4).
+    """
+    weighted = kinds
     for _ in range(ROUNDS):
-        rows, l = _rows(kinds, estimate)
+        rows, l = _rows(weighted, estimate)
         rows[:, 6] *= scaled
         step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
         size = max(float(np.abs(step[3:]).max()), LARGEST_STEP) / LARGEST_STEP
         step /= size
         R = rotation_from_vector(step[3:6])
         estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
-        if np.abs(step[3:]).max() < 1e-9:
-            break
-    return estimate, float((_rows(kinds, estimate)[1] ** 2).sum())
+        away = [_over_sigma(kind, one, estimate) for kind, one in zip(kinds, weighted, strict=True)]
+        weighted = [
+            kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over, 1.0)))
+            for kind, over in zip(kinds, away, strict=True)
+        ]
+    return estimate, sum(float(over.sum()) for over in away)
 
 
-def _rows(kinds: list[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+def _over_sigma(kind: Weighted, weighted: Weighted, estimate: Estimate) -> FloatArray:
+    """Return the residuals of observations over their sigmas, as of the same with other weights."""
+    difference = weighted.linearise(values_of(estimate)).difference
+    return np.asarray(np.abs(difference.reshape(kind.sigma.shape)) / kind.sigma)
+
+
+def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:
     """Return whitened derivatives by shift, turn and scale, (n, 7), and differences, (n,)."""
     values, rows, differences = values_of(estimate), [], []
     for kind in kinds:

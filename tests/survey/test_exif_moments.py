@@ -66,3 +66,13 @@ def test_a_photograph_without_time_is_refused(tmp_path: Path) -> None:
     survey = survey_of(tmp_path, 0.5)
     with pytest.raises(SurveyFileError, match=r"photograph 'right1\.jpg' states no time"):
         moments_from_exif(survey, find_photographs(survey))
+
+
+def test_regular_intervals_with_clocks_that_differ_are_refused(tmp_path: Path) -> None:
+    """One photograph at the end is missing: two differences of the clocks fit as well."""
+    times = 10.0 * np.arange(9)
+    photographed(tmp_path, "left", times.tolist())
+    photographed(tmp_path, "right", (times[:8] + 3600.0).tolist())
+    survey = survey_of(tmp_path, 0.5)
+    with pytest.raises(SurveyFileError, match="by 3590 s or 3600 s, and as many photographs agree"):
+        moments_from_exif(survey, find_photographs(survey))

@@ -78,7 +78,8 @@ def group_of(of: type[Group], truth: Estimate, rng: np.random.Generator, sigma: 
         return of.of_group("group", point[:, None], np.zeros((7, 0)), np.full((7, 1), sigma), {})
     if of is OffsetDistances:
         ends = rng.permutation(np.stack([point, np.roll(point, 2)], axis=1))
-        tape = of.of_group("tape", ends, np.zeros((rows, 1)), np.full((rows, 1), sigma), {})
+        length = np.linalg.norm(truth.points[ends[:, 0]] - truth.points[ends[:, 1]], axis=1)[:, None]
+        tape = of.of_group("tape", ends, length + 0.123, np.full((rows, 1), sigma), {})
         return tape.simulated(values_of(truth), rng)
     name = str(point[0] + 1) if of is HorizontalDirections else "group"
     empty = of(name, point, np.zeros((rows, c)), np.full((rows, c), sigma))

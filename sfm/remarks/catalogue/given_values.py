@@ -41,8 +41,8 @@ ROWS = (
     Kind(
         "frame_points_computed",
         "note",
-        "{points:point} of rigid frames {points:is|are} in no photograph and computed from the other points of "
-        "the frame: {points}.",
+        "{points:point} of rigid frames {points:is|are} in no photograph and computed from the other points "
+        "of the frame: {points}.",
         "a tip that touches the object, or a mistyped name",
         "Nothing needs to be done if photographs do not show {points:it|them}; otherwise correct the name.",
     ),

@@ -58,6 +58,7 @@ from sfm.survey.observation_tables import find_gross, without_observations
 from sfm.survey.placing import (
     MIN_CONTROL,
     hold_fixed,
+    loosen_far,
     place_on_control,
     place_on_exterior,
     place_on_frame,
@@ -418,7 +419,8 @@ def _without_gross(
         free = task.datum.kind != "control"
         placed = place_on_observations(part, start) if free else start  # wrong observations turn it
         datum = on_points(task, part, placed)
-        return adjust(part, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
+        loose = loosen_far(part, placed)
+        return adjust(loose, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
 
     part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
     gross = find_gross(part, adjusted)

@@ -99,7 +99,13 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
         of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
         corrected = dict(of_rig[0])
         for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
-            ahead = _clock_offset(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
+            ahead, *others = _clock_offset(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
+            if others:
+                raise SurveyFileError(
+                    f"{survey.source}: rig {rig.name}: the clock of camera {camera} is ahead of that of "
+                    f"{rig.cameras[0]} by {ahead:g} s or {others[0]:g} s, and as many photographs agree; set "
+                    "the times, or name the moments by an expression, 'order' or a table"
+                )
             corrected |= {name: taken - timedelta(seconds=ahead) for name, taken in times.items()}
             if ahead:
                 found = remark("clock_differs", camera=camera, reference=rig.cameras[0], ahead=(ahead, "s"))
@@ -131,23 +137,27 @@ def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[st
     return times
 
 
-def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> float:
-    """Return by how much a clock is ahead of that of the reference camera, s; 0 where it need not be.
+def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> list[float]:
+    """Return by how much a clock may be ahead of that of the reference camera, s; 0 where it need not be.
 
-    Most pairs of photographs agree at the right offset, and of equal ones the smallest is taken.
+    Most pairs of photographs agree at the right offset. Several mean that nothing shows which one is right,
+    as of photographs at regular intervals.
     """
     if not reference or not times:
-        return 0.0
+        return [0.0]
     start = reference[0]
     a, b = (np.array([(one - start).total_seconds() for one in some]) for some in (reference, times))
     ahead = np.sort((b[:, None] - a).ravel())
-    last = np.searchsorted(ahead, ahead + tolerance_s, side="right")
+    last = np.searchsorted(ahead, ahead + 2 * tolerance_s, side="right")
     count = last - np.arange(len(ahead))
     if count.max() <= (np.abs(ahead) <= tolerance_s).sum():
-        return 0.0
-    best = np.flatnonzero(count == count.max())
-    middle = [float(np.median(ahead[k : last[k]])) for k in best]
-    return min(middle, key=abs)
+        return [0.0]
+    found: list[float] = []
+    for k in np.flatnonzero(count == count.max()):
+        middle = float(ahead[k] + ahead[last[k] - 1]) / 2
+        if not found or middle - found[-1] > tolerance_s:
+            found.append(middle)
+    return found
 
 
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:
