@@ -1,7 +1,7 @@
 """Bundle adjustment with self-calibration.
 
 - `adjust`: begin here; a network and start values in, an `Adjustment` with covariance and tests out.
-- `predict`: the covariance of a network that nobody has photographed yet.
+- `predict`: the covariance of a planned network.
 - `Datum`, `change_datum`: what decides position, attitude and scale.
 - `marginal_of`: joint covariances of points.
 - `w_test`, `tau_test`: gross errors in image coordinates.

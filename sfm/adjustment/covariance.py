@@ -92,10 +92,10 @@ class Marginal:
         inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
         for s, j in enumerate(points):
             seen = slice(observations.start[j], observations.start[j + 1])
-            own = slice(3 * s, 3 * s + 3)
+            at = slice(3 * s, 3 * s + 3)
             rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
-            np.add.at(of_poses[:, :, own], observations.pose[seen], rays)
-            of_interior[:, own] = b.Y_interior[j].T @ inverse[s]
+            np.add.at(of_poses[:, :, at], observations.pose[seen], rays)
+            of_interior[:, at] = b.Y_interior[j].T @ inverse[s]
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
         E[:, u:] = -through
@@ -109,8 +109,8 @@ class Marginal:
         E[:, u:] *= self.layout.point_free[points].ravel()
         cofactor = E.T @ self.optimum.factor.solve(E)
         for s, j in enumerate(points):
-            own = slice(u + 3 * s, u + 3 * s + 3)
-            cofactor[own, own] = Q.points[j]
+            at = slice(u + 3 * s, u + 3 * s + 3)
+            cofactor[at, at] = Q.points[j]
         d = len(motions.inverse)
         H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), d)])
         F = np.hstack(
@@ -172,7 +172,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
 
     Args:
         adjustment: what `adjust` returned.
-        datum: another datum of the same kinds (control stays control); its own if None.
+        datum: another datum of the same kinds (control stays control); that of the adjustment if None.
         cross: whether cofactors between points and photographs are wanted.
 
     Raises:

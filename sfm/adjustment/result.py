@@ -19,9 +19,9 @@ from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 # control strain their network; measured ones to 1e-7 at best.
 ROUNDING = 1e-9
 MOTIONS = 7  # position, attitude and scale: what image points leave open
-# Standard deviation of an image coordinate that nobody beats: targets reach 1/100 px, computed images 1/1000.
-# Beside larger weights, control and bars of a usual survey would be lost in rounding. Source: Luhmann et al.
-# (2020), Close-Range Photogrammetry, sec. 5.4.2.
+# Standard deviation of an image coordinate that no measurement beats: targets reach 1/100 px, computed images
+# 1/1000. Beside larger weights, control and bars of a usual survey would be lost in rounding. Source: Luhmann
+# et al. (2020), Close-Range Photogrammetry, sec. 5.4.2.
 MIN_SIGMA_PX = 1e-3
 
 
@@ -49,7 +49,7 @@ class Covariance:
 class ErrorCorrelation:
     """Errors of image points that neighbours in a photograph have in common, and those that each has alone.
 
-    Each alone has `alone` times its own variance a posteriori. What moves neighbours moves them by as many
+    Each alone has `alone` times its variance a posteriori. Common errors move neighbours by as many
     px, precise ones and others, x and y alike: their covariance in one photograph is
     `common` exp(-d / length_px) at distance d.
     """
@@ -163,11 +163,11 @@ class Adjustment:
         found: list[GroupParameters] = []
         for group in self.network.observations:
             if isinstance(group, Group) and group.reported and len(group):
-                own = group.own_parameters(values_of(self.estimate))
-                J = own.J.reshape(len(own.J), -1)
+                fitted = group.own_parameters(values_of(self.estimate))
+                J = fitted.J.reshape(len(fitted.J), -1)
                 C = self.solution.covariance_of([self.network.points[j] for j in group.point])
-                C = self.sigma0**2 * own.cofactor + J @ C @ J.T
-                found.append(GroupParameters(group.group, group.reported, own.value, C))
+                C = self.sigma0**2 * fitted.cofactor + J @ C @ J.T
+                found.append(GroupParameters(group.group, group.reported, fitted.value, C))
         return tuple(found)
 
     @property

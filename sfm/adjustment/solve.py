@@ -267,7 +267,7 @@ def _result(
         result = without_held(result, layout, optimum)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
-        # that of image points whose photograph nothing holds overflows, if it is far enough away
+        # that of image points whose photograph nothing determines overflows, if it is far enough away
         complement[~np.isfinite(complement).all(axis=(1, 2))] = np.nan
         numbers = numbers_of(complement, layout.observations.whitening)
         numbers[weight == 0] = np.nan

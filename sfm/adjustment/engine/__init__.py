@@ -2,5 +2,5 @@
 
 `unknowns` lays out what is solved for, `observed` what was observed beside image points; `collinearity` is
 the formula of one image point, `accumulate` sums it into `normals`; `motions` are the null vectors that the
-datum holds; `iterate` goes to the optimum with one of `solvers`; `cofactors` are the covariance there.
+datum fixes; `iterate` goes to the optimum with one of `solvers`; `cofactors` are the covariance there.
 """

@@ -17,8 +17,8 @@ from sfm.adjustment.engine.collinearity import Observations, State, Workspace, c
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled, inlined, kernel
 
-SINGULAR_PIVOT = 1e-13  # share of a point's own normal equation left below which its rays are parallel
-STIFF = 1e10  # factor on the pivot that holds such a direction of a point
+SINGULAR_PIVOT = 1e-13  # share of the normal equation of a point left below which its rays are parallel
+STIFF = 1e10  # factor on the pivot that fixes such a direction of a point
 RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
 
 
@@ -123,8 +123,8 @@ def _derivatives(
                 x[p], y[p] = workspace.A[0, p], workspace.A[1, p]
             x[RESIDUAL], y[RESIDUAL] = workspace.r[0], workspace.r[1]
             for q in range(observations.free_count[a]):
-                own = 6 + observations.free_index[a, q]
-                x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q] = workspace.A[0, own], workspace.A[1, own]
+                column = 6 + observations.free_index[a, q]
+                x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q] = workspace.A[0, column], workspace.A[1, column]
             rays += 1
     return rays if in_front else -rays
 

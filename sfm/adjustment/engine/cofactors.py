@@ -63,8 +63,8 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     limiting = _inverse_of_squares(b.L)
     points = limiting + _twice_solved(b.L, q.core)
     for s, j in enumerate(layout.kept):
-        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
-        points[j] = q.border[own, own]
+        at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        points[j] = q.border[at, at]
         # a point that lost all its rays to the test has no precision by rays; it is held as others are
         limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
     mask = layout.point_free.astype(float)
@@ -96,12 +96,12 @@ def marginal_covariance(
     columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
     T = exterior_jacobian(optimum.state.M) @ J
     exterior = _in_datum(_of_photographs(cofactors, columns), H[columns], np.moveaxis(F[:, columns], 1, 0), G)
-    with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing holds
+    with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing determines
         exterior = T @ exterior @ np.swapaxes(T, 1, 2)
     interior = []
-    for own in layout.interior_column:
-        Q = cofactors.border[np.ix_(own - first, own - first)]
-        interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
+    for of_camera in layout.interior_column:
+        Q = cofactors.border[np.ix_(of_camera - first, of_camera - first)]
+        interior.append(variance * _in_datum(Q[None], H[of_camera][None], F[:, of_camera][None], G)[0])
     columns, J = layout.rig_terms(optimum.state)
     at = np.maximum(columns - first, 0)  # where a mount is fixed, J is 0
     rigs = np.zeros((len(at), len(at)))
@@ -164,8 +164,8 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
     exterior[idle_image] = np.nan
     opened = np.asarray(leading(optimum.factor.further).any(axis=1))
     interior = []
-    for own, Q in zip(layout.interior_column, covariance.interior, strict=True):
-        without, rows = Q.copy(), np.flatnonzero(opened[own])
+    for columns, Q in zip(layout.interior_column, covariance.interior, strict=True):
+        without, rows = Q.copy(), np.flatnonzero(opened[columns])
         without[rows] = without[:, rows] = np.nan
         without[rows, rows] = np.inf
         interior.append(without)
@@ -186,16 +186,16 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
 def _of_photographs(cofactors: Cofactors, columns: IntArray) -> FloatArray:
     """Return the cofactors of the unknowns of each photograph: of its pose and its mount, (m, u, u)."""
     pose = columns[:, 0] // 6
-    own = cofactors.exterior[pose]
+    poses_alone = cofactors.exterior[pose]
     if columns.shape[1] == 6:
-        return own
+        return poses_alone
     poses = len(cofactors.exterior)
     at = np.maximum(columns[:, 6:] - 6 * poses, 0)  # where a mount is fixed, J is 0
     if not cofactors.border.size:
-        return np.pad(own, ((0, 0), (0, 6), (0, 6)))
+        return np.pad(poses_alone, ((0, 0), (0, 6), (0, 6)))
     mixed = cofactors.mixed.reshape(poses, 6, -1)[pose[:, None], :, at].swapaxes(1, 2)
     mounts = cofactors.border[at[:, :, None], at[:, None]]
-    return np.block([[own, mixed], [np.swapaxes(mixed, 1, 2), mounts]])
+    return np.block([[poses_alone, mixed], [np.swapaxes(mixed, 1, 2), mounts]])
 
 
 def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:
@@ -240,10 +240,10 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
     mixed = q.mixed.reshape(len(q.exterior), 6, -1)
     for s, j in enumerate(layout.kept):
-        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         seen = slice(layout.observations.start[j], layout.observations.start[j + 1])
-        rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, own], 1, 2)
-        inner[j] = q.border[own]
+        rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, at], 1, 2)
+        inner[j] = q.border[at]
     return rays, inner
 
 
@@ -274,7 +274,7 @@ def _complement(
     Q: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Fill I - J Q J' of each image point, J and Q of its own unknowns: pose, X, free ones of its camera."""
+    """Fill I - J Q J' of each image point, J and Q of its unknowns: pose, X, free ones of its camera."""
     first = 6 * observations.poses
     for o in range(len(observations.image)):
         i, j = observations.pose[o], observations.point[o]

@@ -2,7 +2,7 @@
 
     (U, V, W) = M (X - X0),  u = -U/W,  v = -V/W,  r = model(u, v, p) - measured
 
-The unknowns of a photograph are its projection centre X0 and a small rotation w in its own image
+The unknowns of a photograph are its projection centre X0 and a small rotation w in its image
 axes, R <- R exp([w]x), so that d(U, V, W)/dw = [(U, V, W)]x and no angle is singular.
 
 Source: Kraus, Photogrammetry (2007), sec. 5.3; small rotations as in Foerstner and Wrobel (2016),

@@ -3,7 +3,7 @@
 Least squares with weights of independent errors stays unbiased where the errors of a photograph are
 correlated, but is less precise than its cofactors say. With the influence Z of the errors e on the unknowns,
 dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; with R = I it is the usual one.
-R has what each image point has alone, in units of its own standard deviation, and what a photograph does to
+R has what each image point has alone, in units of its standard deviation, and what a photograph does to
 neighbours alike, in px: whitened, it is the larger the more precise an image point is.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.6 and 3.2;
@@ -54,7 +54,7 @@ class Influence:
         place[points] = len(unknowns) + 3 * np.arange(len(points))
         for axis in range(3):
             rays = np.flatnonzero(place[point] >= 0)
-            Z[rays, :, place[point[rays]] + axis] += self.linear.own[rays, :, axis]
+            Z[rays, :, place[point[rays]] + axis] += self.linear.by_ray[rays, :, axis]
         return Z
 
     def scores_of(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
@@ -72,14 +72,14 @@ class Influence:
 
     def _scores_of_datum(self, rows: IntArray) -> FloatArray:
         """Return what moves the datum by itself, by the errors of some image points, (k, 2, d)."""
-        return self.linear.own[rows] @ self.of_datum[self.linear.layout.observations.point[rows]]
+        return self.linear.by_ray[rows] @ self.of_datum[self.linear.layout.observations.point[rows]]
 
     def of_reduced(self) -> FloatArray:
         """Return the reduced unknowns in the datum by those in any and its parameters."""
         return np.vstack([np.eye(len(self.H)), -self.H.T])
 
     def of_points(self, rows: IntArray) -> FloatArray:
-        """Return the same of some coordinates of object points, without their own errors."""
+        """Return the same of some coordinates of object points, without their errors."""
         return np.vstack([-self.through[:, rows].toarray(), -self.H_points[rows].T])
 
 
@@ -132,7 +132,7 @@ class CorrelatedPart:
         added = C.T @ self.middle @ C
         if not p:
             return np.asarray(added)
-        o, own = influence.linear.layout.observations, influence.linear.own
+        o, by_ray = influence.linear.layout.observations, influence.linear.by_ray
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
         of_all = np.zeros((3 * p, C.shape[1]))
@@ -140,7 +140,7 @@ class CorrelatedPart:
             rows = one.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
             columns, S = influence.scores_of(rows)
-            O, at = own[rows[chosen]], place[o.point[rows[chosen]]]
+            O, at = by_ray[rows[chosen]], place[o.point[rows[chosen]]]
             lines = (3 * at[:, None] + np.arange(3)).ravel()
             KS = one.times(S, chosen)
             of_all[lines] += (O.transpose(0, 2, 1) @ KS).reshape(len(lines), -1) @ C[columns]
@@ -164,8 +164,8 @@ class CorrelatedPart:
             exterior=covariance.exterior + T @ exterior @ np.swapaxes(T, 1, 2),
             rigs=covariance.rigs + J @ D[np.ix_(columns, columns)] @ J.T,
             interior=tuple(
-                Q + D[np.ix_(own, own)]
-                for Q, own in zip(covariance.interior, layout.interior_column, strict=True)
+                Q + D[np.ix_(of_camera, of_camera)]
+                for Q, of_camera in zip(covariance.interior, layout.interior_column, strict=True)
             ),
         )
 
@@ -187,10 +187,12 @@ def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_p
         columns, S = influence.scores_of(rows)
         KS = one.times(S)
         middle[np.ix_(columns, columns)] += np.tensordot(S, KS, axes=((0, 1), (0, 1)))
-        j, own = o.point[rows], linear.own[rows].transpose(0, 2, 1)
+        j, by_ray = o.point[rows], linear.by_ray[rows].transpose(0, 2, 1)
         right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
-        half = own @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
-        np.add.at(added, j, half + half.transpose(0, 2, 1) + own @ one.variances() @ own.transpose(0, 2, 1))
+        half = by_ray @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
+        np.add.at(
+            added, j, half + half.transpose(0, 2, 1) + by_ray @ one.variances() @ by_ray.transpose(0, 2, 1)
+        )
     D = influence.unknowns.T @ middle @ influence.unknowns
     for first in range(0, n, POINTS_AT_ONCE):
         C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
@@ -213,8 +215,8 @@ def correlated_sum(
     """
     total = np.zeros((Z.shape[2], Z.shape[2]))
     for one in _photographs(image, xy, relative, correlation):
-        own = Z[one.rows]
-        total += np.tensordot(own, one.times(own), axes=((0, 1), (0, 1)))
+        of_photograph = Z[one.rows]
+        total += np.tensordot(of_photograph, one.times(of_photograph), axes=((0, 1), (0, 1)))
     return total
 
 
@@ -240,8 +242,8 @@ class _Photograph:
         """Return O'(R - I) O of functions of some image points, three of each (s, 2, 3), (3 s, 3 s)."""
         of_shift = np.swapaxes(self.relative[some], 1, 2) @ O
         pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(some, some), of_shift, optimize=True)
-        own = np.arange(len(some))
-        pairs[own, :, own] += (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
+        each = np.arange(len(some))
+        pairs[each, :, each] += (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
         return np.asarray(pairs.reshape(3 * len(some), 3 * len(some)))
 
     def variances(self) -> FloatArray:

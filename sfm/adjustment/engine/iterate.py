@@ -3,11 +3,11 @@
 Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to get near and Gauss-Newton to end:
 the last steps are undamped in either case. Where a bent valley leaves room for short straight steps only, a
 longer one is brought back to its bottom. Where only the values are wanted, the step that shows convergence
-may be taken with the reduced matrix of the step before, for the gradient of its own state (simplified
+may be taken with the reduced matrix of the step before, for the gradient of the current state (simplified
 Newton). A step that would bring a point behind a camera has an infinite sum of squares and is shortened or
 damped. Converged means that the predicted change of the adjusted observations, |A dx| weighted, is at most
 `tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would move by more than that
-share of its own a priori standard deviation.
+share of its a priori standard deviation.
 
 Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
 veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear

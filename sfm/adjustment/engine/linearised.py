@@ -38,7 +38,7 @@ class Linearised:
     A: csr_matrix  # by reduced unknowns, (2k, reduced)
     B: csr_matrix  # by eliminated points, (2k, 3n)
     V_inverse: csr_matrix  # of eliminated points, (3n, 3n)
-    own: FloatArray  # d X / d errors of each ray, (B V^-1), cameras fixed; 0 for kept points, (k, 2, 3)
+    by_ray: FloatArray  # d X / d errors of each ray, (B V^-1), cameras fixed; 0 for kept points, (k, 2, 3)
     whitening: FloatArray  # F of each image point with F'F its weight, 1/px, (k, 2, 2)
 
     @property

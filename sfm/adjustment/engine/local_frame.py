@@ -60,14 +60,14 @@ class Local:
 def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Local:
     """Return a network, its start values and its datum as they are best computed with."""
     centroid = centroid_of(network, estimate)
-    own, start = network, estimate
+    local, start = network, estimate
     if centroid.any():
-        own, start = shifted(network, estimate, -centroid)
+        local, start = shifted(network, estimate, -centroid)
     order = None
     if len(network.points) >= MANY:
         order = along_curve(start.points)
-        own, start, datum = _renumbered(own, start, datum, order)
-    return Local(own, start, datum, network, centroid, order)
+        local, start, datum = _renumbered(local, start, datum, order)
+    return Local(local, start, datum, network, centroid, order)
 
 
 def along_curve(points: FloatArray) -> IntArray:
@@ -94,7 +94,7 @@ def _renumbered(
 ) -> tuple[Network, Estimate, ResolvedDatum]:
     """Return them with the points in another order."""
     place = np.argsort(order)
-    own = replace(
+    renumbered = replace(
         network,
         points=tuple(network.points[j] for j in order),
         image_points=replace(network.image_points, point=place[network.image_points.point]),
@@ -104,7 +104,7 @@ def _renumbered(
     )
     if datum.points is not None:
         datum = datum._replace(points=datum.points[order])
-    return own, replace(estimate, points=estimate.points[order]), datum
+    return renumbered, replace(estimate, points=estimate.points[order]), datum
 
 
 def centroid_of(network: Network, estimate: Estimate) -> FloatArray:

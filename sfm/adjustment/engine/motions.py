@@ -89,10 +89,10 @@ def motions_of(
     poses, mounts, points = free_motions(layout, state)
     H = np.zeros((layout.reduced, 7))
     H[: layout.pose_free.size] = poses.reshape(-1, 7)
-    own = layout.mount_column >= 0
-    H[layout.mount_column[own]] = mounts[own]
+    mounted = layout.mount_column >= 0
+    H[layout.mount_column[mounted]] = mounts[mounted]
     H[layout.kept_start :] = points[layout.kept].reshape(-1, 7)
-    seen = _seen_by_datum(layout, observed, state, H, mounts[~own & layout.rigged], points)
+    seen = _seen_by_datum(layout, observed, state, H, mounts[~mounted & layout.rigged], points)
     if len(seen):
         # U would have a column for every row, of which control alone brings three a point
         _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)

@@ -36,8 +36,9 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.kernels.options import kernel
 from sfm.kernels.threads import at_once
 
-HALVED = 8_000  # image points from which two halves of the photographs are summed by themselves; a thread of
-# its own takes 0.1 ms to start and saves 0.07 microseconds for each
+# Image points from which two halves of the photographs are summed by themselves; another thread takes 0.1 ms
+# to start and saves 0.07 microseconds for each.
+HALVED = 8_000
 SUMMED = ("D", "gi", "V", "gp", "Y_interior")  # parts of `Sums` that both halves add to
 
 
@@ -221,9 +222,9 @@ def new_space(layout: Unknowns) -> Space:
     sums = Sums(0, m, U, g, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
     if k < HALVED:
         return Space(b, (sums,))
-    own = {name: np.zeros_like(getattr(sums, name)) for name in SUMMED}
+    separate = {name: np.zeros_like(getattr(sums, name)) for name in SUMMED}
     middle = int(np.searchsorted(first, k // 2))
-    other = sums._replace(first=middle, A=np.zeros_like(sums.A), **own)
+    other = sums._replace(first=middle, A=np.zeros_like(sums.A), **separate)
     return Space(b, (sums._replace(end=middle), other))
 
 

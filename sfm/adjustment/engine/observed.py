@@ -40,12 +40,12 @@ class Observed:
         """Which components were observed, (n, d)."""
         return np.reshape(np.diagonal(self.weight, axis1=1, axis2=2) > 0, (len(self.kind), -1))
 
-    own: int = 0  # parameters of their own, which are not among the unknowns
+    fitted: int = 0  # parameters of groups, which are not among the unknowns
 
     @property
     def count(self) -> int:
         """How many scalar observations these are, less parameters of their own."""
-        return int(self.components.sum()) - self.own
+        return int(self.components.sum()) - self.fitted
 
     @property
     def point(self) -> IntArray | None:
@@ -83,8 +83,8 @@ def observed_of(
         weight = inverse_of_observed(some.covariances()) if together is None else together[None]
         if weight.any():
             taken = some.linearise(state).taken
-            own = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
-            found.append(Observed(index, some, rows, weight, own))
+            fitted = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
+            found.append(Observed(index, some, rows, weight, fitted))
     return tuple(found)
 
 
@@ -166,7 +166,7 @@ def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, F
 
 @dataclass(frozen=True)
 class Terms:
-    """What observations that do not depend on an object point alone add to the reduced normal equations."""
+    """Terms in the reduced normal equations of observations that do not depend on an object point alone."""
 
     rows: tuple[tuple[Reduced, FloatArray], ...]  # derivatives and J'P of each kind, (n, u, d)
     vPv: float  # of all kinds
@@ -183,7 +183,7 @@ class Terms:
             g: right side, (6 poses + b,).
 
         Returns:
-            What couples poses with one another, (6 poses, 6 poses); None without.
+            The terms that couple poses with one another, (6 poses, 6 poses); None without.
         """
         first, coupled = 6 * len(U), None
         for (columns, J, l), JP in self.rows:

@@ -65,7 +65,7 @@ def _sorted(key: IntArray, before: IntArray, start: IntArray) -> IntArray:
 
 @compiled
 def _sort(key: IntArray, before: IntArray, place: IntArray, order: IntArray) -> None:
-    """Counting sort of an order before: place holds where the next one of each key goes."""
+    """Counting sort of an order before: `place` is where the next one of each key goes."""
     for o in before:
         order[place[key[o]]] = o
         place[key[o]] += 1

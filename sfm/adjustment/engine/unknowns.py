@@ -106,10 +106,10 @@ class Unknowns:
             R = np.swapaxes(state.rig_from_object[pose], 1, 2)
             J[:, :3, 3:6] = -R @ skew(state.mount_position[a])
             J[:, 3:, 3:6] = state.camera_from_rig[a]
-            own = self.mount_column[a]
+            of_mount = self.mount_column[a]
             J[:, :3, 6:9], J[:, 3:, 9:] = R, np.eye(3)
-            J[:, :, 6:] *= (own >= 0)[:, None]
-            columns = np.concatenate([columns, np.maximum(own, 0)], axis=1)
+            J[:, :, 6:] *= (of_mount >= 0)[:, None]
+            columns = np.concatenate([columns, np.maximum(of_mount, 0)], axis=1)
         J[:, :, :6] *= self.pose_free[pose][:, None]
         return columns, J
 
@@ -201,10 +201,10 @@ def unknowns_of(
     mount_column[mount_free] = 6 * poses + interior + np.arange(mount_unknowns)
     interior += mount_unknowns
     has_interior = counts > 0
-    for a, (own, column) in enumerate(zip(interior_free, columns, strict=True)):
+    for a, (free_ones, column) in enumerate(zip(interior_free, columns, strict=True)):
         of_mount = np.flatnonzero(mount_free[a])
         counts[a] += len(of_mount)
-        free_index[a, : counts[a]] = np.concatenate([own, MAX_PARAMETERS + of_mount])
+        free_index[a, : counts[a]] = np.concatenate([free_ones, MAX_PARAMETERS + of_mount])
         free_column[a, : counts[a]] = np.concatenate([column, mount_column[a, of_mount]])
     kept = _coupled_points(network, point_on)
 
@@ -345,7 +345,7 @@ def _interior_columns(
     seen: dict[tuple[str, str], tuple[int, Camera, float]] = {}
     columns, count = [], 0
     for camera, free in zip(cameras, interior_free, strict=True):
-        own = np.empty(len(free), dtype=np.int64)
+        of_camera = np.empty(len(free), dtype=np.int64)
         for k, s in enumerate(free):
             group, value = camera.group_of(s), float(camera.parameters[s])
             known = seen.get((group, camera.names[s])) if group else None
@@ -359,8 +359,8 @@ def _interior_columns(
                     f"cameras {known[1].name} and {camera.name} share {camera.names[s]}, but start from "
                     f"{known[2]:g} and {value:g}; one value is needed"
                 )
-            own[k] = known[0]
-        columns.append(own)
+            of_camera[k] = known[0]
+        columns.append(of_camera)
     return tuple(columns), count
 
 

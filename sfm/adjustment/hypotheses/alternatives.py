@@ -57,7 +57,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 
-ALPHA = 0.01  # probability of naming any alternative where none holds
+ALPHA = 0.01  # probability of naming any alternative where none is true
 OF_ONE = ("single", "pair")  # patterns of one photograph
 
 
@@ -170,16 +170,16 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
             *((one, [k]) for k, one in enumerate(sets)),
             *([(whole, list(range(len(sets))))] if len(sets) > 1 else []),
         ]:
-            own = D[:, :, columns]
-            H, g, squares = reduced.project(own)
+            freed = D[:, :, columns]
+            H, g, squares = reduced.project(freed)
             gain = gain_of(H, g, squares, least_share(len(H)))
             if gain.rank:
                 # what the photographs say of it once it, or all of the camera, are free
                 variance = float(gain.beta @ H @ gain.beta)
                 spread = min(
                     (
-                        _of_scores(reduced.scores(own @ gain.beta, step), variance)
-                        for step in (own @ gain.beta, D @ every.beta)
+                        _of_scores(reduced.scores(freed @ gain.beta, step), variance)
+                        for step in (freed @ gain.beta, D @ every.beta)
                     ),
                     key=lambda one: one.factor,
                 )
@@ -210,7 +210,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     """Return the alternatives of cameras, strain and bending in some of the photographs.
 
     Of more than MAX_RUNS photographs those next to one another in the sequence are taken together. A camera
-    changes in some of its own photographs, an object in some of all.
+    changes in some of its photographs, an object in some of all.
     """
     camera = cameras_of_photographs(a)
     run = runs_of(camera)
@@ -232,8 +232,8 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                 factor = _of_photographs(factors[best], runs, run, m)
                 if pattern in OF_ONE:
                     alone = among if pattern == "pair" else factor > 0
-                    own = _variance_of(reduced, alone, gains[best])
-                    spread = replace(spread, factor=max(spread.factor, own))
+                    of_family = _variance_of(reduced, alone, gains[best])
+                    spread = replace(spread, factor=max(spread.factor, of_family))
                 yield score_alternative(
                     reduced, family, Pattern(pattern, factor, search, among), gains[best], spread
                 )
@@ -253,7 +253,7 @@ def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternati
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
-    """Return the number of the camera that took each photograph, (m,); parameters of its own leave it one."""
+    """Return the number of the camera that took each photograph, (m,); varying parameters leave it one."""
     names = [camera.shared_name for camera in a.estimate.cameras]
     _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
     return np.asarray(number)
@@ -283,7 +283,7 @@ def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: in
 def _each(
     reduced: Reduced, H: FloatArray, g: FloatArray, squares: FloatArray, run: IntArray
 ) -> Iterator[Alternative]:
-    """Return the alternatives of a camera of its own for each photograph.
+    """Return the alternatives of a per-photograph camera.
 
     It must exceed what all other freedoms of the photographs show once it is in, by an F test: errors that
     the image points of a photograph have in common need not be those of a camera.
@@ -293,12 +293,12 @@ def _each(
         some = np.array(family.places)
         rest = np.setdiff1d(np.arange(f), some)
         q, p = m * len(some), m * len(rest)
-        own = H[:, some][:, :, :, some].reshape(q, q)
-        gain = gain_of(own, g[:, some].ravel(), squares[:, some].ravel())
+        of_some = H[:, some][:, :, :, some].reshape(q, q)
+        gain = gain_of(of_some, g[:, some].ravel(), squares[:, some].ravel())
         if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
             continue
         cross = H[:, rest][:, :, :, some].reshape(p, q)
-        inverse = determined_inverse(own, squares[:, some].ravel())
+        inverse = determined_inverse(of_some, squares[:, some].ravel())
         others = gain_of(
             H[:, rest][:, :, :, rest].reshape(p, p) - cross @ inverse @ cross.T,
             g[:, rest].ravel() + cross @ gain.beta,

@@ -1,4 +1,4 @@
-"""What an alternative frees: one class for each family, with its columns, its remark and what it displaces.
+"""Alternatives: one class for each family, with the columns it frees, its remark and displacements.
 
 A family is a set of columns. A new one is a class here, and a line that looks for it in
 `sfm.adjustment.hypotheses.alternatives`.
@@ -132,7 +132,8 @@ class Family(ABC):
 class OfPhotographs(Family):
     """Some of the freedoms that a photograph may have by itself: `Columns.freedoms`.
 
-    In the pattern `each` every photograph, or run of photographs, has its own: their factors number the runs.
+    In the pattern `each` every photograph, or run of photographs, has a factor: their factors number the
+    runs.
     """
 
     places: tuple[int, ...]  # in the freedoms
@@ -141,12 +142,12 @@ class OfPhotographs(Family):
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points, px, (k, 2, q)."""
         factor = one.factor[a.network.image_points.image]
-        own = columns.freedoms[:, :, list(self.places)]
+        freedoms = columns.freedoms[:, :, list(self.places)]
         if one.pattern != "each":
-            return np.asarray(factor[:, None, None] * own)
-        D = np.zeros((len(own), 2, int(one.factor.max()) + 1, len(self.places)))
-        D[np.arange(len(own)), :, factor.astype(np.int64)] = own
-        return D.reshape(len(own), 2, -1)
+            return np.asarray(factor[:, None, None] * freedoms)
+        D = np.zeros((len(freedoms), 2, int(one.factor.max()) + 1, len(self.places)))
+        D[np.arange(len(freedoms)), :, factor.astype(np.int64)] = freedoms
+        return D.reshape(len(freedoms), 2, -1)
 
 
 @dataclass(frozen=True)
@@ -275,9 +276,9 @@ class PointFamily(Family):
 
     def field(self, points: FloatArray, some: IntArray) -> FloatArray:
         """Return the displacements of points (n, 3) where some of them move, (n, 3, q)."""
-        own = np.zeros((len(points), 3, len(some), 3))
-        own[some, :, np.arange(len(some))] = np.eye(3)
-        return own.reshape(len(points), 3, -1)
+        each = np.zeros((len(points), 3, len(some), 3))
+        each[some, :, np.arange(len(some))] = np.eye(3)
+        return each.reshape(len(points), 3, -1)
 
 
 @dataclass(frozen=True)
@@ -286,9 +287,9 @@ class ShiftedFamily(PointFamily):
 
     def field(self, points: FloatArray, some: IntArray) -> FloatArray:
         """Return the displacements of points (n, 3) where some of them move, (n, 3, 3)."""
-        own = np.zeros((len(points), 3, 3))
-        own[some] = np.eye(3)
-        return own
+        shift = np.zeros((len(points), 3, 3))
+        shift[some] = np.eye(3)
+        return shift
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ NAMED = 1.0  # standard deviations by which coordinates shift, below which a cau
 
 @dataclass(frozen=True)
 class Cause:
-    """An alternative that holds."""
+    """An accepted alternative."""
 
     alternative: Alternative
     refit: Refit
@@ -75,7 +75,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Judged:
-    """What the image points say of the assumptions of an adjustment."""
+    """Tests of the assumptions of an adjustment by the image points."""
 
     causes: tuple[Remark, ...] = ()  # of what contradicts them, the clearest first
     unchecked: tuple[Remark, ...] = ()  # on assumptions that are not tested, or weakly
@@ -180,7 +180,7 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
 
     Args:
         plain: the adjustment without it.
-        cause: the alternative that holds.
+        cause: the accepted alternative.
         unit: object unit.
         without: what fixes all coordinates of the result, so that only those of `plain` shift.
     """
@@ -197,12 +197,14 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
 def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:
     """Return the points of each body that may move against others; of two both motions are the same."""
     names, known = plain.network.points, np.isfinite(plain.estimate.points).all(axis=1)
-    own = [known & np.isin(names, list(one)) for one in bodies]
-    own = [one for one in own if one.sum() >= MIN_OF_BODY and (known & ~one).sum() >= MIN_OF_BODY]
-    own = [
-        one for k, one in enumerate(own) if not any((one == known & ~other).all() for other in own[k + 1 :])
+    members = [known & np.isin(names, list(one)) for one in bodies]
+    members = [one for one in members if one.sum() >= MIN_OF_BODY and (known & ~one).sum() >= MIN_OF_BODY]
+    members = [
+        one
+        for k, one in enumerate(members)
+        if not any((one == known & ~other).all() for other in members[k + 1 :])
     ]
-    return tuple(np.flatnonzero(one) for one in own)
+    return tuple(np.flatnonzero(one) for one in members)
 
 
 def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cause, ...]:
@@ -222,7 +224,7 @@ def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cau
 
 
 def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArray] = ()) -> Cause | None:
-    """Return the alternative that holds beside others: of those of most evidence the one that adjusts best.
+    """Return the accepted alternative beside others: of those of most evidence the one that adjusts best.
 
     The score test is linear, and of a large error the alternative with most parameters has most evidence.
     """

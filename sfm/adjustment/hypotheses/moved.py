@@ -81,9 +81,9 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))
     g = g[movable] - np.einsum("nab,na->nb", C[movable], reduced.y[movable])
     g = g - K @ (reduced.Sinv @ reduced.t)
-    own = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]
+    blocks_of = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]
     KS = K @ reduced.Sinv
-    blocks = own - np.einsum("nas,nbs->nab", KS, K)
+    blocks = blocks_of - np.einsum("nas,nbs->nab", KS, K)
     squares = np.einsum("nii->ni", V[movable])
     single, _ = gains_of(blocks, g, squares)
     order = np.argsort(-single)[: min(MAX_MOVED, len(movable) // 2 or 1)]
@@ -91,7 +91,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     H = -flat[1] @ flat[0].T
     for place, k in enumerate(order):
         block = slice(3 * place, 3 * place + 3)
-        H[block, block] += own[k]
+        H[block, block] += blocks_of[k]
     best: Alternative | None = None
     total = len(movable)
     ordered = np.sort(single)[::-1]
@@ -153,9 +153,9 @@ def _shifted(
     movable, blocks, g = parts
     total = len(movable)
     squares = np.einsum("nii->ni", blocks)
-    own, _ = gains_of(blocks, g, squares)
+    single, _ = gains_of(blocks, g, squares)
     best: Alternative | None = None
-    for first in np.argsort(-own)[:STARTS]:
+    for first in np.argsort(-single)[:STARTS]:
         members = np.arange(total) == first
         for _ in range(ROUNDS):
             N = blocks[members].sum(axis=0)

@@ -75,9 +75,9 @@ def refit(
         step = gain.beta
         beta = beta + step
     gained = log_likelihood(current) - log_likelihood(start)
-    own = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
+    parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
     return Refit(
-        *(current, own[-1], gained, *shifts_of(plain, start, current, one, own[-1])), tuple(own[:-1])
+        *(current, parts[-1], gained, *shifts_of(plain, start, current, one, parts[-1])), tuple(parts[:-1])
     )
 
 

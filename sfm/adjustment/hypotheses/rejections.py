@@ -1,7 +1,8 @@
-"""What the rejected image points have in common: names that were exchanged, points at a second place.
+"""Common causes of rejected image points: names that were exchanged, points at a second place.
 
-The test of the adjustment has told them from the good ones; here they are explained among themselves, with
-photographs as adjusted. They take no part in the tests of `alternatives`, which a few of them would decide.
+The test of the adjustment has separated them from the good ones; here they are explained among themselves,
+with photographs as adjusted. They take no part in the tests of `alternatives`, which a few of them would
+decide.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
 """

@@ -1,6 +1,6 @@
 """Whether the cameras of a rig kept their places: a test of each photograph for a pose of its own.
 
-With the derivatives E of the image points of one photograph by a pose of its own, the whitened residuals v
+With the derivatives E of the image points of one photograph by a separate pose, the whitened residuals v
 and R = I - A Q A', its shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square
 of six. The photographs of a rig are tested together, the largest shift first, each beside those found before.
 
@@ -24,8 +24,8 @@ from sfm.distributions import chi2_sf
 from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
 
-FALSE_ALARM = 0.01  # probability that a rig without a bump is said to have one
-FREE = 1e-9  # redundancy of a pose of its own below which nothing checks it
+FALSE_ALARM = 0.01  # probability that a rig without a bump is reported to have one
+FREE = 1e-9  # redundancy of a separate pose below which nothing checks it
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
 
 
 def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:
-    """Whether all but one photograph of the moment of a photograph have a pose of their own already."""
-    own = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
-    return own + 2 > int((moment == moment[tested[k]]).sum())
+    """Whether all but one photograph of the moment of a photograph have a separate pose already."""
+    taken_with = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
+    return taken_with + 2 > int((moment == moment[tested[k]]).sum())
 
 
 def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -137,7 +137,7 @@ def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _gain(s: FloatArray, G: FloatArray, k: int, taken: list[int]) -> tuple[float, FloatArray]:
-    """Return chi-square of a pose of its own of a photograph beside those of others, and the shift, (6,)."""
+    """Return chi-square of a separate pose of a photograph beside those of others, and the shift, (6,)."""
     t, M = s[k], G[k][:, k]
     if taken:
         across = G[k][:, taken].reshape(6, -1)

@@ -73,7 +73,7 @@ class Reduced:
     def project_by_run(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns (k, 2, f).
 
-        Every run of photographs has f freedoms of its own; `run` is that of each photograph, (m,).
+        Every run of photographs has f separate freedoms; `run` is that of each photograph, (m,).
         """
         n, f, count = len(self.L), D.shape[2], int(run.max()) + 1
         owner = run[self.image]
@@ -157,9 +157,9 @@ class Reduced:
         m, q = self.photographs, D.shape[2]
         by = np.swapaxes(self.A, 1, 2) @ D
         K = np.zeros((len(self.t), q))
-        own = np.zeros((m, 6, q))
-        np.add.at(own, self.image, by[:, :6])
-        K[: 6 * m] = own.reshape(6 * m, q)
+        by_pose = np.zeros((m, 6, q))
+        np.add.at(by_pose, self.image, by[:, :6])
+        K[: 6 * m] = by_pose.reshape(6 * m, q)
         K[6 * m :] = by[:, 6:].sum(axis=0)
         return K
 
@@ -280,13 +280,13 @@ def _camera_normals(
     At = np.swapaxes(A, 1, 2)
     N, b = At @ A, np.einsum("kab,kb->ka", At, v)
     for i, rows in enumerate(rows_of(image, m)):
-        own = slice(6 * i, 6 * i + 6)
+        pose = slice(6 * i, 6 * i + 6)
         whole = N[rows].sum(axis=0)
-        S[own, own] = whole[:6, :6]
-        S[own, 6 * m :] = whole[:6, 6:]
-        S[6 * m :, own] = whole[6:, :6]
+        S[pose, pose] = whole[:6, :6]
+        S[pose, 6 * m :] = whole[:6, 6:]
+        S[6 * m :, pose] = whole[6:, :6]
         S[6 * m :, 6 * m :] += whole[6:, 6:]
-        t[own] = b[rows].sum(axis=0)[:6]
+        t[pose] = b[rows].sum(axis=0)[:6]
         t[6 * m :] += b[rows].sum(axis=0)[6:]
     return S, t
 
@@ -312,7 +312,7 @@ def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Gain:
-    """What an alternative takes from v'Pv over the variance factor."""
+    """The decrease of v'Pv by an alternative over the variance factor."""
 
     value: float
     rank: int  # of its parameters those that the image points determine
@@ -397,7 +397,7 @@ def log_probability(gain: float, q: int, redundancy: int) -> float:
 def log_f_sf(f: float, q: int, d: int) -> float:
     """Return ln of the probability that F of redundancies q and d is larger than f.
 
-    Beyond what a float holds by the series of the incomplete beta function.
+    Beyond the range of a float by the series of the incomplete beta function.
 
     Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.5.2 and 26.6.2.
     """

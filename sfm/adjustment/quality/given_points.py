@@ -128,9 +128,9 @@ class GivenPoints:
         n, R = len(X), placing.rotation
         if self.strain is not None:
             E, F = self.strain.derivatives, self.strain.F
-            own = np.einsum("uab,nb->nau", E, (X - centre) / size)
+            by_strain = np.einsum("uab,nb->nau", E, (X - centre) / size)
             X, R = centre + (X - centre) @ F.T, F @ R
-            A = np.concatenate([np.einsum("ab,nbu->nau", F, A), own], axis=2)
+            A = np.concatenate([np.einsum("ab,nbu->nau", F, A), by_strain], axis=2)
         A = A.reshape(3 * n, -1)[rows]
         turned = np.einsum("ab,ibjc,dc->iajd", R, self.joint.reshape(n, 3, n, 3), R)
         network = placing.scale**2 * turned.reshape(3 * n, 3 * n)[np.ix_(rows, rows)]

@@ -263,9 +263,9 @@ class GivenModel:
             M, P = N @ N.T, np.eye(len(S))
         for one in np.unique(part.item):
             rows = np.flatnonzero(part.item == one)
-            own, W = M[np.ix_(rows, rows)], P[np.ix_(rows, rows)]
+            M_rows, W = M[np.ix_(rows, rows)], P[np.ix_(rows, rows)]
             L = np.linalg.cholesky(W + RANK * np.trace(W) * np.eye(len(rows)))
-            checked = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, own).T)).min()
+            checked = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, M_rows).T)).min()
             r = float(np.clip(checked, 0.0, 1.0))
             out[one] = NONCENTRALITY * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
         return out

@@ -2,7 +2,7 @@
 
 In weak networks the sum of squares has several minima: of few photographs with small angles c and the
 distance go together, and relief or tilt can be turned inside out as in a drawing of a cube. Each minimum has
-a small standard deviation of its own, which says nothing of the others. The network is therefore followed
+a small standard deviation, which says nothing of the others. The network is therefore followed
 along c in both directions, from the result and from its reflection in depth, with c held; where v'Pv is as
 small as that of the result, or at a minimum, c is freed and the network adjusted.
 
@@ -130,7 +130,9 @@ def _impossible(other: Estimate, result: Estimate) -> bool:
     Of photographs that were cropped the result has it there too, or it is given.
     """
     pairs = zip(other.cameras, result.cameras, strict=True)
-    return any(one.free[one.parts[1]].any() and _is_beyond(one) and not _is_beyond(own) for one, own in pairs)
+    return any(
+        one.free[one.parts[1]].any() and _is_beyond(one) and not _is_beyond(ours) for one, ours in pairs
+    )
 
 
 def _is_beyond(camera: Camera) -> bool:
@@ -242,7 +244,7 @@ def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
     """Return the estimate with these parameters of its cameras free."""
-    cameras = tuple(replace(one, free=own) for one, own in zip(estimate.cameras, free, strict=True))
+    cameras = tuple(replace(one, free=freed) for one, freed in zip(estimate.cameras, free, strict=True))
     return replace(estimate, cameras=cameras)
 
 
@@ -265,16 +267,16 @@ class _Place:
 
     def describe(self, other: Estimate, vPv: float) -> OtherSolution:
         """Return another solution as it differs from the result."""
-        own, number = self.adjustment.estimate, self._number
+        result, number = self.adjustment.estimate, self._number
         camera = other.cameras[number]
         c, sigma = float(camera.parameters[0]), float(self.adjustment.interior_sigma(number)[0])
         return OtherSolution(
             camera.name,
             c,
             camera.units[0],
-            reflected=bool(abs(np.log(c / own.cameras[number].parameters[0])) < np.log(STEP) / 2),
-            moved=self.distance(other, own),
-            c_moved=abs(c - own.cameras[number].parameters[0]) / sigma if sigma > 0 else 0.0,
+            reflected=bool(abs(np.log(c / result.cameras[number].parameters[0])) < np.log(STEP) / 2),
+            moved=self.distance(other, result),
+            c_moved=abs(c - result.cameras[number].parameters[0]) / sigma if sigma > 0 else 0.0,
             vPv=vPv,
             estimate=other,
             converges=False,

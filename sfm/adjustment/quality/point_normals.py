@@ -62,11 +62,11 @@ SETTLED = 1e-3  # standard deviations
 def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, FloatArray, float]:
     """Return position (3,), cofactors (3, 3) and v'Pv over sigma0^2 of a point from some of its rays alone.
 
-    Where it lies far from the adjusted point, as if two points bear one name, a single step would not do.
+    Where it lies far from the adjusted point, as where two points have one name, a single step would not do.
     """
     network = adjustment.network
     j = int(network.image_points.point[rows[0]])
-    own = replace(
+    alone = replace(
         adjustment,
         network=replace(network, image_points=network.image_points.select(rows)),
         image_sigma_factor=adjustment.image_sigma_factor[rows],
@@ -74,7 +74,7 @@ def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, Flo
     )
     X, every = adjustment.estimate.points[j], np.arange(len(rows))
     for _ in range(MAX_STEPS):
-        parts = point_normals(own, adjustment.image_sigma0)
+        parts = point_normals(alone, adjustment.image_sigma0)
         if not np.isfinite(parts.q).all():
             return X, np.full((3, 3), np.nan), np.inf
         Q = np.linalg.pinv(parts.N.sum(axis=0))
@@ -82,7 +82,7 @@ def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, Flo
         if step @ parts.N.sum(axis=0) @ step < SETTLED**2:
             break
         X = X + step
-        own = replace(own, residuals=_residuals(own, X), estimate=_moved(own.estimate, j, X))
+        alone = replace(alone, residuals=_residuals(alone, X), estimate=_moved(alone.estimate, j, X))
     return X, Q, parts.misfit(every)
 
 
@@ -92,11 +92,13 @@ def _moved(estimate: Estimate, point: int, X: FloatArray) -> Estimate:
     return replace(estimate, points=points)
 
 
-def _residuals(own: Adjustment, X: FloatArray) -> FloatArray:
+def _residuals(alone: Adjustment, X: FloatArray) -> FloatArray:
     """Return v = computed - measured of the image points of one point at X, px, (k, 2)."""
-    seen, estimate = own.network.image_points, own.estimate
+    seen, estimate = alone.network.image_points, alone.estimate
     computed = [
-        project(estimate.cameras[own.network.camera[i]], estimate.position[i], estimate.rotation[i], X[None])
+        project(
+            estimate.cameras[alone.network.camera[i]], estimate.position[i], estimate.rotation[i], X[None]
+        )
         for i in seen.image
     ]
     return np.asarray(np.concatenate(computed) - seen.xy)
@@ -117,9 +119,9 @@ def point_normals(adjustment: Adjustment, sigma0: float | None = None) -> PointN
     uv = -UVW[:, :2] / W[:, None]
     A = -(np.swapaxes(R, 1, 2)[:, :2] + uv[:, :, None] * R[:, None, :, 2]) / W[:, None, None]
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
-    for camera, own in zip(estimate.cameras, of_camera, strict=True):
-        if len(own):
-            A[own] = pixel_jacobian(camera, seen.xy[own]) @ A[own]
+    for camera, rows_of_camera in zip(estimate.cameras, of_camera, strict=True):
+        if len(rows_of_camera):
+            A[rows_of_camera] = pixel_jacobian(camera, seen.xy[rows_of_camera]) @ A[rows_of_camera]
     P = (
         np.linalg.inv(adjustment.image_covariance)
         / (adjustment.image_sigma0 if sigma0 is None else sigma0) ** 2

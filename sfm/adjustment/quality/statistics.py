@@ -164,7 +164,7 @@ def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
 def robust_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     """Return the test of w over its standard deviation by its median, which half of the coordinates make.
 
-    It finds gross errors that nobody rejected: tau is blind where they are so many that they make sigma0, w
+    It finds gross errors that were not rejected: tau is blind where they are so many that they make sigma0, w
     where the standard deviation is not as stated. Residuals that are rounding are not tested.
 
     Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2.

@@ -1,4 +1,4 @@
-"""Variance components: how well groups of observations were measured, from their own residuals.
+"""Variance components: how well groups of observations were measured, from their residuals.
 
 Groups are photographs, cameras, and kinds of observation. The variance factor of a group is its v'Pv over
 its redundancy, the sum of its redundancy numbers; that of a kind is its count less tr(P Q) of what it
@@ -101,11 +101,11 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     for one in a.observed:
         name = network.kinds[one.index].name
         found[name] = found.get(name, np.zeros(3)) + np.array([one.vPv, one.redundancy, one.count])
-    vPv, own, count = np.array(list(found.values())).reshape(-1, 3).T
+    vPv, redundancies, count = np.array(list(found.values())).reshape(-1, 3).T
     return VarianceComponents(
         (IMAGE_POINTS, *found),
-        np.concatenate([image.sigma0, _root_ratio(vPv, own, FEW_OF_A_KIND)]),
-        np.concatenate([image.redundancy, own]),
+        np.concatenate([image.sigma0, _root_ratio(vPv, redundancies, FEW_OF_A_KIND)]),
+        np.concatenate([image.redundancy, redundancies]),
         np.concatenate([image.count, count.astype(np.int64)]),
     )
 

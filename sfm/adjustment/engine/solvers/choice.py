@@ -34,7 +34,7 @@ FRONT_RATE = 20e9  # the same of many smaller ones, which are added to one anoth
 PAIR_RATE = 25e9  # product of two rays of a point, compiled
 PAIR_OPERATIONS = 216  # of a 6 x 6 x 3 product
 SMALL = 64  # photographs up to which the product of full rows costs so little that nothing else is sought
-SAMPLED = 2  # pairs of rays for each pair of photographs, from which it is told whether most share points
+SAMPLED = 2  # pairs of rays for each pair of photographs, which show whether most share points
 TRIED_PAIRS = 1000  # of photographs; a share of 0.5 is then known to 0.016
 MOSTLY = 0.5  # share of the pairs of photographs with a common point above which fronts save nothing
 

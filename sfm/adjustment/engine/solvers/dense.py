@@ -160,14 +160,14 @@ class DenseFactor:
 
             def products(begin: int, end: int) -> None:
                 for start, rows in rows_of(b, layout, np.ones(layout.reduced), np.float64, begin, end):
-                    own = slice(start, start + len(rows) // 3)
+                    photographs = slice(start, start + len(rows) // 3)
                     if cross:
                         rowsQ = rows @ Q
                         pick_columns(layout.observations, rowsQ, start, YQ, YQ_border)
-                        multiply_rows(rowsQ, rows, core[own])
+                        multiply_rows(rowsQ, rows, core[photographs])
                     else:
                         white = times_triangle(rows, W)
-                        multiply_rows(white, white, core[own])
+                        multiply_rows(white, white, core[photographs])
 
             at_once(lambda: products(0, half), lambda: products(half, n))
         if not cross:
@@ -310,9 +310,9 @@ def subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> Non
     left, right = rows[:, :half], rows[:, half:]
 
     def subtract(a: FloatArray, b: FloatArray, row: int, column: int) -> None:
-        own = slice(row, row + a.shape[1]), slice(column, column + b.shape[1])
-        np.matmul(a.T, b, out=product[own])
-        S[own] -= product[own]
+        block = slice(row, row + a.shape[1]), slice(column, column + b.shape[1])
+        np.matmul(a.T, b, out=product[block])
+        S[block] -= product[block]
 
     def triangles() -> None:
         subtract(left, left, 0, 0)

@@ -44,11 +44,11 @@ BYTES = 8.0  # of a number in double precision
 class Front:
     """A group of photographs that are eliminated together."""
 
-    photographs: IntArray  # own ones, then those joined with them that are eliminated later
-    own: int  # how many are its own
+    photographs: IntArray  # pivots, then those joined with them that are eliminated later
+    pivots: int  # how many of them it eliminates
     children: tuple[int, ...]  # fronts that leave something to it
     parent: int  # front that takes what is left of it; -1: nothing is left
-    into: IntArray  # places among the photographs of the parent of those that are not its own
+    into: IntArray  # places among the photographs of the parent of those that it does not eliminate
     points: IntArray  # object points that add to it
     rows: IntArray  # exterior unknowns of its photographs
 
@@ -64,7 +64,7 @@ class Fronts:
     @property
     def operations(self) -> float:
         """Operations of the factorisation, products and sums counted each."""
-        return float(sum(_operations(6.0 * f.own, 6.0 * len(f.photographs)) for f in self.fronts))
+        return float(sum(_operations(6.0 * f.pivots, 6.0 * len(f.photographs)) for f in self.fronts))
 
     def bytes(self, border: int, vectors: float) -> float:
         """Memory of factor and inverse at the peak: what is kept, what waits for a parent, the front at work.
@@ -78,7 +78,7 @@ class Fronts:
         last = self._eliminating(range(end, len(self.fronts)), first.waiting | second.waiting)
         factor = first.kept + second.kept + last.kept
         factoring = max(first.peak + second.peak, first.kept + second.kept + last.peak)  # both halves at once
-        columns = BYTES * 6 * sum(front.own for front in self.fronts) * border
+        columns = BYTES * 6 * sum(front.pivots for front in self.fronts) * border
         return max(factoring, factor + vectors, factor + self._inverting() + 2 * columns) + 2 * columns
 
     def _eliminating(self, some: range, waiting: dict[int, float]) -> _Memory:
@@ -88,12 +88,12 @@ class Fronts:
         space = max((_bytes(self.fronts[g])[0] for g in some), default=0.0)
         for g in some:
             front = self.fronts[g]
-            _, own, rest = _bytes(front)
+            _, factor, rest = _bytes(front)
             for child in front.children:
                 del waiting[child]
-            peak = max(peak, space + kept + sum(waiting.values()) + own + rest)
+            peak = max(peak, space + kept + sum(waiting.values()) + factor + rest)
             waiting[g] = rest
-            kept += own
+            kept += factor
         return _Memory(kept, peak, waiting)
 
     def _inverting(self) -> float:
@@ -102,9 +102,9 @@ class Fronts:
         needed = [len(front.children) for front in self.fronts]
         peak = before = 0.0
         for g in range(len(self.fronts) - 1, -1, -1):
-            matrix, own, _ = _bytes(self.fronts[g])
+            matrix, factor, _ = _bytes(self.fronts[g])
             # the front, as it is and scaled, and what is left of the one before
-            peak = max(peak, sum(kept.values()) + 2 * matrix + own + before)
+            peak = max(peak, sum(kept.values()) + 2 * matrix + factor + before)
             before = matrix
             parent = self.fronts[g].parent
             if parent >= 0:
@@ -126,8 +126,8 @@ class _Memory(NamedTuple):
 
 def _bytes(front: Front) -> tuple[float, float, float]:
     """Return the memory of the matrix of a front, of its part of the factor and of what it leaves."""
-    own, size = 6 * front.own, 6 * len(front.photographs)
-    return BYTES * size**2, BYTES * own * size, BYTES * (size - own) ** 2
+    pivots, size = 6 * front.pivots, 6 * len(front.photographs)
+    return BYTES * size**2, BYTES * pivots * size, BYTES * (size - pivots) ** 2
 
 
 def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
@@ -162,13 +162,13 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
     where = np.empty(m, dtype=np.int32)
     fronts = []
     for g, (group, parent) in enumerate(zip(order.groups, order.parents, strict=True)):
-        own = photograph[members[g]]
+        in_front = photograph[members[g]]
         into = np.searchsorted(members[parent], members[g][len(group) :])
         added = points[cuts[g] : cuts[g + 1]]
-        where[own] = np.arange(len(own))
+        where[in_front] = np.arange(len(in_front))
         _place(observations, added, where, local)
-        rows = (6 * own[:, None] + np.arange(6)).ravel()
-        fronts.append(Front(own, len(group), tuple(children[g]), parent, into, added, rows))
+        rows = (6 * in_front[:, None] + np.arange(6)).ravel()
+        fronts.append(Front(in_front, len(group), tuple(children[g]), parent, into, added, rows))
     return Fronts(tuple(fronts), _halves(order.parents), local)
 
 
@@ -182,10 +182,10 @@ def _halves(parents: list[int]) -> tuple[int, int]:
     return (below[len(below) // 2 - 1] + 1 if len(below) > 1 else 0), last
 
 
-def _operations(own: float, size: float) -> float:
+def _operations(pivots: float, size: float) -> float:
     """Operations that eliminate some of the unknowns of a symmetric matrix."""
-    rest = size - own
-    return own**3 / 3 + own**2 * rest + own * rest**2
+    rest = size - pivots
+    return pivots**3 / 3 + pivots**2 * rest + pivots * rest**2
 
 
 @kernel
@@ -222,8 +222,8 @@ def _eliminate(graph: csr_matrix, photographs: IntArray, order: Dissection) -> l
         return [len(order.groups) - 1]
     tops: list[int] = []
     for half in halves[:2]:
-        own = np.flatnonzero(half)
-        tops += _eliminate(graph[own][:, own], photographs[own], order)
+        members = np.flatnonzero(half)
+        tops += _eliminate(graph[members][:, members], photographs[members], order)
     separator = photographs[halves[2]]
     if len(separator) == 0:
         return tops

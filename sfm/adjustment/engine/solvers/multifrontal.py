@@ -3,7 +3,7 @@
     S = (A C; C' D)     A: exterior orientation, block by block; D: interior unknowns and kept points
 
 is factored as A = L L' and D - C' A^-1 C. A is never put together: every front (`fronts`) sums what its
-object points add, takes what the fronts before it have left, eliminates its own photographs and leaves the
+object points add, takes what the fronts before it have left, eliminates its pivots and leaves the
 rest to the next. The motions that the datum leaves open, and any further null vectors, are held by adding 1
 to one diagonal element for each: with g free of the null space these unknowns get dx = 0 and nothing else
 changes, a minimal constraint.
@@ -97,19 +97,19 @@ class MultifrontalSolver:
         )
         scale = equations.parts.scale
         Q = motions.orthonormal(scale)
-        holds = _largest(Q)
+        fixed = _largest(Q)
         border = self._border(equations)
-        factor = self._factored(equations, border, holds)
+        factor = self._factored(equations, border, fixed)
         if damped or not (factor is None or factor.weak):
             return factor
         del factor  # one at a time in memory
-        shifted = self._factored(equations, border, holds, shift=SHIFT)
+        shifted = self._factored(equations, border, fixed, shift=SHIFT)
         if shifted is None:
-            return self._factored(equations, border, holds)
+            return self._factored(equations, border, fixed)
         further = null_vectors(shifted, equations, self.layout, Q)
         del shifted
         if further.shape[1] == 0:
-            return self._factored(equations, border, holds)
+            return self._factored(equations, border, fixed)
         # held together with the motions, so that no unknown is chosen for two null vectors
         factor = self._factored(equations, border, _largest(np.hstack([Q, further])))
         if factor is None:
@@ -135,29 +135,30 @@ class MultifrontalSolver:
         self,
         equations: Equations,
         border: Border,
-        holds: IntArray,
+        fixed: IntArray,
         *,
         shift: float = 0.0,
     ) -> MultifrontalFactor | None:
         """Return the factor with some unknowns held; None if the matrix is not positive definite."""
         first = self.layout.pose_free.size
         added = np.full(self.layout.reduced, shift)
-        added[holds] += 1.0
+        added[fixed] += 1.0
         eliminated = self._eliminate(equations, added[:first])
         if eliminated is None:
             return None
         weak = any(front.weakest**2 < WEAK_PIVOT for front in eliminated)
         none = np.zeros((self.layout.reduced, 0))
-        own = MultifrontalFactor(self.layout, self.fronts, equations.parts.scale, eliminated, border.C, none)
+        scale = equations.parts.scale
+        factor = MultifrontalFactor(self.layout, self.fronts, scale, eliminated, border.C, none)
         X, corner = np.zeros((first, 0)), border.D + np.diag(added[first:])
         if len(border.D):
-            X = own.solve_exterior(border.C)
+            X = factor.solve_exterior(border.C)
             try:
                 corner, _ = cho_factor(corner - border.C.T @ X)
             except np.linalg.LinAlgError:
                 return None
             weak = weak or bool(np.diagonal(corner).min() ** 2 < WEAK_PIVOT)
-        return own.with_border(X, corner, weak=weak)
+        return factor.with_border(X, corner, weak=weak)
 
     def _eliminate(self, equations: Equations, added: FloatArray) -> list[Eliminated] | None:
         """Return all fronts eliminated, added to the diagonal; None if one is not positive definite."""
@@ -174,7 +175,7 @@ class MultifrontalSolver:
                 F = self._front(equations, front, added, space)
                 for child in front.children:  # in this order however many threads there are
                     _extend(left.pop(child), fronts[child].into, F)
-                done = _eliminated(F, 6 * front.own)
+                done = _eliminated(F, 6 * front.pivots)
                 if done is None:
                     return False
                 found[g], left[g] = done
@@ -193,21 +194,21 @@ class MultifrontalSolver:
         F.fill(0.0)
         scale = equations.parts.scale[front.rows]
         _sum_front(
-            self.layout.observations, b.U, b.Y, front.photographs[: front.own], front.points,
+            self.layout.observations, b.U, b.Y, front.photographs[: front.pivots], front.points,
             self.fronts.local, scale, F.reshape(-1),
         )  # fmt: skip
-        own = np.arange(6 * front.own)
-        F[own, own] += equations.damping + added[front.rows[own]]  # the diagonal of U is 1 by its scale
+        each = np.arange(6 * front.pivots)
+        F[each, each] += equations.damping + added[front.rows[each]]  # the diagonal of U is 1 by its scale
         return F
 
 
-def _eliminated(F: FloatArray, own: int) -> tuple[Eliminated, FloatArray] | None:
+def _eliminated(F: FloatArray, pivots: int) -> tuple[Eliminated, FloatArray] | None:
     """Return the factor of the first unknowns of a front, and what they leave of the rest."""
-    U, info = dpotrf(F[:own, :own].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
+    U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
     if info != 0:
         return None
-    rest = F[own:, own:].copy()
-    K = F[own:, :own].copy()
+    rest = F[pivots:, pivots:].copy()
+    K = F[pivots:, :pivots].copy()
     if len(K):
         K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
         rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
@@ -227,18 +228,18 @@ def _sum_front(
     observations: Observations,
     U: FloatArray,
     Y: FloatArray,
-    own: IntArray,
+    pivots: IntArray,
     points: IntArray,
     local: AnyArray,
     scale: FloatArray,
     flat: FloatArray,
 ) -> None:
-    """Fill the lower triangle with U of the own photographs less Y Y' of the object points, scaled."""
+    """Fill the lower triangle with U of the pivots less Y Y' of the object points, scaled."""
     size = len(scale)
-    for i in range(len(own)):
+    for i in range(len(pivots)):
         for q in range(6):
             for p in range(q + 1):
-                flat[(6 * i + q) * size + 6 * i + p] = U[own[i], q, p]
+                flat[(6 * i + q) * size + 6 * i + p] = U[pivots[i], q, p]
     for j in points:
         for s in range(observations.start[j], observations.start[j + 1]):
             row = 6 * local[s]

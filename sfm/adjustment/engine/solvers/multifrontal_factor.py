@@ -4,7 +4,7 @@ From A = L L' and Z = A^-1 follows, front by front from the last,
 
     Z_RJ = -Z_RR G,   Z_JJ = L_JJ^-T L_JJ^-1 - G' Z_RJ,   G = L_RJ L_JJ^-1
 
-where J are the own photographs of a front and R the others, whose Z_RR the front behind it has already.
+where J are the pivots of a front and R the others, whose Z_RR the front behind it has already.
 
 Source: Takahashi, Fagan and Chin (1973), Formation of a sparse bus impedance matrix; Erisman and Tinney
 (1975), Comm. ACM 18(3); Liu (1992), SIAM Review 34(1); Foerstner and Wrobel (2016), sec. 15.2.5.
@@ -34,7 +34,7 @@ from sfm.kernels.options import kernel
 class Eliminated(NamedTuple):
     """Part of the factor left by eliminating the photographs of a front."""
 
-    L: FloatArray  # of the own unknowns, lower triangle, (j, j)
+    L: FloatArray  # of the unknowns of the pivots, lower triangle, (j, j)
     K: FloatArray  # rows of the other unknowns of the front, (r, j)
     weakest: float  # smallest pivot
 
@@ -75,14 +75,14 @@ class MultifrontalFactor:
         x = np.array(right, order="C")
         pairs = list(zip(self.fronts.fronts, self.eliminated, strict=True))
         for front, (L, K, _) in pairs:
-            own, rest = np.split(front.rows, [6 * front.own])
-            x[own] = dtrsm(1.0, L.T, x[own], trans_a=1)
+            pivots, rest = np.split(front.rows, [6 * front.pivots])
+            x[pivots] = dtrsm(1.0, L.T, x[pivots], trans_a=1)
             if len(rest):
-                x[rest] -= K @ x[own]
+                x[rest] -= K @ x[pivots]
         for front, (L, K, _) in reversed(pairs):
-            own, rest = np.split(front.rows, [6 * front.own])
-            y = x[own] - K.T @ x[rest] if len(rest) else x[own]
-            x[own] = dtrsm(1.0, L.T, y)
+            pivots, rest = np.split(front.rows, [6 * front.pivots])
+            y = x[pivots] - K.T @ x[rest] if len(rest) else x[pivots]
+            x[pivots] = dtrsm(1.0, L.T, y)
         return x
 
     def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
@@ -93,8 +93,8 @@ class MultifrontalFactor:
         """
         b, observations = blocks, self.layout.observations
         first, border = len(self.C), len(self.corner)
-        own = self.scale * self.layout.reduced_free()
-        s, sb = own[:first], own[first:]
+        scales = self.scale * self.layout.reduced_free()
+        s, sb = scales[:first], scales[first:]
         X = self.X * s[:, None] / self.scale[first:]
         Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
         Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # as a matrix without elements is, for the kernel
@@ -108,7 +108,7 @@ class MultifrontalFactor:
             scale = s[front.rows]
             Z_own = Z * scale
             Z_own *= scale[:, None]
-            for i, photograph in enumerate(front.photographs[: front.own]):
+            for i, photograph in enumerate(front.photographs[: front.pivots]):
                 at = slice(6 * i, 6 * i + 6)
                 rows = slice(6 * photograph, 6 * photograph + 6)
                 exterior[photograph] = Z_own[at, at] + XQ[rows] @ X[rows].T
@@ -127,16 +127,16 @@ class MultifrontalFactor:
         kept: dict[int, FloatArray] = {}
         for g in range(len(fronts) - 1, -1, -1):
             front, (L, K, _) = fronts[g], self.eliminated[g]
-            own, size = 6 * front.own, 6 * len(front.photographs)
+            pivots, size = 6 * front.pivots, 6 * len(front.photographs)
             inverse = np.tril(dtrtri(L.T, lower=0)[0].T)
             Z = np.empty((size, size))
-            Z[:own, :own] = inverse.T @ inverse
-            if size > own:
-                _pick(kept[front.parent], front.into, Z[own:, own:])
+            Z[:pivots, :pivots] = inverse.T @ inverse
+            if size > pivots:
+                _pick(kept[front.parent], front.into, Z[pivots:, pivots:])
                 G = K @ inverse
-                Z[own:, :own] = -(Z[own:, own:] @ G)
-                Z[:own, own:] = Z[own:, :own].T
-                Z[:own, :own] -= G.T @ Z[own:, :own]
+                Z[pivots:, :pivots] = -(Z[pivots:, pivots:] @ G)
+                Z[:pivots, pivots:] = Z[pivots:, :pivots].T
+                Z[:pivots, :pivots] -= G.T @ Z[pivots:, :pivots]
             if front.parent >= 0:
                 waiting[front.parent] -= 1
                 if waiting[front.parent] == 0:

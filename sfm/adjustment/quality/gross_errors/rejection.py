@@ -251,8 +251,8 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         Q = cofactors(optimum, layout)
         complement = hat_complement(optimum, layout, Q, weight)
         if run.problem.observed:
-            vPv, own = sum_of_squares(layout.observations, v, complement, weight > 0)
-            redundancy = min(max(own, 1.0), redundancy)
+            vPv, of_image_points = sum_of_squares(layout.observations, v, complement, weight > 0)
+            redundancy = min(max(of_image_points, 1.0), redundancy)
         seen, used = layout.observations, weight > 0
         out = snoop(
             *(seen, optimum.state, v, complement, Q.limiting, used),

@@ -334,7 +334,7 @@ class _Rays:
     C: FloatArray  # cofactors of the point, (3, 3): -B C B' are those of two residuals
 
     def without(self, a: int) -> _Rays:
-        """Return what is left when one of them leaves; its own place means nothing afterwards."""
+        """Return what is left when one of them leaves; its place means nothing afterwards."""
         with_a = -self.B @ self.C @ self.B[a].T
         weight = np.linalg.pinv(self.Q[a], rcond=MIN_REDUNDANCY, hermitian=True)
         gain = with_a @ weight
