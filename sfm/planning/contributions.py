@@ -1,4 +1,4 @@
-"""What the rig and each kind of observation beside image points add to a planned network.
+"""Contributions of the rig and of each kind of observation beside image points to a planned network.
 
 Precision is that of the shape of the object: its standard deviations with inner constraints for position,
 attitude and scale, in which networks with different datum can be compared.

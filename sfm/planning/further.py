@@ -1,7 +1,7 @@
 """After a survey: which few photographs more would help its weakest points most.
 
-What faces where is taken from the rays that there are: a point faces the mean of its rays. What hides it from
-elsewhere is not known.
+Directions are taken from the existing rays: a point faces the mean of its rays. Obstacles in other directions
+are not known.
 
 Source: Fedorov (1972), Theory of Optimal Experiments (augmentation of a design).
 """

@@ -215,8 +215,8 @@ def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations
     """Return what photographs show, each by its camera."""
     rows = rows_of(stations.camera, len(cameras))
     parts = [
-        sight_of(planned, camera, stations.position[own], stations.rotation[own], seeing)
-        for camera, own in zip(cameras, rows, strict=True)
+        sight_of(planned, camera, stations.position[of_camera], stations.rotation[of_camera], seeing)
+        for camera, of_camera in zip(cameras, rows, strict=True)
     ]
     order = np.argsort(np.concatenate(rows))
     joined = (np.concatenate([getattr(part, field.name) for part in parts])[order] for field in fields(Sight))
@@ -257,14 +257,14 @@ def largest_length_sigma(xyz: FloatArray, covariance: FloatArray) -> float:
     """
     n = len(xyz)
     Q = covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
-    own = Q[np.arange(n), np.arange(n)]
+    blocks = Q[np.arange(n), np.arange(n)]
     largest = 0.0
     for i in range(n - 1):
         u = xyz[i + 1 :] - xyz[i]
         length = np.linalg.norm(u, axis=1)
         u = u[length > 0] / length[length > 0, None]
         cross = Q[i, i + 1 :][length > 0]
-        of_difference = own[i] + own[i + 1 :][length > 0] - cross - cross.transpose(0, 2, 1)
+        of_difference = blocks[i] + blocks[i + 1 :][length > 0] - cross - cross.transpose(0, 2, 1)
         variance = np.einsum("ja,jab,jb->j", u, of_difference, u)
         largest = max(largest, float(variance.max(initial=0.0)))
     return float(np.sqrt(largest))

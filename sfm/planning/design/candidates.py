@@ -84,8 +84,8 @@ def candidates(
         if faced.sum() < FEWEST:
             continue
         near = planned.size / nearest > sees_all  # the object does not fit in a photograph from here
-        own = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
-        ways = np.array([looking(aim - place) for aim in own])
+        aimed_at = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
+        ways = np.array([looking(aim - place) for aim in aimed_at])
         shown = sight_of(planned, camera, np.tile(place, (len(ways), 1)), ways, seeing).seen.sum(axis=1)
         best = int(np.argmax(shown))
         if shown[best] < FEWEST:

@@ -1,6 +1,6 @@
 """Precision of a target in a photograph from its size, contrast, blur and noise.
 
-An edge blurred by a Gaussian of standard deviation s holds, per length, the information
+An edge blurred by a Gaussian of standard deviation s contains, per length, the information
 A^2 / (2 s sqrt(pi)) / noise^2 on a shift across it. Summed round an ellipse that is the Cramer-Rao bound of
 its centre, which the measurement of targets reaches within some 5 % where the background is even.
 

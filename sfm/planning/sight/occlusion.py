@@ -45,14 +45,14 @@ def box_tree(mesh: Mesh) -> BoxTree:
     boxes.append((np.zeros(3), np.zeros(3), 0, 0))
     while todo:
         start, end, place = todo.pop()
-        own = order[start:end]
-        a, b = low[own].min(axis=0), high[own].max(axis=0)
+        inside_box = order[start:end]
+        a, b = low[inside_box].min(axis=0), high[inside_box].max(axis=0)
         if end - start <= LEAF:
             boxes[place] = (a, b, start, end - start)
             continue
-        axis = int(np.argmax(np.ptp(centre[own], axis=0)))
+        axis = int(np.argmax(np.ptp(centre[inside_box], axis=0)))
         middle = (end - start) // 2
-        order[start:end] = own[np.argpartition(centre[own, axis], middle)]
+        order[start:end] = inside_box[np.argpartition(centre[inside_box, axis], middle)]
         inside = len(boxes)
         boxes[place] = (a, b, inside, 0)
         boxes += [(a, b, 0, 0), (a, b, 0, 0)]

@@ -1,4 +1,4 @@
-"""Which point is seen from which station, and how well: the model of a photograph that nobody has taken yet.
+"""Which point is seen from which station, and how well: the model of a photograph not yet taken.
 
 Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
 Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution).
