@@ -36,7 +36,7 @@ def assemble_result(
     """Return everything that a survey ends with; each argument is what the stage of that name returned."""
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
-    is_in = set(adjustment.network.images)  # a photograph may fit at last, with a camera of its own
+    is_in = set(adjustment.network.images)  # a photograph may fit at last, with a per-photograph camera
     failed = tuple(
         FailedImage(*one)
         for one in (*start.failures, *matched.left_out, *solution.dropped_images)

@@ -61,7 +61,7 @@ class _Rig:
 
     @property
     def rank(self) -> tuple[int, float]:
-        """What is less for one that more pairs agree with, and more closely."""
+        """Sort key, less for a turn that more pairs agree with, and more closely."""
         return -int(self.agrees.sum()), self.squares(self.agrees)
 
 
@@ -116,8 +116,8 @@ def agree_on_turns(
         return measured, start
     names = [photographs.names[i] for i in sorted(uncertain)]
     involved = sorted({measured.cameras[measured.network.camera[i]].name for i in uncertain})
-    told = remark("plate_looks_alike_turned", cameras=involved, photographs=names)
-    return measured, replace(start, remarks=(*start.remarks, told))
+    alike = remark("plate_looks_alike_turned", cameras=involved, photographs=names)
+    return measured, replace(start, remarks=(*start.remarks, alike))
 
 
 def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair]]:
@@ -217,9 +217,9 @@ class _Views:
             placed = project(self.cameras[right], X0[left] + R[left] @ base, R[left] @ rotation, self.points)
             placed[~np.isfinite(placed)] = np.inf  # behind the camera
             away = np.linalg.norm(self.xy[right][:, None] - placed, axis=2)
-            own = [(np.arange(len(away)), number[self.number[right]]) for number in self.turns]
-            misfit = [float(np.sqrt((away[one] ** 2).mean())) for one in own]
+            places = [(np.arange(len(away)), number[self.number[right]]) for number in self.turns]
+            misfit = [float(np.sqrt((away[one] ** 2).mean())) for one in places]
             turn = int(np.argmin(misfit))
             found.turn[k], found.misfit[k] = turn, misfit[turn]
-            found.agrees[k] = bool((away.argmin(axis=1) == own[turn][1]).all())
+            found.agrees[k] = bool((away.argmin(axis=1) == places[turn][1]).all())
         return found

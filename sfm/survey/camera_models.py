@@ -100,7 +100,7 @@ def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
 def _fit(measured: Measurements, found: Orientation) -> tuple[float, int]:
     """Return ln of the likelihood of all image points, and how many of them fit.
 
-    What does not fit is spread evenly over the format.
+    Points that do not fit are spread evenly over the format.
     """
     length = residual_lengths(measured.network, found.estimate)
     fits = length <= FINAL_TOLERANCE_PX

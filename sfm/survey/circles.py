@@ -80,7 +80,7 @@ def check_circles(
         if np.isfinite(scale):
             other = _other_sizes(survey, names_of_circles, known, scale * circles.radius)
             remarks += other
-        if other or not np.isfinite(scale):  # a bar may be wrong: the targets give the scale of their own
+        if other or not np.isfinite(scale):  # a bar may be wrong: the targets alone give the scale
             scale = float(np.nanmedian(known / circles.radius))
         circles = fit_circles(views, len(numbers), radius=known / scale)
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
@@ -219,7 +219,7 @@ def _views(
     rays = np.einsum("kji,kj->ki", rotation, outward)
     jacobian, curvature = np.empty((len(seen), 2, 2)), np.empty((len(seen), 2, 2, 2))
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
-    for camera, own in zip(estimate.cameras, of_camera, strict=True):
-        jacobian[own] = pixel_jacobian(camera, seen.xy[own])
-        curvature[own] = np.nan_to_num(pixel_curvature(camera, -rays[own, :2] / rays[own, 2:]))
+    for camera, of_one in zip(estimate.cameras, of_camera, strict=True):
+        jacobian[of_one] = pixel_jacobian(camera, seen.xy[of_one])
+        curvature[of_one] = np.nan_to_num(pixel_curvature(camera, -rays[of_one, :2] / rays[of_one, 2:]))
     return CircleViews(point, shape, rays, rotation, jacobian, curvature)

@@ -135,7 +135,7 @@ def _without_other_objects(
     """Match, leave out the photographs whose codes contradict the others, and match the others again.
 
     Returns:
-        What was matched; photographs that are left out, with the reason; remarks on codes that are at
+        The matches; photographs that are left out, with the reason; remarks on codes that are at
         several places still.
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
@@ -244,9 +244,11 @@ def _with_own_cameras(
     estimate = matched.estimate
     accepted = residual_lengths(matched.network, estimate) <= tolerance_px
     per_photograph = find_photograph_cameras(matched.network, estimate, accepted, oriented=estimate.oriented)
-    if per_photograph is None or not per_photograph.own:
+    if per_photograph is None or not per_photograph.photographs:
         return matched
-    own = replace(photographs, camera=per_photograph.network.camera)
-    naming, found = match_uncoded(own, matched.naming, per_photograph.estimate, tolerance_px=tolerance_px)
+    separate = replace(photographs, camera=per_photograph.network.camera)
+    naming, found = match_uncoded(
+        separate, matched.naming, per_photograph.estimate, tolerance_px=tolerance_px
+    )
     network = build_network(survey, photographs, naming)
-    return _Matched(naming, network, replace(found, cameras=estimate.cameras), per_photograph.own)
+    return _Matched(naming, network, replace(found, cameras=estimate.cameras), per_photograph.photographs)

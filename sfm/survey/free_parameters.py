@@ -89,8 +89,8 @@ def choose_free_parameters(
                 _with_observed_c(one, camera) if a in seen else one
                 for a, (one, camera) in enumerate(zip(settings, start.cameras, strict=True))
             )
-            own = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
-            part, start = split_cameras(own, without_given(part), start)  # others are as they were
+            of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
+            part, start = split_cameras(of_part, without_given(part), start)  # others are as they were
             alone = _determined(part, start, names, "free", extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
             with_control = _determined(part, start, names, datum, extend=extend)

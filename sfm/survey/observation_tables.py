@@ -135,10 +135,10 @@ def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network
         indices = [np.array([number[column[row]] for row in rows], dtype=np.int64) for column in named]
         if issubclass(one.of, Group):
             for group, label in labels.items():
-                own = np.array([one.table.texts[0][row] == group for row in rows], dtype=bool)
-                if own.any():
-                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[own]
-                    value, sigma = one.value[rows][own], one.sigma[rows][own]
+                of_group = np.array([one.table.texts[0][row] == group for row in rows], dtype=bool)
+                if of_group.any():
+                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[of_group]
+                    value, sigma = one.value[rows][of_group], one.sigma[rows][of_group]
                     made = one.of.of_group(group, points, value, sigma, number)
                     if isinstance(made, RigidFrames):
                         of_group = np.array([name == group for name in one.table.texts[0]], dtype=bool)
@@ -325,7 +325,9 @@ def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:
     w = np.where(np.isnan(w), -np.inf, w)
     at = w.argmax(axis=1)
     return [
-        (float(own[k]), row, int(k)) for row, (own, k) in enumerate(zip(w, at, strict=True)) if own[k] >= 0
+        (float(of_row[k]), row, int(k))
+        for row, (of_row, k) in enumerate(zip(w, at, strict=True))
+        if of_row[k] >= 0
     ]
 
 

@@ -178,7 +178,7 @@ def _hold_cameras_of_two(
 
     The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
     Zisserman 2003, sec. 11.1): hardly c, and neither principal point nor distortion, which bend the object
-    instead. A control field in the datum determines them, and observed parameters have their own precision.
+    instead. A control field in the datum determines them, and observed parameters have the stated precision.
     So is it where the survey does not say what is free, as one that was drafted.
     """
     estimate = found.estimate
@@ -238,8 +238,8 @@ def _strongest(network: Network) -> BoolArray:
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     for rows in rows_of(seen.image, len(network.images)):
-        own = seen.point[rows]
-        chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
+        points = seen.point[rows]
+        chosen[points[np.argsort(rank[points], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
     return chosen
 
 

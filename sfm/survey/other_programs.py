@@ -53,7 +53,7 @@ def compare_solution(
     Args:
         solution: of the survey.
         others: what to compare with.
-        clock: of the survey; the stages it has timed so far are the survey's own time.
+        clock: of the survey; the stages it has timed so far are the time of the survey.
         files: the photographs, for another pipeline.
     """
     own_seconds = sum(seconds for _, seconds in clock.seconds)

@@ -34,12 +34,12 @@ def with_moments(survey: Survey, network: Network) -> Network:
     """Return the network with the moments of photographs of rigs; as it is without rigs.
 
     Args:
-        survey: says which cameras make a rig and what tells the moment of a photograph.
+        survey: states which cameras make a rig and what gives the moment of a photograph.
         network: with one camera for each of the survey's, in their order.
 
     Raises:
-        SurveyFileError: no moment is told of a photograph of a rig, two photographs of one camera are of one
-            moment, or no moment has photographs of two cameras.
+        SurveyFileError: no moment is given for a photograph of a rig, two photographs of one camera are of
+            one moment, or no moment has photographs of two cameras.
     """
     if not survey.rigs:
         return network
@@ -106,14 +106,14 @@ def _moments(
     where: str,
 ) -> dict[int, object]:
     """Return the moment of each photograph of a rig, by its index."""
-    own = [i for i in range(len(images)) if camera[i] in of_rig]
+    of_photographs = [i for i in range(len(images)) if camera[i] in of_rig]
     if rig.named:
-        for i in own:
+        for i in of_photographs:
             if images[i] not in named:
                 raise SurveyFileError(
                     f"{where}: {rig.table or 'EXIF data'} has no moment of photograph '{images[i]}'"
                 )
-        return {i: named[images[i]] for i in own}
+        return {i: named[images[i]] for i in of_photographs}
     if rig.moment == "order":
         counts = {a: int((camera == a).sum()) for a in of_rig}
         if len(set(counts.values())) > 1:
@@ -124,7 +124,7 @@ def _moments(
         inside = [np.flatnonzero(camera == a).tolist() for a in of_rig]
         return {i: k for some in inside for k, i in enumerate(sorted(some, key=lambda i: images[i]))}
     pattern, found = re.compile(rig.moment), {}
-    for i in own:
+    for i in of_photographs:
         match = pattern.search(images[i])
         if match is None or match.group(1) is None:
             raise SurveyFileError(f"{where}: moment = '{rig.moment}' does not match photograph '{images[i]}'")

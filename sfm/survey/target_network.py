@@ -186,8 +186,8 @@ def match_uncoded(
         ],
     )
     for i, rows in enumerate(free):
-        own = matches.image == i
-        point[i][rows[matches.target[own]]] = len(coded) + matches.point[own]
+        of_image = matches.image == i
+        point[i][rows[matches.target[of_image]]] = len(coded) + matches.point[of_image]
     uncoded = len(matches.points)
     return (
         replace(
@@ -210,7 +210,7 @@ def _nearest(
 ) -> IntArray:
     """Return the coded point that each target coincides with, or UNNAMED; one target a point.
 
-    A target whose own code says another number is never renamed: one of the two is wrong. One with the code
+    A target whose code reads another number is never renamed: one of the two is wrong. One with the code
     of the point keeps its name also beyond the tolerance, for the adjustment to judge, unless it is so far
     away that it is another target.
     """
@@ -220,8 +220,8 @@ def _nearest(
     for j in np.flatnonzero(np.isfinite(projected).all(axis=1)):
         distance = np.hypot(*(xy - projected[j]).T)
         distance[(code >= 0) & (code != point_code[j])] = np.inf
-        own = np.flatnonzero((code == point_code[j]) & (distance <= far_px))
-        k = int(own[np.argmin(distance[own])]) if len(own) else int(np.argmin(distance))
-        if (len(own) or distance[k] <= tolerance_px) and named[k] == UNNAMED:
+        of_code = np.flatnonzero((code == point_code[j]) & (distance <= far_px))
+        k = int(of_code[np.argmin(distance[of_code])]) if len(of_code) else int(np.argmin(distance))
+        if (len(of_code) or distance[k] <= tolerance_px) and named[k] == UNNAMED:
             named[k] = j
     return named

@@ -109,7 +109,7 @@ def test_what_must_be_converted_is_told_with_how(name: str, told: str, tmp_path:
     (tmp_path / "a.tif").rename(tmp_path / name)
     with pytest.raises(PhotographError, match=told):
         read_photograph(tmp_path / name)
-    with pytest.raises(SurveyFileError, match=f"no photographs .* it holds {name}: {told}"):
+    with pytest.raises(SurveyFileError, match=f"no photographs .* it contains {name}: {told}"):
         draft_survey(tmp_path)
 
 

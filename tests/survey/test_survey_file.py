@@ -276,7 +276,7 @@ def test_photographs_are_found_by_glob(tmp_path: Path) -> None:
     assert found.names == ("b c.jpg", "ä.jpg", "sub/b c.jpg")
     assert list(found.camera) == [0, 0, 1]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SurveyFileError, match=r"no photographs found.*which holds no files"):
+    with pytest.raises(SurveyFileError, match=r"no photographs found.*which has no files"):
         find_photographs(survey, images_dir=tmp_path / "empty")
     with pytest.raises(SurveyFileError, match="no such folder"):
         find_photographs(survey, images_dir=tmp_path / "nowhere")

@@ -507,6 +507,8 @@ def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
 def _own_c(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:
     """Yield the name of each camera of which every photograph has c by itself, these c, and their unit."""
     for name in sorted(varying):
-        own = [one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name]
-        if own:
-            yield name, [float(one.parameters[0]) for one in own], own[0].units[0]
+        cameras = [
+            one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name
+        ]
+        if cameras:
+            yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]

@@ -212,8 +212,8 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     remarks, names = [], [one.name for one in survey.cameras]
     for one in survey.cameras:
         name = MODELS[one.model].names[0]
-        own = [camera for camera in estimate.cameras if base_name(camera.name, names) == one.name]
-        held = next((camera for camera in own if not camera.free[0]), None)
+        cameras = [camera for camera in estimate.cameras if base_name(camera.name, names) == one.name]
+        held = next((camera for camera in cameras if not camera.free[0]), None)
         if name in one.may_be_free and held is not None:
             value = held.c_px * float(np.mean(held.pixel_mm))
             remarks.append(remark("calibration_failed", camera=one.name, held=(value, "mm")))

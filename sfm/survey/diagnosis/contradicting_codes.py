@@ -48,8 +48,8 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
     whole, shown = _places(photographs, naming)
     contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
     groups = _groups(contested)
-    own = groups[0] if groups else frozenset()
-    accepted = _accepted(contested, own)
+    largest = groups[0] if groups else frozenset()
+    accepted = _accepted(contested, largest)
     elsewhere: dict[int, set[int]] = {}
     for code, places in contested.items():
         for image, at in places.items():
@@ -65,7 +65,7 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
         group = next(one for one in groups if image in one)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
         left_out[image] = _foreign(codes, others)
-    main = {code: place for code, places in contested.items() if (place := _most(places, own)) != UNNAMED}
+    main = {code: place for code, places in contested.items() if (place := _most(places, largest)) != UNNAMED}
     away = {image: frozenset(codes) for image, codes in elsewhere.items()}
     return ContestedCodes(contested, left_out, main, away)
 
@@ -85,11 +85,12 @@ def plates_elsewhere(
     moved: dict[PlateFamily, frozenset[int]] = {}
     plates = plates_of(family)
     for plate in plates if len(plates) > 1 else ():
-        own = range(plate.first_point, plate.last_point + 1)
+        of_plate = range(plate.first_point, plate.last_point + 1)
         images = frozenset(
             image
             for image, codes in found.elsewhere.items()
-            if 2 * len(codes.intersection(own)) > np.isin(photographs.targets[image].code, own).sum()
+            if 2 * len(codes.intersection(of_plate))
+            > np.isin(photographs.targets[image].code, of_plate).sum()
         )
         if images:
             moved[plate] = images

@@ -34,7 +34,7 @@ class Lost:
 def explain_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
     """Return the orientation with what is missing between the groups of photographs that are not connected.
 
-    A photograph with fewer points than any orientation needs is no group: its own reason says so.
+    A photograph with fewer points than any orientation needs is no group: its reason states it.
 
     Args:
         network: image points that have names.
@@ -108,7 +108,7 @@ def try_other_principal_distances(
     if not len(network.image_points):
         return found, ()
     free = all(camera.free[0] for camera in estimate.cameras)
-    if lost < 2:  # one alone has a cause of its own
+    if lost < 2:  # one alone has another cause
         misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
         held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
         best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))

@@ -1,10 +1,10 @@
-"""Photographs that lose many of their points: whether an interior orientation of their own explains them.
+"""Photographs that lose many of their points: whether a per-photograph interior orientation explains them.
 
 A zoom that slipped, a lens that was focused anew or a picture that was resampled shows the points of the
 others at another scale. Its exterior orientation takes up a part of that, and the rejection of image points
 the rest, so that a photograph with a few accepted points would stand among the oriented ones.
 
-Tried are the photographs of which more points are rejected than chance makes. Each is adjusted alone on
+The photographs are tried that lose more points to the test than chance makes. Each is adjusted alone on
 the points of the others, with the camera that it shares and with parameters of its own. The likelihood
 must pay for these and for the search, as in `sfm.adjustment.hypotheses`, and exceed that of the
 alternatives there: a wrong parameter that all photographs share makes some of them look zoomed. A
@@ -43,7 +43,7 @@ from sfm.remarks.remark import Remark, remark
 LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
 TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of what fits with c to 2.5 %
-PAIR = 2  # photographs of a camera, of which nothing says which one changed
+PAIR = 2  # photographs of a camera, of which it is not known which one changed
 OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
 
 
@@ -55,7 +55,7 @@ class PhotographCameras:
     estimate: Estimate
     left_out: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
     remarks: tuple[Remark, ...]  # on those with per-photograph cameras
-    own: tuple[str, ...]  # names of these
+    photographs: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
 
 
@@ -67,14 +67,14 @@ def find_photograph_cameras(
     oriented: BoolArray,
     suspected: tuple[str, ...] = (),
 ) -> PhotographCameras | None:
-    """Give photographs that lost most of their points a camera of their own, or leave them out.
+    """Give photographs that lost most of their points a per-photograph camera, or leave them out.
 
     Args:
         network: all image points, a camera each for what shares one.
         estimate: adjusted; NaN for photographs and points that left it.
         accepted: image points that the adjustment accepted, (k,).
         oriented: photographs that had an exterior orientation before the adjustment, (m,).
-        suspected: names of photographs that fitted with a camera of their own before; all their points
+        suspected: names of photographs that fitted with per-photograph cameras before; all their points
             together may bend the others so much that none of them looks wrong.
 
     Returns:
@@ -177,30 +177,30 @@ def _explained_otherwise(
             (own_network, own_estimate, start & ~theirs[seen.image[rows]]),
         )
     ]
-    plain, own = found
+    plain, separate = found
     other = None if plain is None else best_explanation(plain)
     if plain is None or other is None or other.alternative.kind in ("other_camera", "two_cameras"):
         return False  # which photographs they are is seen best by what was rejected
-    if own is None:
+    if separate is None:
         return True
-    camera_of_row = own.network.camera[own.network.image_points.image]
+    camera_of_row = separate.network.camera[separate.network.image_points.image]
     search = float(np.log(len(OWN) * len(network.images)))
     freed, price = 0, 0.0
     for index in np.unique(camera_of_row[camera_of_row >= len(estimate.cameras)]).tolist():
         q = sum(not group for group in own_estimate.cameras[index].shared)
         freed += q
         price += price_of(q, int((camera_of_row == index).sum()), search)
-    gained = log_likelihood(own, freed) - log_likelihood(plain) - price
+    gained = log_likelihood(separate, freed) - log_likelihood(plain) - price
     return other.evidence > gained
 
 
 def _own_camera(
     network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float
 ) -> tuple[Camera, Adjustment] | None:
-    """Return the camera of its own with which a photograph fits the points of the others, if one does."""
+    """Return the per-photograph camera with which a photograph fits the points of the others, if one does."""
     camera = estimate.cameras[network.camera[image]]
     if any(not group for group in camera.shared):
-        return None  # has parameters of its own already
+        return None  # has per-photograph parameters already
     seen = network.image_points
     xy, points, n = seen.xy[rows], estimate.points[seen.point[rows]], len(rows)
     start = _scaled_resection(camera, xy, points, SCALES)
@@ -218,28 +218,30 @@ def _own_camera(
     search = np.log(len(SCALES)) + np.log(len(OWN) * len(network.images) / ALPHA)
     best, most = None, 0.0
     for roles in OWN:
-        own = camera.plays(*roles)
-        own[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
-        found = _alone(alone, start, points, own)
+        freed = camera.plays(*roles)
+        freed[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
+        found = _alone(alone, start, points, freed)
         if found is None or found.rejected.sum() > LARGER_PART * n:
             continue
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             continue  # no picture of these points, as where their names are wrong
         sigma = max(sigma_px, found.sigma0_px)
         gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
-        q = int(own.sum())
+        q = int(freed.sum())
         evidence = gain - q / 2 * np.log(2 * n) - search
         if evidence > most:
-            best, most = (found, own), evidence
+            best, most = (found, freed), evidence
     if best is None:
         return None
-    found, own = best
+    found, freed = best
     variant = replace(
         camera,
         name=f"{camera.name} {network.images[image]}",
-        parameters=np.where(own, found.estimate.cameras[0].parameters, camera.parameters),
-        free=camera.free | own,
-        shared=tuple("" if mine else group for mine, group in zip(own, _sharing(camera).shared, strict=True)),
+        parameters=np.where(freed, found.estimate.cameras[0].parameters, camera.parameters),
+        free=camera.free | freed,
+        shared=tuple(
+            "" if mine else group for mine, group in zip(freed, _sharing(camera).shared, strict=True)
+        ),
     )
     return variant, found
 

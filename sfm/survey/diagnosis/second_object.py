@@ -1,4 +1,4 @@
-"""What fits itself and not the rest of a survey: a second object of the same codes, a mirror image, a motion.
+"""Parts of a survey that do not fit the rest: a second object of the same codes, a mirror image, a motion.
 
 Photographs without orientation are oriented by themselves, both parts are adjusted, and the points that they
 have in common are compared as those of any two results (`sfm.comparison`): what a camera explains, that bends

@@ -12,9 +12,10 @@ from glob import escape
 from sfm.photographs.exif import Metadata
 from sfm.remarks.remark import Remark, remark
 
-FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing tells it
-FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing tells it
-# What makers call such lenses: "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D", "7.5mm Fish-eye"
+FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing states it
+FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing states it
+# Names that makers give such lenses: "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D", "7.5mm
+# Fish-eye"
 FISHEYE_NAME = re.compile("fish-?eye", re.IGNORECASE)
 MIN_IN_GROUP = 2  # photographs that a camera is kept with if another has more
 
@@ -57,7 +58,7 @@ def group_photographs(
 
     Args:
         metadata: of every readable photograph, by its file name.
-        sensor_width: a list of cameras, asked where EXIF data do not tell the pixel size.
+        sensor_width: a list of cameras, asked where EXIF data do not give the pixel size.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     by_name = not any(one.make for one in metadata.values())

@@ -63,10 +63,10 @@ def draft_survey(
 
     Args:
         folder: the photographs, directly in it.
-        sensor_width: a list of cameras, asked where EXIF data do not tell the pixel size.
+        sensor_width: a list of cameras, asked where EXIF data do not give the pixel size.
         pitch: distance of neighbouring dots or crossings, should they be on a plate, mm; else assumed.
         store: keeps the targets measured on trial.
-        progress: told of what is tried.
+        progress: informed of what is tried.
 
     Raises:
         SurveyFileError: no folder, or one without photographs.
@@ -102,12 +102,14 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
         path for path in every if (path.suffix.lower() in SUFFIXES or conversion_of(path)) and path.is_file()
     ]
     if all(conversion_of(path) for path in files):
-        holds = (
-            f"it holds {', '.join(as_plain(path.name) for path in every[:SHOWN])}" if every else "it is empty"
+        content = (
+            f"it contains {', '.join(as_plain(path.name) for path in every[:SHOWN])}"
+            if every
+            else "it is empty"
         )
-        holds += f": {conversion_of(files[0])}" if files else ""
-        holds += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
-        raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {holds}")
+        content += f": {conversion_of(files[0])}" if files else ""
+        content += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
+        raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
     metadata, unreadable = {}, []
     for path in files:
         if not is_plain(path.name):
@@ -304,7 +306,7 @@ def _position_lines(positions: int) -> list[str]:
 
 
 def _found(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
-    """What was found, for the terminal."""
+    """Findings, for the terminal."""
     found = [
         (
             f"camera {camera.name}",

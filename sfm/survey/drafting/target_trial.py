@@ -62,7 +62,7 @@ MANY_TARGETS = 12  # circles in a photograph that are no chance finds
 
 @dataclass(frozen=True)
 class TargetTrial:
-    """What a few photographs show."""
+    """Targets that a few photographs show."""
 
     codes: str  # family of codes, "none" without
     polarity: str  # dark, bright or auto
@@ -92,7 +92,7 @@ def try_targets(
     Args:
         paths: photographs in their order; those that cannot be decoded are passed over.
         store: keeps what is measured, so that the survey need not measure it again.
-        progress: told of every photograph and family.
+        progress: informed of every photograph and family.
 
     Raises:
         GeometryError: fewer than two of them can be decoded.
@@ -255,7 +255,7 @@ def _spread(count: int, tried: int) -> list[int]:
 
 @dataclass(frozen=True)
 class _Look:
-    """What a photograph shows at first sight."""
+    """A photograph at first sight."""
 
     shows_targets: bool  # codes, plates, or many circles
     circles: int

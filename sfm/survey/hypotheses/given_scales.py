@@ -55,9 +55,9 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     lengths = [tuple(b for one, _ in some for b in one.bars) for some in found.values()]
     scales = [mean_scale([scale for _, scale in some]) for some in found.values()]
     for group in groups:
-        own = _scale_of(task, group)
-        if own is not None:
-            scales.append(own)
+        given_scale = _scale_of(task, group)
+        if given_scale is not None:
+            scales.append(given_scale)
             of.append(group.of)
             names.append(plate_name(0) if task.of_plate and group.of == "control" else group.of)
     if not scales:

@@ -44,7 +44,7 @@ class Calibration:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> Calibration:
-        """Return that of a camera, as far as a camera tells: without standard deviations."""
+        """Return that of a camera, as far as a camera has one: without standard deviations."""
         sides = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
         values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         return cls(camera.name, camera.model, camera.size_px, sides, values)
@@ -96,12 +96,12 @@ def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
             raise SurveyFileError(
                 f"{table.path}: camera {one.name} has no {', '.join(missing)}, model {one.model} needs it"
             )
-        own = {name: rows[one.name, name] for name in MODELS[one.model].names}
-        adjusted = {name: s for name, (_, s) in own.items() if np.isfinite(s) and s > 0}
+        of_camera = {name: rows[one.name, name] for name in MODELS[one.model].names}
+        adjusted = {name: s for name, (_, s) in of_camera.items() if np.isfinite(s) and s > 0}
         found.append(
             Calibration(
                 *(one.name, one.model, one.size_px, one.pixel_mm),
-                {name: value for name, (value, _) in own.items()},
+                {name: value for name, (value, _) in of_camera.items()},
                 adjusted,
                 tuple(
                     (p, q, value)

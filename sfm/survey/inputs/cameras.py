@@ -73,8 +73,8 @@ def start_cameras(
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
     for number, one in enumerate(settings):
-        own = [k for k in range(len(metadata)) if index[k] == number]
-        size = _common_size(one, [(names[k], metadata[k].size_px) for k in own])
+        photographs = [k for k in range(len(metadata)) if index[k] == number]
+        size = _common_size(one, [(names[k], metadata[k].size_px) for k in photographs])
         where = f"{source}: camera {one.name}"
         if size is None:
             raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
@@ -85,9 +85,11 @@ def start_cameras(
         known |= {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
         known |= dict(one.start) | free_start_values(one, one.name, given)
         if pixel is None:
-            pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
+            pixel = next((metadata[k].pixel_mm for k in photographs if metadata[k].pixel_mm), None)
         if focal is None:
-            focal = known.get("c") or next((metadata[k].focal_mm for k in own if metadata[k].focal_mm), None)
+            focal = known.get("c") or next(
+                (metadata[k].focal_mm for k in photographs if metadata[k].focal_mm), None
+            )
         if pixel is None:
             raise SurveyFileError(
                 f"{where}: EXIF data of the photographs do not state the pixel size; "

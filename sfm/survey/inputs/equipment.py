@@ -47,7 +47,7 @@ COORDINATES = ("X", "Y", "Z", "sX", "sY", "sZ")
 
 
 class Calibrated(Section):
-    """What is known of a bar or a frame beside its lengths."""
+    """Data of a bar or a frame beside its lengths."""
 
     name: Name  # by which surveys refer to it
     calibrated: date  # day of its calibration, as on its certificate
@@ -84,7 +84,7 @@ class Bar(Calibrated):
 class Frame(Calibrated):
     """[[frame]]: targets that are rigid to one another, as of a bar of several, a scale cross or a probe."""
 
-    file: Name  # point,X,Y,Z,sX,sY,sZ in a system of its own, beside the equipment file
+    file: Name  # point,X,Y,Z,sX,sY,sZ in a separate system, beside the equipment file
 
 
 class EquipmentFile(Section):
@@ -128,8 +128,8 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
             raise SurveyFileError(f"{path}: '{name}' comes twice, needed different names of bars and frames")
     tables = {}
     for frame in content.frames:
-        own = inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
-        found = read_table(own, ("point",), COORDINATES)
+        file = inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
+        found = read_table(file, ("point",), COORDINATES)
         found.keys("point")
         tables[frame.name] = found
     return Equipment(path, content, tables)
@@ -187,9 +187,9 @@ def given_by(
     return tuple(bars), tuple(frames)
 
 
-def _points(one: EquipmentSettings, own: Names, count: int, where: str) -> Names:
+def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Names:
     """Return what a survey calls the points of its equipment."""
-    points = one.points or own
+    points = one.points or names
     if len(points) != count or len(set(points)) < count:
         raise SurveyFileError(
             f"{where}: equipment '{one.name}': points = {listed(list(points)) or 'none'}, needed {count} "

@@ -108,11 +108,11 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
     for place, names, sigmas in ((0, AXES, sigmas_of_axes), (3, angles, sigmas_of_angles)):
         for k, name in enumerate(names):
             given = table.values[:, columns.index(name)]
-            own = (
+            deviation = (
                 table.values[:, columns.index(sigmas[k])] if sigmas else np.where(np.isnan(given), given, 0.0)
             )
-            _refuse_halves(table, given, own, name, sigmas[k] if sigmas else "")
-            value[:, place + k], sigma[:, place + k] = given, own
+            _refuse_halves(table, given, deviation, name, sigmas[k] if sigmas else "")
+            value[:, place + k], sigma[:, place + k] = given, deviation
     return _observed_exterior(table, value, sigma)
 
 

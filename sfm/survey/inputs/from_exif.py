@@ -1,4 +1,4 @@
-"""What a survey takes from the EXIF data of its photographs: projection centres, and moments of rigs."""
+"""Data that a survey takes from the EXIF data of its photographs: projection centres, and moments of rigs."""
 
 from __future__ import annotations
 

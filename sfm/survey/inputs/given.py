@@ -54,8 +54,8 @@ class KnownPoints:
         """
         good: BoolArray = np.asarray((self.sigma >= 0).all(axis=1))
         good[good] = possible_covariances(self.covariance[good])
-        for name, own in zip(self.names, good.tolist(), strict=True):
-            if not own:
+        for name, possible in zip(self.names, good.tolist(), strict=True):
+            if not possible:
                 raise SurveyFileError(
                     f"control point {name}: expected sigmas of 0 (fixed) or more and covariances that make a "
                     "positive definite matrix with them"
@@ -89,7 +89,7 @@ class KnownPoints:
 
 @dataclass(frozen=True)
 class StartOrientations:
-    """Approximate exterior orientations, as images.csv of a result holds them."""
+    """Approximate exterior orientations, as in images.csv of a result."""
 
     names: tuple[str, ...]  # photographs, (m,)
     position: FloatArray  # projection centres X0, object unit, (m, 3)
@@ -113,9 +113,9 @@ class StartOrientations:
 
 @dataclass(frozen=True)
 class StartCameras:
-    """Approximate values of interior orientation, as cameras.csv of a result holds them."""
+    """Approximate values of interior orientation, as in cameras.csv of a result."""
 
-    camera: tuple[str, ...]  # camera of each row, or photograph or group of one with its own values, (k,)
+    camera: tuple[str, ...]  # camera of each row, or photograph or group of one with other values, (k,)
     parameter: tuple[str, ...]  # (k,)
     value: FloatArray  # in the parameter's unit, (k,)
     table: CsvTable  # where they stand, for messages
@@ -388,8 +388,8 @@ def _observations(table: CsvTable, unit: str) -> Observations:
     )
     image, point = table.texts
     stated = sigma if np.isfinite(sigma).any() else None
-    own = covariance[:, 0] if covariance.any() else None
-    return Observations(image, point, xy, stated, unit, table, own)
+    between = covariance[:, 0] if covariance.any() else None
+    return Observations(image, point, xy, stated, unit, table, between)
 
 
 def columns_of(

@@ -43,7 +43,7 @@ def split_cameras(
         given: start values of single photographs or groups.
 
     Returns:
-        The same with a camera for each photograph or group where parameters of it are its own; the others
+        The same with a camera for each photograph or group where parameters vary between these; the others
         it shares. Observed parameters are free, and their values are among the observations.
 
     Raises:
@@ -178,7 +178,7 @@ def group_of_image(settings: CameraSettings, image: str, source: str = "survey")
 
 
 def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tuple[list[Camera], IntArray]:
-    """Return a camera for each photograph or group with parameters of its own, and whose is whose."""
+    """Return a camera for each photograph or group whose parameters vary, and whose is whose."""
     observed = [name for name, _ in settings.weighted]
     camera = replace(camera, free=camera.free | np.array([name in observed for name in camera.names]))
     grouped = [group_of_image(settings, image) if settings.groups else 0 for image in images]

@@ -53,7 +53,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
 
     Args:
         survey: a survey with photographs, or its file.
-        images_dir: folder of the photographs in place of the survey's own; photographs in a folder that the
+        images_dir: folder of the photographs in place of that of the survey; photographs in a folder that the
             user names may be links to files in the user's home folder.
 
     Raises:
@@ -81,7 +81,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
             ) from error
         if not found:
             raise SurveyFileError(
-                f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_holds(folder)}"
+                f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_describe_files(folder)}"
             )
         return found
 
@@ -120,12 +120,12 @@ def refuse_many(where: str, images: Sequence[str]) -> None:
         )
 
 
-def _holds(folder: Path) -> str:
-    """Say in a few words which files a folder holds."""
+def _describe_files(folder: Path) -> str:
+    """Return in a few words which files a folder contains."""
     files = sorted(path.name for path in folder.iterdir() if path.is_file())
     if not files:
-        return "which holds no files (--images names another folder)"
-    return f"which holds {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"
+        return "which has no files (--images names another folder)"
+    return f"which has {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"
 
 
 def refuse_incomplete_cameras(

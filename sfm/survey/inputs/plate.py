@@ -149,12 +149,12 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
 
 
 def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:
-    """Raise SurveyFileError where each point has coordinates of its own, and its identity cannot be known."""
+    """Raise SurveyFileError where each point has separate coordinates, and its identity cannot be known."""
     plate = plate_family(targets)
     if plate is None or datum == "control" or not plate.is_ambiguous:
         return
     turned = 360 // (1 + len(plate.turns))
     raise SurveyFileError(
-        f"{where}: a plate that looks alike turned by {turned} degrees has no points of its own; needed "
+        f"{where}: a plate that looks alike turned by {turned} degrees has no identified points; needed "
         "[datum] kind = 'control', which takes the plate as flat and true, or a plate with marks"
     )

@@ -119,8 +119,8 @@ class CameraSettings(Section):
     correlations: Correlations = ()  # of weighted parameters; 0 if not given
     calibration: Name | None = None  # folder of an earlier result, relative to the survey file
     calibration_use: Literal["fixed", "weighted"] = "fixed"  # held, or an observation with its covariance
-    per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
-    per_group: Names = ()  # adjusted parameters of which every group of photographs has a value of its own
+    per_photograph: Names = ()  # adjusted parameters with a value for each photograph
+    per_group: Names = ()  # adjusted parameters with a value for each group of photographs
     groups: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()  # globs of these groups of photographs
 
     @property
@@ -178,7 +178,7 @@ class TargetSettings(PlateSettings):
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
     diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
     tag_sigma: Length | None = None  # standard deviation of tag_size, common to all tags, object unit
-    pitch_assumed: bool = False  # whether nobody measured the pitch
+    pitch_assumed: bool = False  # whether the pitch was not measured
 
 
 class TiePointSettings(Section):

@@ -73,13 +73,13 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     every = images
     copies = same_photographs(image, point, xy, owner)
-    own = np.isin(np.arange(len(images)), list(copies), invert=True)
-    rows = own[image] & ~outside
-    number = np.cumsum(own) - 1
+    distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
+    rows = distinct[image] & ~outside
+    number = np.cumsum(distinct) - 1
     failed = tuple(
         FailedImage(every[i], remark("copy_of_image_points", original=every[j])) for i, j in copies.items()
     )
-    images, owner = tuple(name for name, keep in zip(images, own, strict=True) if keep), owner[own]
+    images, owner = tuple(name for name, keep in zip(images, distinct, strict=True) if keep), owner[distinct]
     image, point = number[image[rows]], point[rows]
     merged = merge_repeated(ImagePoints(image, point, xy[rows], covariance[rows], stated[rows]))
     network = network_of(survey, images, owner, points, merged.image_points)
@@ -89,14 +89,14 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         for i, j in merged.dropped
         for name in [f"{points[j]} in {images[i]}"]
     )
-    told = (remark("image_points_outside", image_points=gross),) if gross else ()
+    outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
         network,
         cameras,
         every,
         np.full(len(points), MIN_RAYS),
         failed,
-        remarks=(*merged.remarks(images, points), *told),
+        remarks=(*merged.remarks(images, points), *outside_remark),
         left_out=(
             *contradicting,
             *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
@@ -126,7 +126,7 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
     """Return start values from [approximate] and the control; NaN for what nothing is said about.
 
     Args:
-        survey: gives them, and says whether the control holds.
+        survey: gives them, and states whether the control is the datum.
         network: photographs and points that get their values by name.
         cameras: with their start values.
     """
@@ -179,11 +179,11 @@ def _in_pixels(
     xy_px = xy.copy()
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
     if given.unit == "mm":
-        for own, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
-            xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
+        for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+            xy_px[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
             if sigma is not None:
-                s[rows] = sigma[rows] / own.pixel_mm
-                between[rows] /= -own.pixel_mm.prod()  # y is up in the image frame, down in px
+                s[rows] = sigma[rows] / one.pixel_mm
+                between[rows] /= -one.pixel_mm.prod()  # y is up in the image frame, down in px
     s = np.where(np.isnan(s), sigma_px, s)
     covariance = np.zeros((len(xy), 2, 2))
     covariance[:, range(2), range(2)] = s**2
@@ -284,7 +284,8 @@ def merge_repeated(seen: ImagePoints) -> Merged:
     """Return image points of which each stands once in its photograph, where it stood first.
 
     Identical positions are one measurement that was written twice. Different ones are two measurements:
-    their weighted mean, if a chi-square test of their differences passes; else nobody knows which is right.
+    their weighted mean, if a chi-square test of their differences passes; else it is not known which is
+    right.
     """
     key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
     _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)

@@ -109,7 +109,7 @@ class SurveyFile(Section):
 
     @property
     def allow_outside(self) -> bool:
-        """Whether the survey may name files outside its own folder."""
+        """Whether the survey may name files outside its folder."""
         return self._allow_outside
 
     def beside(self, name: str) -> Path:

@@ -1,1 +1,1 @@
-"""What is measured in the photographs of a survey, targets or natural texture, and its store."""
+"""Measurements in the photographs of a survey, targets or natural texture, and their store."""

@@ -1,6 +1,6 @@
 """Points that cover the texture of photographs, once their orientation is known.
 
-A few hundred tie points orient the photographs and tell the shape of the surface. The rest needs no features:
+A few hundred tie points orient the photographs and give the shape of the surface. The rest needs no features:
 squares with texture, side by side, are put on the plane through the points around them in space, projected
 into all photographs that look at that plane, and measured there by least squares matching, in those with the
 most similar direction first, whose rays correct the place for the others. So a point is followed through all
@@ -104,7 +104,7 @@ def find_covering_points(
         photographs: (H, W), m of them; read when they are asked for, of files.
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
-        seen: image points of the tie points that fit, which tell the surface.
+        seen: image points of the tie points that fit, which give the surface.
         windows: their side and model.
         side_px: of the squares that the windows are in the middle of; no two of them share pixels.
         references: photographs that points are taken from; all, those with the most tie points first, if not
@@ -115,8 +115,8 @@ def find_covering_points(
     """
     m = len(photographs)
     margin = windows.side_px // 2 + BORDER_PX
-    own = rows_of(seen.image, m)
-    order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
+    tie_rows = rows_of(seen.image, m)
+    order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
     covered = Covered([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
@@ -124,7 +124,7 @@ def find_covering_points(
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points from a photograph that so many see, or more."""
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
-        points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
+        points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
         places = _Places(i, xy, normal, points).select(known)
         visible, free = _visible(estimate, camera, places, covered, margin, side_px)
@@ -140,7 +140,9 @@ def find_covering_points(
         found.append(new)
         covered.cover(new.image_points.image, new.image_points.xy, side_px * measured.scale[used])
 
-    in_order = [i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(own[i]) >= NEIGHBOURS]
+    in_order = [
+        i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(tie_rows[i]) >= NEIGHBOURS
+    ]
     for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
         cover(i, MIN_RAYS, more=True)
         give_back_memory()

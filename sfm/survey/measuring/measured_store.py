@@ -35,11 +35,11 @@ MAX_ENTRY_BYTES = 100_000_000  # 400,000 targets, 180,000 features; bounded befo
 
 @dataclass(frozen=True)
 class Kind(Generic[M]):
-    """What can be measured in a photograph alone, and kept: arrays by their names."""
+    """Measurements of a photograph alone that can be kept: arrays by their names."""
 
     type: type[M]
     measuring: tuple[str, ...]  # modules; what is measured depends on these and on all that they import
-    apart: str  # how the arrays begin that have a length of their own; the others have one length
+    apart: str  # how the arrays begin that have a separate length; the others have one length
 
 
 TARGETS = Kind(Targets, ("sfm.photographs.reading", "sfm.targets.detect"), "rejected")
@@ -79,7 +79,7 @@ class MeasuredStore:
         """Keep what was measured, whole or not at all; where there is no room it is simply not kept."""
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
-        if data.tell() > MAX_ENTRY_BYTES:  # nobody would read it
+        if data.tell() > MAX_ENTRY_BYTES:  # no one would read it
             return
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
@@ -87,7 +87,7 @@ class MeasuredStore:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:
-        """Remove what nobody has asked for in months, and what a killed run left half-written."""
+        """Remove entries not asked for in months, and what a killed run left half-written."""
         remove_unused(self.folder)
 
     def _path(self, key: str) -> Path:
@@ -100,7 +100,7 @@ def measured_once(
     """Return what is measured in a photograph, and whether an earlier run has measured it.
 
     Args:
-        store: is asked first, and keeps and holds what had to be measured; None to measure in any case.
+        store: is asked first, and keeps what had to be measured; None to measure in any case.
         path: the photograph.
         kind: what is measured.
         settings: everything but the photograph that it depends on, in any unambiguous text.
@@ -157,7 +157,7 @@ def content_hash(path: Path) -> str:
 
 @cache
 def _code_version(measuring: tuple[str, ...]) -> str:
-    """Return a fingerprint of the code that measures: its own sources and the libraries it computes with."""
+    """Return a fingerprint of the code that measures: its sources and the libraries it computes with."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for _, source in sorted(sources_of(*measuring).items()):
         digest.update(source.encode())

@@ -24,7 +24,7 @@ def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray
     """Return the photographs that stand nearest to each, nearest first, NONE where there are no more, (m, k).
 
     Positions in EXIF data are compared in their standard deviations. Where they differ by no more than their
-    errors they tell nothing, and no photograph has neighbours.
+    errors they decide nothing, and no photograph has neighbours.
 
     Args:
         metadata: of m photographs; some may state no position.
@@ -45,8 +45,8 @@ def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray
     nearest = min(count + 1, len(rows))
     order = np.atleast_2d(cKDTree(places).query(places, nearest)[1])
     for k, others in enumerate(order):
-        own = others[others != k][:count]
-        found[rows[k], : len(own)] = rows[own]
+        closest = others[others != k][:count]
+        found[rows[k], : len(closest)] = rows[closest]
     return found
 
 

@@ -1,4 +1,4 @@
-"""Photographs of another size under one camera: they get a camera of their own, or are left out and told."""
+"""Photographs of another size under one camera: they get a separate camera, or are left out and reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
-MIN_OWN = 3  # photographs of one size that a camera of their own is worth
+MIN_OWN = 3  # photographs of one size that a separate camera is worth
 SAME_ASPECT = 0.005  # relative difference of the ratio of the sides of a photograph that was resampled
 RESAMPLED, UPRIGHT, CROPPED = "resampled", "stored upright", "cropped or from another sensor"
 

@@ -39,13 +39,13 @@ def each_photograph(
     Args:
         photographs: the files.
         work: what is done with a file; PhotographError says why it cannot be read.
-        picture: what tells the picture from all others in what came of it, as a copy that was saved again
-            has other bytes; empty where it does not tell.
+        picture: what identifies the picture in its result, as a copy that was saved again
+            has other bytes; empty where nothing does.
         jobs: how many photographs are worked on at a time.
-        progress: told of every photograph.
+        progress: informed of every photograph.
 
     Returns:
-        What came of the photographs by their number, and those without, in their order.
+        The results of the photographs by their number, and those without, in their order.
 
     Raises:
         GeometryError: fewer than two readable photographs.
@@ -78,7 +78,7 @@ def each_photograph(
                         photographs.names[k], remark("photograph_unreadable", reason=reason)
                     )
                 progress.advance(photographs.names[k])
-        except BaseException:  # Ctrl-C among them: nobody waits for photographs that are not begun
+        except BaseException:  # Ctrl-C among them: no one waits for photographs that are not begun
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     pictures: dict[bytes, int] = {}

@@ -1,8 +1,8 @@
 """The points of a textured survey once its photographs are oriented: their windows cover the photographs.
 
-Windows that overlap measure the same pixels twice, and their errors have these in common: the precision of a
-result would be told too good. So the tie points, which lie anywhere, give way to windows side by side. All
-pixels then take part once, whatever the size of the windows; it is chosen by what the surface bears, which is
+Windows that overlap measure the same pixels twice, and their errors have these in common: a result would
+be reported too precise. So the tie points, which lie anywhere, give way to windows side by side. All
+pixels then take part once, whatever the size of the windows; it is chosen by the surface, which is
 hardly plane over large ones, and by the noise, which hides the texture of small ones where it is correlated
 from pixel to pixel.
 """
@@ -52,7 +52,7 @@ TRIED = (
 TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
 TRIAL_RAYS = 100  # with fewer the window stays as it is
 TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
-# Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
+# Spread of the rays of a tie point, in that of all, beyond which it does not show the surface
 TOLERANCE_FACTOR = 6.0
 RAYS_OF_NOISE = 20_000  # from about so many the noise of matching is estimated: to half a percent
 MIN_CONTROL = 3  # points that place the photographs in the system of the control

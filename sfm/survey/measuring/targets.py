@@ -44,7 +44,7 @@ def measure_photographs(
         photographs: the files.
         jobs: how many photographs are worked on at a time.
         store: keeps what is measured and spares measuring it again; None to measure everything.
-        progress: told of every photograph.
+        progress: informed of every photograph.
 
     Raises:
         GeometryError: fewer than two readable photographs.
@@ -95,13 +95,13 @@ def measure_photograph(
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether an earlier run has measured them.
 
-    The pixels are let go at once.
+    The pixels are released at once.
 
     Args:
         path: the photograph.
         settings: what the targets look like.
         family: their codes, None where they have none.
-        store: is asked first, and keeps and holds what had to be measured.
+        store: is asked first, and keeps what had to be measured.
 
     Raises:
         PhotographError: the photograph cannot be read.

@@ -58,7 +58,7 @@ def tie_photographs(
         photographs: the files.
         jobs: how many photographs are worked on at a time.
         store: keeps what single photographs show and spares finding it again; None to find everything.
-        progress: told of every photograph.
+        progress: informed of every photograph.
 
     Raises:
         GeometryError: fewer than two readable photographs, or no point that two of them have in common.
@@ -187,8 +187,8 @@ def natural_points_of(
     Args:
         path: the photograph.
         settings: detector and number of features.
-        store: is asked first, and keeps and holds what had to be found.
-        photograph: what the file holds, where it has been read.
+        store: is asked first, and keeps what had to be found.
+        photograph: the content of the file, where it has been read.
 
     Raises:
         PhotographError: the photograph cannot be read.

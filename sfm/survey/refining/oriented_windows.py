@@ -26,7 +26,7 @@ SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces a
 
 @dataclass(frozen=True)
 class Oriented:
-    """Key points measured anew, and the orientation that those tell whose windows do not overlap."""
+    """Key points measured anew, and the orientation given by those whose windows do not overlap."""
 
     windows: Windows
     window_px: int
@@ -88,10 +88,10 @@ def orient(
     v = np.abs(adjusted.residuals)
     fits = np.ones(len(v), dtype=bool)
     matched = part.image_points.point < int(points[: len(network.points)].sum())
-    for own in (~matched, matched):  # targets are measured in another way, with other residuals
-        if own.any():
-            spread = MAD_TO_SIGMA * float(np.median(v[own]))
-            fits[own] = (v[own] <= TOLERANCE_FACTOR * spread).all(axis=1)
+    for kind in (~matched, matched):  # targets are measured in another way, with other residuals
+        if kind.any():
+            spread = MAD_TO_SIGMA * float(np.median(v[kind]))
+            fits[kind] = (v[kind] <= TOLERANCE_FACTOR * spread).all(axis=1)
     accepted = images[anew.image_points.image] & points[anew.image_points.point]
     accepted[accepted] = fits
     solved = merge_estimate(adjusted.estimate, images, points)

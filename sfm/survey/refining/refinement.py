@@ -61,7 +61,7 @@ from sfm.survey.refining.windows import (
 # surface is curved they measure its mean depth over them, in all photographs alike, which no residual shows.
 WINDOWS_PX = (15, 11)
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
-FOCAL_NAMES = ("f", "fx", "fy")  # each of which holds both, where one of them is a camera's only one
+FOCAL_NAMES = ("f", "fx", "fy")  # each of which fixes both, where one of them is a camera's only one
 FIRST_RADIAL = {"k": "k1"}  # another name of the only coefficient
 
 GROUPS = ("key points", "targets")
@@ -141,12 +141,14 @@ class Refinement:
     @property
     def remarks(self) -> tuple[Remark, ...]:
         """Remarks to read before the model is used."""
-        own, remarks = self.adjustment, []
-        if not own.converged:
-            remarks.append(remark("not_converged", iterations=own.iterations))
-        if own.defect > own.expected_defect:
-            remarks.append(remark("rank_defect", defect=own.defect, expected=own.expected_defect))
-        if self.after_px > HARDLY_BETTER * self.readjusted_px and own.sigma0 > MAX_SIGMA0:
+        adjustment, remarks = self.adjustment, []
+        if not adjustment.converged:
+            remarks.append(remark("not_converged", iterations=adjustment.iterations))
+        if adjustment.defect > adjustment.expected_defect:
+            remarks.append(
+                remark("rank_defect", defect=adjustment.defect, expected=adjustment.expected_defect)
+            )
+        if self.after_px > HARDLY_BETTER * self.readjusted_px and adjustment.sigma0 > MAX_SIGMA0:
             remarks.append(remark("refinement_hardly_better", times=self.after_px / self.readjusted_px))
         lost = [name for name, used in zip(self.model.images, self.images, strict=True) if not used]
         if lost:
@@ -157,7 +159,7 @@ class Refinement:
             total=self.key_points,
             missing=1 - self.refined / max(self.key_points, 1),
         )
-        return (*remarks, *unless_note(measured), *own.remarks, *self.found)
+        return (*remarks, *unless_note(measured), *adjustment.remarks, *self.found)
 
     @property
     def points_anew(self) -> BoolArray:
@@ -351,12 +353,12 @@ def _describe_targets(result: Refinement) -> str:
     """Return the line of targets, control and scale bars; none where they were not asked for."""
     if result.targets is None:
         return ""
-    own, a = result.targets.network, result.adjustment
+    measured, a = result.targets.network, result.adjustment
     control = len(a.network.control) if a.datum == "control" else 0
     used = int((~a.rejected[len(result.rows) :]).sum())
     elsewhere = result.targets.contradicting
     return (
-        f"targets       {len(result.target_points)} of {len(own.points)}, {counted(used, 'image point')}"
+        f"targets       {len(result.target_points)} of {len(measured.points)}, {counted(used, 'image point')}"
         + (f" ({elsewhere} more are not where their target is)" if elsewhere else "")
         + ", "
         f"datum {a.datum}, {counted(control, 'control point')}, "
@@ -394,7 +396,7 @@ def adjust_finally(
 ) -> tuple[Adjustment, tuple[Remark, ...]]:
     """Return the last adjustment with its covariance, and what of control and bars was left out.
 
-    Where control or scale bars take part, key points and targets are weighted by their own variance
+    Where control or scale bars take part, key points and targets are weighted by their variance
     components, so that these keep the standard deviations that were stated for them. Control or a bar that
     the key points and targets contradict is left out.
 
@@ -471,8 +473,9 @@ def _other_names(names: tuple[str, ...]) -> tuple[str, ...]:
 def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
     """Free what the image points of a model determine, but for what is to be held.
 
-    Principal distances and principal point, and the distortion that the model has. COLMAP holds the principal
-    point unless it is told otherwise; held at a wrong place all photographs are turned to make up for it.
+    Principal distances and principal point, and the distortion that the model has. COLMAP fixes the
+    principal point unless asked otherwise; held at a wrong place all photographs are turned to make up for
+    it.
 
     Args:
         camera: of the model.

@@ -107,15 +107,15 @@ def measure_model_targets(
             f"no coded target ({survey.targets.codes}) in two of the {len(names)} photographs of the model"
         )
     circles = check_circles(survey, photographs, naming, measured, replace(part, points=points))
-    own, points, contradicting = _intersected(circles.network, part, tolerance_px)
-    placement, found_of_given = _placement(survey, own, points)
-    seen = own.image_points
+    targets, points, contradicting = _intersected(circles.network, part, tolerance_px)
+    placement, found_of_given = _placement(survey, targets, points)
+    seen = targets.image_points
     return ModelTargets(
         replace(
-            own,
+            targets,
             images=network.images,
             camera=network.camera,
-            points=tuple(f"{PREFIX}{name}" for name in own.points),
+            points=tuple(f"{PREFIX}{name}" for name in targets.points),
             image_points=replace(seen, image=oriented[seen.image]),
         ),
         points,
@@ -130,8 +130,8 @@ def measure_model_targets(
 
 def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) -> tuple[Network, Estimate]:
     """Return a model with targets behind its points, and their control and scale bars."""
-    n, own = len(network.points), targets.network
-    first, second, control, bars = network.image_points, own.image_points, own.control, own.scale_bars
+    n, added = len(network.points), targets.network
+    first, second, control, bars = network.image_points, added.image_points, added.control, added.scale_bars
     joined = ImagePoints(
         np.concatenate([first.image, second.image]),
         np.concatenate([first.point, n + second.point]),
@@ -140,7 +140,7 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
     )
     return replace(
         network,
-        points=network.points + own.points,
+        points=network.points + added.points,
         image_points=joined,
         control=ObjectPoints(n + control.point, control.xyz, control.covariance),
         scale_bars=ScaleBars(n + bars.start, n + bars.end, bars.length, bars.sigma),
@@ -159,18 +159,18 @@ def _intersected(
     return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())
 
 
-def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Similarity, tuple[Remark, ...]]:
+def _placement(survey: Survey, targets: Network, points: FloatArray) -> tuple[Similarity, tuple[Remark, ...]]:
     """Return the object frame from that of the model, by control, else by scale bars, and remarks.
 
     Raises:
         GeometryError: the datum is control, and fewer than three control points are among the targets; or
             control or scale bars are given, and too few of them are among the targets to give the scale.
     """
-    control = own.control.complete
+    control = targets.control.complete
     known: BoolArray = np.isfinite(points.sum(axis=1))
     on = known[control.point]
     given = () if survey.control is None else survey.control.names
-    seen = {own.points[j] for j in np.flatnonzero(known)}
+    seen = {targets.points[j] for j in np.flatnonzero(known)}
     lost = [name for name in given if name not in seen]
     bars = [bar for bar in survey.scale_bars if not {bar.start, bar.end} <= seen]
     remarks = []
@@ -186,7 +186,7 @@ def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Simila
             f"{on.sum()} of {len(given)} control points are targets in two photographs or more, needed "
             f"{MIN_CONTROL}"
         )
-    scale = object_scale(own, Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), points))
+    scale = object_scale(targets, Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), points))
     if not scale > 0:
         if given or survey.scale_bars:
             missing = "; ".join(one.text.rstrip(".") for one in remarks)

@@ -108,18 +108,19 @@ def match_windows(
     place = np.rint(seen.xy[template_of])  # px, in the reference, (k, 2)
     from_photograph = rows_of(seen.image[template_of[rows]], len(network.images))
     of_photograph = rows_of(seen.image, len(network.images))
-    progress.stage("matching", sum(len(own) > 0 for own in from_photograph))
+    progress.stage("matching", sum(len(to_match) > 0 for to_match in from_photograph))
     for i, part in enumerate(from_photograph):
         if not len(part):
             continue
-        own = rows[part]
-        own = own[seen.image[own] != i]
-        points, normal = _planes(estimate, camera, i, place[own], seen.point[own], of_photograph[i], seen)
-        warp = plane_warps(estimate, camera, i, seen.image[own], place[own], points, normal, window_px / 2)
-        moved = np.einsum("kij,kj->ki", linear_part(warp), place[own] - seen.xy[template_of[own]])
-        others, number_of = np.unique(seen.image[own], return_inverse=True)
+        matched = rows[part]
+        matched = matched[seen.image[matched] != i]
+        image, at, point = seen.image[matched], place[matched], seen.point[matched]
+        points, normal = _planes(estimate, camera, i, at, point, of_photograph[i], seen)
+        warp = plane_warps(estimate, camera, i, image, at, points, normal, window_px / 2)
+        moved = np.einsum("kij,kj->ki", linear_part(warp), at - seen.xy[template_of[matched]])
+        others, number_of = np.unique(image, return_inverse=True)
         for j, some in zip(others.tolist(), rows_of(number_of, len(others)), strict=True):
-            to = own[some]
+            to = matched[some]
             match = match_lsm(
                 photographs.grey(i),
                 photographs.grey(j),
@@ -246,11 +247,11 @@ def _planes(
     i: int,
     place: FloatArray,
     point: IntArray,
-    own: IntArray,
+    rows_seen: IntArray,
     seen: ImagePoints,
 ) -> tuple[FloatArray, FloatArray]:
     """Return object points and normals of places of a photograph; it is faced where no plane is known."""
-    points, normal = planes_at(estimate, camera, i, place, seen.point[own])
+    points, normal = planes_at(estimate, camera, i, place, seen.point[rows_seen])
     unknown = ~np.isfinite(points).all(axis=1)
     points[unknown] = estimate.points[point[unknown]]
     normal[unknown] = estimate.rotation[i][:, 2]

@@ -1,7 +1,7 @@
 """Photographs whose errors are those of another: copies that were saved again or compressed.
 
 A copy is no second observation: it would only make the result look more precise than it is. One whose
-compression makes errors larger than those of its original has errors of its own, and is one. Two photographs
+compression makes errors larger than those of its original has other errors, and is one. Two photographs
 from one place have the residuals r_i and r_j and differ by d = r_i - r_j. With independent errors the square
 sum of d is that of both residuals together, with the same errors it is 0:
 
@@ -105,7 +105,7 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     start = Estimate(measured.cameras, *empty, np.full((len(points), 3), np.nan))
     network, _ = reduce_network(network, start, keep, points, every)
     photographs, naming = measured.photographs, measured.naming
-    kept = [k for k, own in enumerate(keep) if own]
+    kept = [k for k, kept_one in enumerate(keep) if kept_one]
     if photographs is not None:
         photographs = replace(
             photographs,
