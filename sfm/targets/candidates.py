@@ -183,7 +183,7 @@ def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: Fl
     """Return which candidates are counters: the white inside of letters such as o, e and 8.
 
     It looks like a target on the stroke of the letter. The background of a counter is a closed stroke, behind
-    which the paper begins again, and next to a letter there are others. A target with its own dark rim is
+    which the paper begins again, and next to a letter there are others. A target with a dark rim is
     not like that: its rim is thinner than half its radius, or the surroundings of the rim are free. Nor is a
     dot in the ring of a code, which always has clear cells.
 

@@ -44,7 +44,7 @@ class Observed:
 
     @property
     def count(self) -> int:
-        """How many scalar observations these are, less parameters of their own."""
+        """How many scalar observations these are, less parameters of groups."""
         return int(self.components.sum()) - self.fitted
 
     @property

@@ -1,4 +1,4 @@
-"""Whether the cameras of a rig kept their places: a test of each photograph for a pose of its own.
+"""Whether the cameras of a rig kept their places: a test of each photograph for a separate pose.
 
 With the derivatives E of the image points of one photograph by a separate pose, the whitened residuals v
 and R = I - A Q A', its shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square

@@ -5,7 +5,7 @@ others at another scale. Its exterior orientation takes up a part of that, and t
 the rest, so that a photograph with a few accepted points would stand among the oriented ones.
 
 The photographs are tried that lose more points to the test than chance makes. Each is adjusted alone on
-the points of the others, with the camera that it shares and with parameters of its own. The likelihood
+the points of the others, with the camera that it shares and with per-photograph parameters. The likelihood
 must pay for these and for the search, as in `sfm.adjustment.hypotheses`, and exceed that of the
 alternatives there: a wrong parameter that all photographs share makes some of them look zoomed. A
 photograph that loses the larger part of its points with either is left out.

@@ -151,7 +151,7 @@ def free_start_values(settings: CameraSettings, name: str, given: StartCameras |
 
     Args:
         settings: say what is free.
-        name: of the camera in the table, or of one of its photographs or groups with values of their own.
+        name: of the camera in the table, or of one of its photographs or groups with separate values.
         given: the table, None without.
     """
     values = given.of(name) if given is not None else {}

@@ -35,7 +35,7 @@ class OtherSizes:
 
 
 def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
-    """Give the photographs of another size than the others of their camera a camera of their own.
+    """Give photographs of another size than the others of their camera a separate camera.
 
     A few of them, and those whose camera is held at values that another part of the sensor does not have, are
     left out.

@@ -48,7 +48,7 @@ MIN_REDUNDANCY = 1e-6  # of a ray in the direction that the others check less, o
 HUBER = 1.501
 TUKEY = 5.123
 # In a photograph of n image points an error moves the residual of another by about 6 / (2 n) of itself, at
-# most some times that: beside CROWDED points one of BESIDE of the largest tau is an error of its own.
+# most some times that: beside CROWDED points one of BESIDE of the largest tau is a separate error.
 CROWDED = 60
 BESIDE = 0.4
 RETURNS = 0.99  # of the critical value: a rejected one returns below, since at it rounds turn in circles
