@@ -9,10 +9,10 @@ function_tolerance 1e-6, start radius 1e8, 1 or 2 threads, whichever wins. Both 
 decrease of the cost, 1e-6 = (|A dx| / |v|)^2; how near to the optimum each ends is printed against an
 adjustment to the last digit. pycolmap's scene is built from arrays before the clock starts, as the network
 is. --growth adjusts blocks of 100 to 10,000 photographs and a dense convergent network of 1,000 x 1,000
-without the covariance, each adjuster in a process of its own; the limit for Ceres is of wall time and
+without the covariance, each adjuster in a separate process; the limit for Ceres is of wall time and
 includes building its scene. Only ratios within one run mean anything; run it on a machine that does nothing
 else. With --cpu everything gets one thread and CPU time is compared, which other programs disturb less.
-Memory is the peak of a process of its own while it adjusts, network or scene included.
+Memory is the peak of a separate process while it adjusts, network or scene included.
 """
 
 from __future__ import annotations
@@ -174,9 +174,9 @@ def timed_ceres(
     """Return the shortest time of pycolmap's adjustment of copies of a scene, and its cost in px^2."""
     times = []
     for _ in range(repeat + 1):
-        own = copy.deepcopy(scene)
+        copied = copy.deepcopy(scene)
         started = clock()
-        cost = run_ceres(own, tuned, covariance=covariance)
+        cost = run_ceres(copied, tuned, covariance=covariance)
         times.append(clock() - started)
         if times[-1] > SLOW_S:
             break
@@ -246,15 +246,15 @@ def reconstruction(network: Network, start: Estimate) -> Any:
     axes = np.diag([1.0, -1.0, -1.0])
     tracks: list[list[tuple[int, int]]] = [[] for _ in network.points]
     order = np.argsort(k.image, kind="stable")
-    for i, own in enumerate(
+    for i, rows in enumerate(
         np.split(order, np.cumsum(np.bincount(k.image, minlength=len(network.images)))[:-1])
     ):
         R = axes @ start.rotation[i].T
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ start.position[i])
         scene.add_image_with_trivial_frame(
-            pycolmap.Image(name=network.images[i], keypoints=k.xy[own], camera_id=1, image_id=i + 1), pose
+            pycolmap.Image(name=network.images[i], keypoints=k.xy[rows], camera_id=1, image_id=i + 1), pose
         )
-        for place, j in enumerate(k.point[own]):
+        for place, j in enumerate(k.point[rows]):
             tracks[j].append((i + 1, place))
     for j, track in enumerate(tracks):
         elements = [pycolmap.TrackElement(i, place) for i, place in track]
@@ -301,7 +301,7 @@ def growth(repeat: int, most: int, ceres_limit: float, *, cpu: bool) -> None:
 def grown(
     what: str, size: str, repeat: int, cpu: bool, limit: float | None = None
 ) -> tuple[float, float, float]:
-    """Return image points, s and peak memory, MB, of a network that is adjusted in a process of its own."""
+    """Return image points, s and peak memory, MB, of a network that is adjusted in a separate process."""
     command = [
         sys.executable,
         "-m",
@@ -370,7 +370,7 @@ def peak_mb() -> float:
 
 
 def peak_in_own_process(what: str) -> float:
-    """Return what `peak_of` finds in a process of its own, MB."""
+    """Return what `peak_of` finds in a separate process, MB."""
     command = [sys.executable, "-m", "benchmarks.adjustment", "--peak", what]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 

@@ -14,7 +14,7 @@ alternate photographs with the orientation of the whole.
 
 A ratio of 1 says that differences are what their standard deviations say: the root of the mean over the draws
 of squared differences over what is predicted of each. Draws of one way have image points and few deciding
-directions in common: the ratio's own standard deviation beside it is that of all draws together.
+directions in common: the standard deviation of the ratio beside it is that of all draws together.
 """
 
 from __future__ import annotations

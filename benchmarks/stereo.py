@@ -161,8 +161,8 @@ def main() -> None:
     exact = np.array([np.linalg.norm(truth.mounts.position[1]), *angles])
     errors, sigmas, rms = [], [], []
     for xy in drawn:
-        own = replace(network, image_points=replace(network.image_points, xy=xy))
-        a = adjust(own, truth, datum=Datum("control"), reject="none", sigma_px=NOISE_PX)
+        measured = replace(network, image_points=replace(network.image_points, xy=xy))
+        a = adjust(measured, truth, datum=Datum("control"), reject="none", sigma_px=NOISE_PX)
         mount = rigs_of(a)[0].mounts[0]
         errors.append(np.array([mount.base, *mount.rotation_deg]) - exact)
         sigmas.append(np.array([mount.base_sigma, *mount.rotation_sigma_deg]))

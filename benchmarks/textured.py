@@ -1,4 +1,4 @@
-"""COLMAP, COLMAP and refine, and Kolinear's own textured survey on rendered photographs with truth.
+"""COLMAP, COLMAP and refine, and Kolinear's textured survey on rendered photographs with truth.
 
     python -m benchmarks.textured --photographs 20 60 --roughness smooth medium rough
     python -m benchmarks.textured --photographs 15 30 60 120 --roughness medium --methods kolinear
@@ -57,12 +57,12 @@ def main() -> None:
             scene = textured_scene(roughness, photographs, arguments.finer)
             if not (folder / "survey.toml").is_file():
                 render_scene(folder, roughness, photographs, arguments.finer)
-            own: list[float] = []
+            of_scene: list[float] = []
             if "kolinear" in arguments.methods:
-                own.append(_kolinear(scene, folder, arguments.jobs))
+                of_scene.append(_kolinear(scene, folder, arguments.jobs))
             if "colmap" in arguments.methods:
-                own += _colmap(scene, folder)
-            seconds.append(own)
+                of_scene += _colmap(scene, folder)
+            seconds.append(of_scene)
         if len(arguments.photographs) > 1:
             power = np.polyfit(np.log(arguments.photographs), np.log(seconds), 1)[0]
             print(f"{roughness:<17}time grows as n^" + ", n^".join(f"{one:.2f}" for one in power))
@@ -111,15 +111,15 @@ def _print(
     """Print one row of the table."""
     truth = {f"surface_{i + 1:03d}.png": i for i in range(len(scene.position))}
     on = np.flatnonzero(estimate.oriented)
-    own = [truth[network.images[i]] for i in on]
-    moved = fit_similarity(estimate.position[on], scene.position[own])
+    of_truth = [truth[network.images[i]] for i in on]
+    moved = fit_similarity(estimate.position[on], scene.position[of_truth])
     placed = moved.apply_estimate(estimate)
-    centres = placed.position[on] - scene.position[own]
-    angles = rotation_angle_deg(scene.rotation[own], placed.rotation[on])
+    centres = placed.position[on] - scene.position[of_truth]
+    angles = rotation_angle_deg(scene.rotation[of_truth], placed.rotation[on])
     centre = float(np.sqrt((centres**2).sum(axis=1).mean()))
     predicted, distance = np.nan, np.nan
     if adjustment is not None:
-        turn = scene.rotation[own].transpose(0, 2, 1) @ placed.rotation[on]
+        turn = scene.rotation[of_truth].transpose(0, 2, 1) @ placed.rotation[on]
         turns = np.column_stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])  # small angles, image axes
         errors = np.column_stack([centres @ moved.rotation / moved.scale, turns])
         covariance = covariance_on_centres(adjustment)

@@ -2,7 +2,7 @@
 
 What can be computed by the program is: the pinhole camera stands where `sfm.camera.project` sees the point,
 the axes turn by `sfm.conventions.rotation_from_angles`, and the vectors of distortion are the models'.
-Colours are the page's own, so that a drawing is readable on light and on dark ground.
+Colours are those of the page, so that a drawing is readable on light and on dark ground.
 """
 
 from __future__ import annotations

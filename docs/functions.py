@@ -35,7 +35,7 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
 
 
 def names_on_pages() -> tuple[str, ...]:
-    """Return every name in code on the pages of docs/, but for the public ones, which have their own page."""
+    """Return every name in code on the pages of docs/, but for the public ones, which have another page."""
     found: set[str] = set()
     for page in DOCS.rglob("*.md"):
         prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
@@ -105,7 +105,7 @@ class FunctionReference(SphinxDirective):
         section = nodes.section(ids=[label])
         section += nodes.title(title, title)
         section += nodes.literal_block("", text.strip(), language="text")
-        if name in PUBLIC:  # its own page is where links lead
+        if name in PUBLIC:  # links lead to its page
             return section
         if kind == "module":
             domain.note_module(name, label, "", "", False)

@@ -31,7 +31,7 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        """Note what an element holds."""
+        """Note the content of an element."""
         values = {name: value or "" for name, value in attributes}
         self.places |= {values[name] for name in ("id", "name") if values.get(name)}
         if tag == "a" and values.get("href"):

@@ -28,17 +28,17 @@ SHAPES = {  # types of several values: what is written in the file, and of which
 
 
 def section_of(annotation: Any) -> type[Section]:
-    """Return the section that a field of the survey file holds, one or several, there or not.
+    """Return the section that a field of the survey file has, one or several, there or not.
 
     Raises:
-        TypeError: it holds none.
+        TypeError: it has none.
     """
     if inspect.isclass(annotation) and issubclass(annotation, Section):
         return annotation
     for inner in typing.get_args(annotation):
         if inspect.isclass(inner) and issubclass(inner, Section):
             return inner
-    raise TypeError(f"{annotation} holds no section")
+    raise TypeError(f"{annotation} has no section")
 
 
 def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
@@ -107,7 +107,7 @@ def bounds_of(metadata: Iterable[Any]) -> str:
     """Return the bounds of a number in words; empty where it has none."""
     found = []
     for one in metadata:
-        for part in getattr(one, "metadata", [one]):  # pydantic's Field holds several
+        for part in getattr(one, "metadata", [one]):  # pydantic's Field has several
             if isinstance(part, Ge):
                 found.append(f"from {part.ge:g}")
             elif isinstance(part, Gt):

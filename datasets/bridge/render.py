@@ -4,7 +4,7 @@
     cd build/bridge && kolinear epochs first.toml second.toml third.toml
 
 A model in a hall: a deck between two abutments that stand still, and two scale bars beside it. Every target
-is on a plate of its own, which moves down with the deck. The photographs of an epoch are taken anew, by hand,
+is on a separate plate, which moves down with the deck. The photographs of an epoch are taken anew, by hand,
 with one camera. Lengths in mm.
 """
 
