@@ -15,8 +15,8 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate
 
-THIN = 0.05  # extent over the longest one below which points have no depth
-COLLINEAR = 1e-9  # second singular value over the first below which points lie on a line
+MIN_DEPTH_RATIO = 0.05  # extent over the longest one below which points have no depth
+MAX_COLLINEAR_RATIO = 1e-9  # second singular value over the first below which points lie on a line
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _fitted(
     sign[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     R = (U * sign[:, None]) @ Vt
     found: list[Similarity | None] = []
-    for k, on_line in enumerate(spread[:, 1] <= COLLINEAR * spread[:, 0]):
+    for k, on_line in enumerate(spread[:, 1] <= MAX_COLLINEAR_RATIO * spread[:, 0]):
         if on_line:
             found.append(None)
             continue
@@ -190,5 +190,5 @@ def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the axes along which an object extends (k, 3), and its coordinates along them (n, k)."""
     centred = xyz - xyz.mean(axis=0)
     _, extent, axes = np.linalg.svd(centred, full_matrices=False)
-    axes = axes[THIN * extent[0] < extent]
+    axes = axes[MIN_DEPTH_RATIO * extent[0] < extent]
     return axes, centred @ axes.T

@@ -15,7 +15,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
-from sfm.adjustment.engine.cofactors import ZERO, Cofactors, cofactors, marginal_covariance, without_held
+from sfm.adjustment.engine.cofactors import (
+    MAX_FIXED_VARIANCE,
+    Cofactors,
+    cofactors,
+    marginal_covariance,
+    without_held,
+)
 from sfm.adjustment.engine.correlated import CorrelatedPart, Influence, correlated_part, influence_of
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
@@ -127,7 +133,7 @@ class Marginal:
         if self.correlated is not None:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
-        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= ZERO * limiting)  # by the datum
+        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)  # by the datum
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
         cofactor *= self.adjustment.sigma0**2

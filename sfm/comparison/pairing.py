@@ -26,7 +26,8 @@ SAME_PX = 1e-2  # image points closer than this are one measurement, as files ro
 SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
 NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this
 MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
-AMBIGUOUS = 0.3  # of the distance to the next neighbour: what is farther away is not recognised by place
+# Of the distance to the next neighbour: what is farther away is not recognised by place.
+MAX_PLACE_FRACTION = 0.3
 SAME_PLACE = 0.5  # of the points that must coincide for two results to be in one frame as they are
 
 
@@ -309,7 +310,9 @@ def nearest_places(
     distance, there = tree_b.query(ours)
     back = tree_a.query(theirs)[1]
     k = np.flatnonzero(back[there] == np.arange(len(ours)))
-    good = distance[k] < AMBIGUOUS * np.minimum(_spacing(a, rows_a[k]), _spacing(b, rows_b[there[k]]))
+    good = distance[k] < MAX_PLACE_FRACTION * np.minimum(
+        _spacing(a, rows_a[k]), _spacing(b, rows_b[there[k]])
+    )
     found: IntArray = np.stack([rows_a[k], rows_b[there[k]]], axis=1)[good]
     return found
 

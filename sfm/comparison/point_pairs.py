@@ -12,7 +12,7 @@ from sfm.similarity import Similarity, mean_distance
 from sfm.solution import Solution
 
 ROUNDING = 1e-9  # of the extent of the object: what computing in double precision and writing cost at most
-HELD = 1e-12  # variance over the mean one below which a coordinate is held
+MAX_HELD_VARIANCE = 1e-12  # variance over the mean one below which a coordinate is held
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def held_points(variance: FloatArray) -> BoolArray:
         variance: of the coordinates, object unit^2, (n, 3).
     """
     return (
-        np.asarray((variance <= HELD * variance.mean()).any(axis=1))
+        np.asarray((variance <= MAX_HELD_VARIANCE * variance.mean()).any(axis=1))
         if len(variance)
         else np.zeros(0, dtype=bool)
     )

@@ -19,13 +19,13 @@ from scipy.spatial import cKDTree
 from sfm.comparison.pairing import nearest_places
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.similarity import COLLINEAR, Similarity, fit_similarity
+from sfm.similarity import MAX_COLLINEAR_RATIO, Similarity, fit_similarity
 
 NEIGHBOURS = 6  # of each point, that make triangles with it
 TRIANGLES = 100  # of the first set that are tried
-ALIKE = 5  # triangles of the second set that are tried for each
+SIMILAR_TRIANGLES = 5  # triangles of the second set that are tried for each
 ROUNDS = 5  # of pairing and fitting after a proposal
-ENOUGH = 0.9  # of the points: no better proposal is looked for
+ENOUGH_FRACTION = 0.9  # of the points: no better proposal is looked for
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
@@ -50,7 +50,11 @@ def find_pattern(
     else:
         sides, their_sides = np.log(sides), np.log(their_sides)
     order = np.random.default_rng(len(a)).permutation(len(ours))[:TRIANGLES]
-    near = cKDTree(their_sides).query(sides[order], k=min(ALIKE, len(theirs)))[1].reshape(len(order), -1)
+    near = (
+        cKDTree(their_sides)
+        .query(sides[order], k=min(SIMILAR_TRIANGLES, len(theirs)))[1]
+        .reshape(len(order), -1)
+    )
     best, most = None, 3
     for k, candidates in zip(order, near, strict=True):
         for j in candidates:
@@ -62,7 +66,7 @@ def find_pattern(
                 continue
             if count > most:
                 best, most = found, count
-        if most >= ENOUGH * min(len(a), len(b)):
+        if most >= ENOUGH_FRACTION * min(len(a), len(b)):
             break
     if best is None:
         return None
@@ -94,5 +98,5 @@ def _triangles(xyz: FloatArray) -> tuple[IntArray, FloatArray]:
     order = np.argsort(sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
     corners = np.take_along_axis(corners, order, axis=1)
-    proper = sides[:, 0] + sides[:, 1] > (1 + COLLINEAR) * sides[:, 2]
+    proper = sides[:, 0] + sides[:, 1] > (1 + MAX_COLLINEAR_RATIO) * sides[:, 2]
     return corners[proper], sides[proper]

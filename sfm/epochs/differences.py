@@ -27,7 +27,7 @@ from sfm.comparison.point_pairs import PointPairs, coordinates_of, held_points, 
 from sfm.comparison.point_tests import known_scale
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted
-from sfm.epochs.epoch import SAME, Epoch, given_observations
+from sfm.epochs.epoch import MAX_SAME_DIFFERENCE, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.solution import Solution
 
@@ -179,7 +179,7 @@ def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
     theirs = {(camera, parameter): value for camera, parameter, value, _ in second.interior}
     for camera, parameter, value, _ in first.interior:
         other = theirs.get((camera, parameter))
-        if other is not None and abs(other - value) <= SAME * abs(value):
+        if other is not None and abs(other - value) <= MAX_SAME_DIFFERENCE * abs(value):
             raise GeometryError(
                 f"{first.name} and {second.name} share the weighted {parameter} of camera {camera}, whose "
                 "error is in both: adjust the epochs together (--together), or let each epoch "
@@ -208,7 +208,7 @@ def _shared(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | 
         if key not in theirs:
             continue
         other, other_sigma, other_value = theirs[key]
-        if abs(other_value - value) > SAME * max(abs(value), 1.0):
+        if abs(other_value - value) > MAX_SAME_DIFFERENCE * max(abs(value), 1.0):
             continue
         for epoch, gradient, s, found in ((first, ours, sigma, mine), (second, other, other_sigma, yours)):
             Q = epoch.result.covariance

@@ -25,7 +25,7 @@ from sfm.distributions import chi2_isf
 from sfm.epochs.differences import Differences
 
 ALPHA = 0.05  # level of all tests of a pair of epochs together
-MANY = 10**6  # redundancy above which Fisher's F is chi-square
+MAX_F_REDUNDANCY = 10**6  # redundancy above which Fisher's F is chi-square
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
 
     Source: Baarda (1968), A testing procedure for use in geodetic networks, sec. 4.
     """
-    freedom = min(MANY, redundancy or MANY)
+    freedom = min(MAX_F_REDUNDANCY, redundancy or MAX_F_REDUNDANCY)
     limit = critical_value(alpha, m, redundancy)
     low, high = 0.0, 4 * float(chi2_isf(alpha, m)) + 100.0
     for _ in range(60):

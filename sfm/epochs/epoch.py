@@ -12,7 +12,7 @@ from sfm.conventions import FloatArray
 from sfm.network import ObjectPoints, ScaleBars
 from sfm.solution import Solution
 
-SAME = 1e-9  # relative difference of two given values that are the same one
+MAX_SAME_DIFFERENCE = 1e-9  # relative difference of two given values that are the same one
 
 
 @dataclass(frozen=True)

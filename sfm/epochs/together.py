@@ -27,12 +27,12 @@ from sfm.adjustment.solve import adjust
 from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import FloatArray, IntArray
-from sfm.epochs.epoch import SAME, Common, Epoch, given_observations
+from sfm.epochs.epoch import MAX_SAME_DIFFERENCE, Common, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
 
 ALPHA = 0.01  # level of the test whether a camera is the same
-NAMED = 4  # cameras that a message names
+MAX_NAMED = 4  # cameras that a message names
 SAME_SIGMA = 0.05  # of a standard deviation, by which an adjustment from stored tables may differ, and of it
 
 
@@ -332,10 +332,10 @@ def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
 def _some(names: tuple[str, ...]) -> str:
     return (
         ", ".join(names)
-        if len(names) <= NAMED
-        else f"{', '.join(names[:NAMED])} and {len(names) - NAMED} more"
+        if len(names) <= MAX_NAMED
+        else f"{', '.join(names[:MAX_NAMED])} and {len(names) - MAX_NAMED} more"
     )
 
 
 def _same(a: float, b: float) -> bool:
-    return abs(a - b) <= SAME * max(abs(a), 1.0)
+    return abs(a - b) <= MAX_SAME_DIFFERENCE * max(abs(a), 1.0)

@@ -26,7 +26,7 @@ from sfm.similarity import similarity_motions
 
 RIG = "rig"
 MIN_SHAPE = 3  # points that have one
-OPEN = 1e-6  # share of a rotation or scale in open motions; it is of their order or rounding
+MIN_OPEN_SHARE = 1e-6  # share of a rotation or scale in open motions; it is of their order or rounding
 
 
 @dataclass(frozen=True)
@@ -134,5 +134,5 @@ def shape(adjustment: Adjustment, points: IntArray) -> tuple[float, IntArray]:
     sigma = float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))
     free = m.optimum.motions.points[points].reshape(len(Q), -1)[:, : adjustment.expected_defect]
     along = np.linalg.lstsq(motions.reshape(-1, 7), free, rcond=None)[0]  # of the seven, (7, d)
-    turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=OPEN)) for k in (3, 6))
+    turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=MIN_OPEN_SHARE)) for k in (3, 6))
     return sigma, np.array([adjustment.expected_defect - turned, turned - scaled, scaled])

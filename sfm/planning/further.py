@@ -30,7 +30,7 @@ from sfm.runtime.progress import report_step
 
 DISTANCES = (0.8, 1.2)  # of those that the survey was photographed from
 ROOM = 0.25  # by which the box around its stations may be left, of its size
-WEAKEST = 10  # points that are listed
+MAX_LISTED = 10  # points that are listed
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def further_photographs(
     later = np.trace(after.covariance.points, axis1=1, axis2=2) / 3
     every = np.zeros((len(chosen), len(network.points)), dtype=bool)
     every[:, rows] = sight.seen
-    worst = rows[np.argsort(-variance[rows], kind="stable")[:WEAKEST]]
+    worst = rows[np.argsort(-variance[rows], kind="stable")[:MAX_LISTED]]
     return Further(
         estimate.cameras[camera].name,
         stations,

@@ -11,7 +11,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.planning.sight.optics import best_focus
 from sfm.planning.stations import Stations
 
-CODED = 5  # targets in every photograph, by which it is oriented by resection
+MIN_CODED_TARGETS = 5  # targets in every photograph, by which it is oriented by resection
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def roll_deg(rotation: FloatArray) -> float:
 
 
 @checked_arguments(seen="m n")
-def choose_coded(seen: BoolArray, *, per_photograph: int = CODED) -> IntArray:
+def choose_coded(seen: BoolArray, *, per_photograph: int = MIN_CODED_TARGETS) -> IntArray:
     """Return few points which, as coded targets, give every photograph so many, or all that it shows.
 
     The point that most photographs still lack comes first.

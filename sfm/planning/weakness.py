@@ -21,8 +21,8 @@ from sfm.display import counted
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network
 from sfm.planning.sight.visibility import WORDS, Seeing, Why
 
-WEAK = 1.5  # times the median sigma from which a point is called weak
-FEW_RAYS = 4  # with fewer a gross error is hardly found, and hardly ever attributed
+MIN_WEAK_RATIO = 1.5  # times the median sigma from which a point is called weak
+MIN_RAYS = 4  # with fewer a gross error is hardly found, and hardly ever attributed
 FLAT_DEG = 40.0  # largest angle of rays below which depth is much weaker than the rest
 ROLLED_DEG = 45.0  # from the others, from which a photograph counts as rolled
 MIN_DEPTH = 0.1  # of the object over its distance, below which it is flat to the camera
@@ -78,7 +78,7 @@ class Calibratability:
 def weak_points(prediction: Prediction) -> tuple[WeakPoint, ...]:
     """Return the points that are not determined and those much worse than the median, worst first."""
     sigma, determined = prediction.sigma, prediction.determined
-    limit = WEAK * float(np.median(sigma[determined])) if determined.any() else 0.0
+    limit = MIN_WEAK_RATIO * float(np.median(sigma[determined])) if determined.any() else 0.0
     weak = np.flatnonzero(~determined | (sigma > limit) | (prediction.rays < 2))
     order = weak[np.lexsort((prediction.rays[weak], -sigma[weak]))]
     return tuple(
@@ -92,7 +92,7 @@ def reason_of(prediction: Prediction, j: int) -> str:
     words = [counted(rays, "ray")]
     if np.isfinite(angle):
         words.append(f"{angle:.0f} degrees")
-    if rays < FEW_RAYS:
+    if rays < MIN_RAYS:
         why = prediction.sight.why[:, j]
         counts = [(int((why == kind).sum()), WORDS[kind]) for kind in Why if kind != Why.SEEN]
         seen_by_few = int(((why == Why.SEEN) & (prediction.photograph < 0)).sum())

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import STRONG, Correlation
+from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlation
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.files.result_tables import VARIANCE_COMPONENTS
@@ -53,7 +53,7 @@ MAX_BINS = 12  # numbers of rays that are listed one by one
 MAX_OPEN = 30  # parameters that are shown without a click
 MAX_WEAK_POINTS = 5  # points
 MAX_CORRELATIONS = 20  # correlations of the exterior orientation; all are in summary.json
-OVER = f"{100 * STRONG:.0f} %"
+OVER = f"{100 * MIN_REPORTED_CORRELATION:.0f} %"
 
 
 def precision_parts(f: Findings) -> Iterator[Part]:

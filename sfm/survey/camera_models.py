@@ -25,7 +25,8 @@ FISHEYE = "opencv_fisheye"
 # c over half the diagonal, of a central perspective, below which the corner is more than 45 degrees off the
 # axis: there equal angles and equal tangents are apart by more than a tenth of the half diagonal.
 WIDE_C = 1.0
-FITTING = 0.9  # share of the image points with a central perspective from which nothing else is tried
+# Share of the image points with a central perspective from which nothing else is tried.
+MIN_FITTING_FRACTION = 0.9
 
 
 def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, Measurements, Orientation]:
@@ -49,7 +50,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
     except GeometryError as error:
         failure = error
     likelihood, fitting = (-math.inf, 0) if found is None else _fit(measured, found)
-    few = fitting < FITTING * len(measured.network.image_points)
+    few = fitting < MIN_FITTING_FRACTION * len(measured.network.image_points)
     wide = [a for a in unsaid if found is None or few or _is_wide(found.estimate.cameras[a])]
     if not wide:
         if found is None:

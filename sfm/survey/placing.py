@@ -34,14 +34,16 @@ K = TypeVar("K", bound=Kind)
 Weighted = TableKind | ScaleBars  # with one standard deviation for each value
 
 ROUNDS = 20  # of Gauss-Newton from each attitude
-FAR = 100.0  # standard deviations from which on an observation is taken for wrong before anything is adjusted
-OPEN = 1e-9  # of the derivatives, below which what is left of a motion is rounding
-LARGEST_STEP = 0.5  # turn of one step, rad, and change of the scale
+# Standard deviations from which on an observation is taken for wrong before anything is adjusted.
+MIN_FAR_SIGMAS = 100.0
+MIN_FRACTION = 1e-9  # of the derivatives, below which what is left of a motion is rounding
+MAX_STEP = 0.5  # turn of one step, rad, and change of the scale
 MIN_POINTS = 3  # that fix position, attitude and scale
-NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
-SURE = 3.0  # standard deviations by which places must be off a line to give the turn about it
-FLAT = 1e-6  # the same for places without error, over their extent
-ROUGH = 1e-3  # of the extent of the places: no start value needs to be better
+# Breadth over length of places below which their turn about the length is taken from angles.
+MAX_BREADTH_RATIO = 0.05
+MIN_OFF_LINE_SIGMAS = 3.0  # standard deviations by which places must be off a line to give the turn about it
+MIN_OFF_LINE_FRACTION = 1e-6  # the same for places without error, over their extent
+START_TOLERANCE = 1e-3  # of the extent of the places: no start value needs to be better
 MIN_CONTROL = 3  # points that a control datum needs, and that place a free network
 
 
@@ -77,7 +79,7 @@ def loosen_far(network: Network, estimate: Estimate) -> Network:
     for kind in network.observations:
         if isinstance(kind, TableKind) and len(kind) == len(_usable(kind, estimate)):
             over = _over_sigma(kind, kind, estimate)
-            kind = kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over / FAR, 1.0)))
+            kind = kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over / MIN_FAR_SIGMAS, 1.0)))
         kinds.append(kind)
     return replace(network, observations=tuple(kinds))
 
@@ -96,9 +98,9 @@ def scale_sigma(network: Network, estimate: Estimate) -> float:
     rows[:, :3] *= size  # shifts in units of the extent, beside turns in rad
     largest = sum(_largest(kind, estimate) for kind in kinds) * size
     U, singular, _ = np.linalg.svd(rows[:, :6], full_matrices=False)
-    U = U[:, singular > OPEN * largest]
+    U = U[:, singular > MIN_FRACTION * largest]
     left = float(np.linalg.norm(rows[:, 6] - U @ (U.T @ rows[:, 6])))
-    return 1 / left if left > OPEN * largest else float("inf")
+    return 1 / left if left > MIN_FRACTION * largest else float("inf")
 
 
 def _largest(kind: Kind, estimate: Estimate) -> float:
@@ -136,7 +138,7 @@ def _fitted(kinds: list[Weighted], estimate: Estimate, *, scaled: bool) -> tuple
         rows, l = _rows(weighted, estimate)
         rows[:, 6] *= scaled
         step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
-        size = max(float(np.abs(step[3:]).max()), LARGEST_STEP) / LARGEST_STEP
+        size = max(float(np.abs(step[3:]).max()), MAX_STEP) / MAX_STEP
         step /= size
         R = rotation_from_vector(step[3:6])
         estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
@@ -204,7 +206,7 @@ def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
     control = network.control.complete
     known = estimate.determined[control.point]
     length, breadth = _extents(control.xyz[known], np.ones(int(known.sum())))
-    if known.sum() >= MIN_POINTS and breadth >= NARROW * length:
+    if known.sum() >= MIN_POINTS and breadth >= MAX_BREADTH_RATIO * length:
         return estimate  # the orientation has brought it there
     oriented = estimate.oriented[image]
     centres = oriented & np.isfinite(value[:, :3]).all(axis=1)
@@ -216,13 +218,16 @@ def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
     turned = oriented & np.isfinite(value[:, 3:]).all(axis=1)
     if not len(target) or not (len(target) >= MIN_POINTS or turned.any()):
         raise GeometryError(_too_few(len(target), int(turned.sum())))
-    least = (ROUGH * float(np.ptp(target, axis=0).max())) ** 2
+    least = (START_TOLERANCE * float(np.ptp(target, axis=0).max())) ** 2
     weight = 1 / np.maximum(variance, least if least > 0 else 1.0)
     length, breadth = _extents(target, weight)
     noise = float(np.sqrt(weight @ variance / weight.sum() / 3))
-    if turned.any() and (len(target) < MIN_POINTS or breadth < NARROW * length):
+    if turned.any() and (len(target) < MIN_POINTS or breadth < MAX_BREADTH_RATIO * length):
         similarity = _by_angles(network, estimate, image[turned], value[turned, 3:], source, target, weight)
-    elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
+    elif (
+        breadth > max(MIN_OFF_LINE_SIGMAS * noise, MIN_OFF_LINE_FRACTION * length)
+        or np.isfinite(value[:, 3:]).any()
+    ):
         similarity = fit_similarity(source, target, weights=weight)
     else:
         raise GeometryError(_too_few(len(target), 0, f", {_arrangement(length, breadth, noise)}"))
@@ -282,11 +287,13 @@ def _arrangement(length: float, breadth: float, noise: float) -> str:
     """Say how places that do not place the network lie, by their extents and standard deviation."""
     if length == 0:
         return "all the same"
-    if length > SURE * noise and breadth <= max(noise, FLAT * length):  # no broader than by their errors
+    if length > MIN_OFF_LINE_SIGMAS * noise and breadth <= max(
+        noise, MIN_OFF_LINE_FRACTION * length
+    ):  # no broader than by their errors
         return "on a line"
     return (
         f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
-        f"{SURE:g} in both directions"
+        f"{MIN_OFF_LINE_SIGMAS:g} in both directions"
     )
 
 

@@ -28,7 +28,7 @@ UNNAMED = -1
 # Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers
 # and the setting "fit to page" by mistake are apart from true scale once the ruler was checked.
 TAG_SIGMA = 0.002
-FAR = 4.0  # semi-axes of a target: what is nearer to its point is not another target
+MAX_SEMI_AXES = 4.0  # semi-axes of a target: what is nearer to its point is not another target
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
 
 
@@ -171,7 +171,12 @@ def match_uncoded(
             camera = estimate.cameras[photographs.camera[i]]
             projected = project(camera, estimate.position[i], estimate.rotation[i], known)
             named = _nearest(
-                found.xy, projected, found.code, naming.code[coded], tolerance_px, FAR * found.semi_axes[:, 0]
+                found.xy,
+                projected,
+                found.code,
+                naming.code[coded],
+                tolerance_px,
+                MAX_SEMI_AXES * found.semi_axes[:, 0],
             )
         point.append(named)
     free = [np.flatnonzero(named == UNNAMED) for named in point]

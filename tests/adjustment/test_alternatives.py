@@ -59,11 +59,11 @@ def test_thresholds_of_search_and_rounding() -> None:
     assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
     assert score.SMALLEST_LOG == -600.0  # a float ends at -745
     assert columns.SMALL_MOVE_PX == 0.01  # where distortion of 40 px is linear to 1e-4 of it
-    assert refit.SETTLED == 0.01  # of a gain of which 9 and more count
+    assert refit.LAST_GAIN == 0.01  # of a gain of which 9 and more count
     assert hypotheses.MAX_IMAGE_POINTS == 6_000 and hypotheses.MAX_PHOTOGRAPHS == 300  # tested in seconds
     assert hypotheses.MAX_CAUSES == 2
     assert pytest.approx(np.log(100)) == hypotheses.MIN_LEAD
-    assert hypotheses.NAMED == 1.0  # standard deviation: less is what a user was promised
+    assert hypotheses.MIN_NAMED_SIGMAS == 1.0  # standard deviation: less is what a user was promised
     assert [one.places for one in families.CAMERA_FAMILIES] == [(0,), (0, 1, 2, 3), tuple(range(9))]
     assert (columns.STRAIN, columns.BENDING) == (5, 18)  # 6 - 1 of a symmetric matrix, 3 times 6 products
 

@@ -13,7 +13,7 @@ from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import iterate, normals
 from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
-from sfm.adjustment.engine.normals import HALVED, Equations
+from sfm.adjustment.engine.normals import MIN_HALVED_POINTS, Equations
 from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
@@ -249,14 +249,14 @@ def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest
         monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)
         monkeypatch.setattr(choice, "MOSTLY", 1.0)
     network, truth = aerial("threads", 4, 14, 600, rays=40.0)
-    assert len(network.image_points) >= HALVED
+    assert len(network.image_points) >= MIN_HALVED_POINTS
     results = []
     for threads in (1, 2):
         with threadpool_limits(threads):
             a = run(network, truth)
         results.append(a.estimate.points.tobytes() + a.covariance.points.tobytes())
     assert results[0] == results[1]
-    monkeypatch.setattr(normals, "HALVED", len(network.image_points) + 1)
+    monkeypatch.setattr(normals, "MIN_HALVED_POINTS", len(network.image_points) + 1)
     whole = run(network, truth)  # the sums in another order
     assert np.abs(whole.estimate.points - a.estimate.points).max() < 1e-9 * HEIGHT
 

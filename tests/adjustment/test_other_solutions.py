@@ -116,7 +116,7 @@ def test_a_barrier_of_three_thousand_ends_the_search(
 
 def test_c_is_followed_from_a_fifth_to_the_fivefold() -> None:
     assert 4 < searched.STEP**searched.STEPS < 6
-    assert searched.STEPS == 6 and searched.MAX_ITERATIONS == 60 and searched.NEAR == 1e-3
+    assert searched.STEPS == 6 and searched.MAX_ITERATIONS == 60 and searched.FOLLOWING_TOLERANCE == 1e-3
 
 
 def test_each_c_is_tried_from_the_one_before_and_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:

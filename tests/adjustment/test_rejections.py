@@ -56,7 +56,7 @@ def with_rejected(a: Adjustment, xy: dict[int, FloatArray]) -> Adjustment:
 def test_thresholds_are_those_stated() -> None:
     assert rejections.MIN_EXCHANGED == 2  # once is an accident
     assert rejections.MIN_RAYS == 3  # two nearly meet along an epipolar line
-    assert rejections.PREDICTED == 2.0  # as large as that of the measurement
+    assert rejections.MAX_PREDICTION_RATIO == 2.0  # as large as that of the measurement
 
 
 def test_nothing_is_explained_where_nothing_was_rejected_or_known(clean: Adjustment) -> None:

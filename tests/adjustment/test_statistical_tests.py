@@ -36,8 +36,8 @@ def stub(**parts: Any) -> Any:
 def test_levels_are_the_usual_ones() -> None:
     assert statistics.ALPHA == 0.001 and statistics.POWER == 0.8  # Baarda
     assert statistics.GLOBAL_ALPHA == 0.05  # as in textbooks
-    assert statistics.STRONG == 0.9 and statistics.FAR_MORE == 2.0
-    assert numbers.UNCONTROLLED == 1e-6  # the rounding of normal equations is 1e-8
+    assert statistics.MIN_REPORTED_CORRELATION == 0.9 and statistics.MIN_EXCESS_RATIO == 2.0
+    assert numbers.MIN_CHECKED_REDUNDANCY == 1e-6  # the rounding of normal equations is 1e-8
 
 
 def test_far_more_than_expected_is_twice_and_not_by_chance() -> None:

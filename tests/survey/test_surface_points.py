@@ -174,7 +174,7 @@ def test_a_photograph_has_as_many_points_as_the_survey_says(tmp_path: Path) -> N
 def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surface_points, "TRIED", (Windows(9),))
+    monkeypatch.setattr(surface_points, "TRIED_WINDOWS", (Windows(9),))
     monkeypatch.setattr(surface_points, "TRIAL_RAYS", 10)
     for more, side in (("", 9), (HELD, 15)):
         assert all((one.semi_axes == side / 2).all() for one in covered(tmp_path, more).overlays)

@@ -18,7 +18,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.kernels.options import compiled, inlined, kernel
 
 SINGULAR_PIVOT = 1e-13  # share of the normal equation of a point left below which its rays are parallel
-STIFF = 1e10  # factor on the pivot that fixes such a direction of a point
+STIFFENING = 1e10  # factor on the pivot that fixes such a direction of a point
 RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
 
 
@@ -296,7 +296,7 @@ def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
             L[j, p, p] = np.sqrt(pivot)
         else:
             held += 1
-            L[j, p, p] = STIFF * np.sqrt(V[j, p, p]) if V[j, p, p] > 0.0 else STIFF
+            L[j, p, p] = STIFFENING * np.sqrt(V[j, p, p]) if V[j, p, p] > 0.0 else STIFFENING
         for s in range(p + 1, 3):
             total = V[j, s, p]
             for q in range(p):

@@ -25,7 +25,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.options import kernel
 from sfm.observations.pose import exterior_jacobian
 
-ZERO = 1e-9  # variance over its limiting value below which a coordinate is one that the datum fixes
+# Variance over its limiting value below which a coordinate is one that the datum fixes.
+MAX_FIXED_VARIANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,9 @@ def marginal_covariance(
     H, P = optimum.motions.reduced, optimum.motions.points
     F, G = cofactors.F_reduced, cofactors.G
     points = _in_datum(cofactors.points, P, cofactors.F_points, G)
-    fixed = np.diagonal(points, axis1=1, axis2=2) <= ZERO * np.diagonal(cofactors.limiting, axis1=1, axis2=2)
+    fixed = np.diagonal(points, axis1=1, axis2=2) <= MAX_FIXED_VARIANCE * np.diagonal(
+        cofactors.limiting, axis1=1, axis2=2
+    )
     points[fixed] = 0.0
     np.swapaxes(points, 1, 2)[fixed] = 0.0
     first = layout.pose_free.size

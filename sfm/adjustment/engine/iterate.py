@@ -38,16 +38,17 @@ from sfm.runtime.memory import keep_freed_memory
 TOLERANCE = 1e-6
 MIN_SHIFT = 1e-6
 ARMIJO = 1e-4  # share of the predicted decrease that a step must bring (Nocedal and Wright, sec. 3.1)
-SHORTEST = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
-BENT = 0.25  # share of a Gauss-Newton step below which a valley is bent
+MIN_STEP_SHARE = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
+BENT_STEP_SHARE = 0.25  # share of a Gauss-Newton step below which a valley is bent
 CORRECTIONS = 3  # steps back to its bottom
 START_DAMPING = 1e-3  # share of the diagonal
-NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
+UNDAMPED_TOLERANCE = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
 ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
-FAR = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
-SIMPLIFIED = 0.8  # |A dx| / |v| of a step below which its reduced matrix may show that the next is the last
-COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
+FAR_TOLERANCE = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
+# |A dx| / |v| of a step below which its reduced matrix may show that the next is the last.
+SIMPLIFIED_TOLERANCE = 0.8
+SINGLE_TOLERANCE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
@@ -149,7 +150,7 @@ def iterate(
     share = 1.0
     before: tuple[State, Move] | None = None
     limit = np.inf
-    shortest = 1.0 if method == "undamped" else SHORTEST
+    shortest = 1.0 if method == "undamped" else MIN_STEP_SHARE
     last: Factor | None = None
     while True:
         found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
@@ -162,7 +163,7 @@ def iterate(
             start, tried = before
             whole = share == 1.0
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
-            if whole and better is not None and better[1] < BENT:
+            if whole and better is not None and better[1] < BENT_STEP_SHARE:
                 better = _along_valley(problem, start, weight, tried, better[1]) or better
             if better is None:  # no share of the last step leads where they can be solved
                 state, found = start, _solve(problem, start, weight)
@@ -173,11 +174,11 @@ def iterate(
         if found.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
-        single = single and not found.within(FAR)
+        single = single and not found.within(FAR_TOLERANCE)
         before, share = (state, found.move()), 1.0
         state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
         limit = _most_allowed(before[1], share, shortest)
-        last = None if exact or not found.within(SIMPLIFIED) else found.factor
+        last = None if exact or not found.within(SIMPLIFIED_TOLERANCE) else found.factor
         del found  # its memory is needed for the next
     if found is None:
         _refuse(problem, state)
@@ -246,7 +247,7 @@ def _solve(
         if factored is None:
             continue
         found = _step(p, equations, factored, motions)
-        if not (coarse and found.within(COARSE)):
+        if not (coarse and found.within(SINGLE_TOLERANCE)):
             return found
     return None
 
@@ -275,7 +276,7 @@ def _approach(
         gain = -1.0
         if found is not None:
             start_vPv = found.equations.vPv if start_vPv is None else start_vPv
-            if found.within(NEAR):
+            if found.within(UNDAMPED_TOLERANCE):
                 return state, taken, start_vPv
             moved = step(problem.layout, state, found.reduced, found.points)
             gain = (found.equations.vPv - total(problem, moved, weight)) / found.predicted
@@ -336,7 +337,7 @@ def _along_valley(
         straight: share of it that can be taken straight.
     """
     along, share = found.reduced, float(np.sqrt(straight))
-    allowed, height = _most_allowed(found, share, SHORTEST), np.inf
+    allowed, height = _most_allowed(found, share, MIN_STEP_SHARE), np.inf
     moved = step(problem.layout, start, share * found.reduced, share * found.points)
     for _ in range(CORRECTIONS):
         back = _solve(problem, moved, weight)

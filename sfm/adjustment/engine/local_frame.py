@@ -20,8 +20,9 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, Network
 
-FAR = 1000.0  # extents of the network from the origin at which an axis is reduced: three digits are lost
-MANY = 5000  # points from which their order matters; fewer stay in the cache
+# Extents of the network from the origin at which an axis is reduced: three digits are lost.
+MAX_EXTENTS = 1000.0
+MIN_SORTED_POINTS = 5000  # points from which their order matters; fewer stay in the cache
 LEVELS = 10  # of the curve: each axis is cut into 2^10 parts
 
 
@@ -64,7 +65,7 @@ def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Loca
     if centroid.any():
         local, start = shifted(network, estimate, -centroid)
     order = None
-    if len(network.points) >= MANY:
+    if len(network.points) >= MIN_SORTED_POINTS:
         order = along_curve(start.points)
         local, start, datum = _renumbered(local, start, datum, order)
     return Local(local, start, datum, network, centroid, order)
@@ -120,12 +121,12 @@ def centroid_of(network: Network, estimate: Estimate) -> FloatArray:
     if len(known) == 0:
         return np.zeros(3)
     low, high = known.min(axis=0), known.max(axis=0)
-    if max(high.max(), -low.min()) <= FAR * (high - low).max() / 2:  # the extent is at least that
+    if max(high.max(), -low.min()) <= MAX_EXTENTS * (high - low).max() / 2:  # the extent is at least that
         return np.zeros(3)
     centre = np.median(known, axis=0)
     extent = np.abs(known - centre).max()
     # Far from the origin x - c is exact for all x between c / 2 and 2 c (Sterbenz), so is giving it back.
-    return np.where(np.abs(centre) > FAR * extent, centre, 0.0)
+    return np.where(np.abs(centre) > MAX_EXTENTS * extent, centre, 0.0)
 
 
 def shifted(network: Network, estimate: Estimate, by: FloatArray) -> tuple[Network, Estimate]:

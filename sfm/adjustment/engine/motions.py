@@ -27,7 +27,7 @@ from sfm.kernels.options import kernel
 
 TINY = float(np.finfo(float).tiny)
 SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 but for rounding
-DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
+MIN_EFFECT = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def motions_of(
     if len(seen):
         # U would have a column for every row, of which control alone brings three a point
         _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
-        rank = int((singular > DETERMINED * max(1.0, singular[0])).sum())
+        rank = int((singular > MIN_EFFECT * max(1.0, singular[0])).sum())
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
@@ -197,7 +197,7 @@ def _regular_inverse(BH: FloatArray) -> FloatArray:
         inverse = np.asarray(np.linalg.inv(BH))
     except np.linalg.LinAlgError:
         inverse = np.full_like(BH, np.inf)
-    if not np.linalg.norm(BH) * np.linalg.norm(inverse) * DETERMINED < 1.0:
+    if not np.linalg.norm(BH) * np.linalg.norm(inverse) * MIN_EFFECT < 1.0:
         raise GeometryError("datum: the datum points cannot fix position, attitude and scale of the network")
     return inverse
 

@@ -38,7 +38,7 @@ from sfm.kernels.threads import at_once
 
 # Image points from which two halves of the photographs are summed by themselves; another thread takes 0.1 ms
 # to start and saves 0.07 microseconds for each.
-HALVED = 8_000
+MIN_HALVED_POINTS = 8_000
 SUMMED = ("D", "gi", "V", "gp", "Y_interior")  # parts of `Sums` that both halves add to
 
 
@@ -220,7 +220,7 @@ def new_space(layout: Unknowns) -> Space:
     )
     U, g = (np.empty((m, 6, 6)), np.empty((m, 6))) if layout.rigged else (b.U, b.g)
     sums = Sums(0, m, U, g, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
-    if k < HALVED:
+    if k < MIN_HALVED_POINTS:
         return Space(b, (sums,))
     separate = {name: np.zeros_like(getattr(sums, name)) for name in SUMMED}
     middle = int(np.searchsorted(first, k // 2))

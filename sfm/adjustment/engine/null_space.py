@@ -25,8 +25,10 @@ from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
 MIN_CARRIERS = 3  # points that fix position, attitude and scale
-LEADING = 0.1  # share of the largest component of a null vector from which it leaves a parameter open
-MOVED = 1e-6  # |A dx| of the points that carry the datum from which a null vector of length 1 moves them
+# Share of the largest component of a null vector from which it leaves a parameter open.
+MIN_LEADING_SHARE = 0.1
+# |A dx| of the points that carry the datum from which a null vector of length 1 moves them.
+MIN_DATUM_EFFECT = 1e-6
 
 
 def on_sound_points(datum: ResolvedDatum, held: IntArray) -> ResolvedDatum:
@@ -45,7 +47,7 @@ def on_sound_points(datum: ResolvedDatum, held: IntArray) -> ResolvedDatum:
 def leading(vectors: FloatArray) -> BoolArray:
     """Return the unknowns that each null vector leaves open, (reduced, e), of scaled ones (reduced, e)."""
     size = np.abs(vectors)
-    return np.asarray(size >= LEADING * size.max(axis=0, keepdims=True, initial=0.0))
+    return np.asarray(size >= MIN_LEADING_SHARE * size.max(axis=0, keepdims=True, initial=0.0))
 
 
 def with_further(
@@ -75,7 +77,7 @@ def with_further(
     N, moved = motions.transform(N, _moved_points(N, equations, layout))
     whitened = np.swapaxes(blocks.L[on], 1, 2) @ moved[on]
     _, singular, Vt = np.linalg.svd(np.linalg.qr(whitened.reshape(3 * len(whitened), N.shape[1]), mode="r"))
-    carried = int((singular > MOVED).sum())
+    carried = int((singular > MIN_DATUM_EFFECT).sum())
     N, moved = N @ Vt.T, moved @ Vt.T
     on_points, on_reduced = np.zeros_like(moved), np.zeros_like(N)
     on_points[on, :, :carried] = moved[on, :, :carried]

@@ -55,7 +55,8 @@ OF_FREE_POINTS = (  # which given points make untrue
     *("assumptions_untested", "photographs_untested"),
     *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
 )
-NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
+# Standard deviations by which coordinates shift, below which a cause is of no consequence.
+MIN_NAMED_SIGMAS = 1.0
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
         numpy.linalg.LinAlgError: the network is not determined.
     """
     cause = _best(final, ())
-    if cause is None or cause.alternative.family.name == "bending" or cause.refit.shift < NAMED:
+    if cause is None or cause.alternative.family.name == "bending" or cause.refit.shift < MIN_NAMED_SIGMAS:
         return None
     return cause
 
@@ -220,7 +221,9 @@ def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cau
         if found is None:
             break
         causes = _still_needed(plain, causes, found)
-    return tuple(one for one in causes if not one.refit.shift < NAMED)  # one not known is as bad as can be
+    return tuple(
+        one for one in causes if not one.refit.shift < MIN_NAMED_SIGMAS
+    )  # one not known is as bad as can be
 
 
 def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArray] = ()) -> Cause | None:

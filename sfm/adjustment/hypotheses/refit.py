@@ -24,7 +24,7 @@ from sfm.similarity import fit_similarity
 ROUNDS = 6
 HALVINGS = 4  # of a step: linear in what a large error makes of the image points, it may go too far
 MAX_ITERATIONS = 15  # of an adjustment that starts next to its optimum; half of those that converge need 3
-SETTLED = 0.01  # gain of v'Pv over the variance factor at which the rounds end
+LAST_GAIN = 0.01  # gain of v'Pv over the variance factor at which the rounds end
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def refit(
         except np.linalg.LinAlgError:
             return None
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
-        if gain.value < SETTLED or number == ROUNDS - 1:
+        if gain.value < LAST_GAIN or number == ROUNDS - 1:
             break
         step = gain.beta
         beta = beta + step
@@ -103,7 +103,7 @@ def _stepped(
             found = None
         if found is not None and found.converged:
             found = replace(found, error_correlation=plain.error_correlation)  # as far as is known
-            if log_likelihood(found) > log_likelihood(start) - SETTLED:
+            if log_likelihood(found) > log_likelihood(start) - LAST_GAIN:
                 return found, beta + step
             best = best or (found, beta + step)
         step = step / 2

@@ -26,7 +26,8 @@ from sfm.remarks.remark import Remark, remark
 
 MIN_EXCHANGED = 2  # photographs in which two names are exchanged, from which it is a rule and no accident
 MIN_RAYS = 3  # that meet at a second place; two nearly meet wherever they are along an epipolar line
-PREDICTED = 2.0  # variance of a prediction and its measurement over that of the measurement, at most
+# Variance of a prediction and its measurement over that of the measurement, at most.
+MAX_PREDICTION_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def _other_points(a: Adjustment) -> dict[int, int]:
     """Return the rejected image points that lie where another point is seen, with that point."""
     network, estimate, seen = a.network, a.estimate, a.network.image_points
     rejected = np.flatnonzero(a.rejected)
-    tolerance = float(np.sqrt(PREDICTED * chi2_isf(ALPHA, 2))) * a.sigma0_px
+    tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(ALPHA, 2))) * a.sigma0_px
     found: dict[int, int] = {}
     for i, rows in enumerate(rows_of(seen.image[rejected], len(network.images))):
         if not len(rows):

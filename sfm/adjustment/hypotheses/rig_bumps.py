@@ -25,7 +25,7 @@ from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
 
 FALSE_ALARM = 0.01  # probability that a rig without a bump is reported to have one
-FREE = 1e-9  # redundancy of a separate pose below which nothing checks it
+MIN_REDUNDANCY = 1e-9  # redundancy of a separate pose below which nothing checks it
 
 
 @dataclass(frozen=True)
@@ -146,6 +146,6 @@ def _gain(s: FloatArray, G: FloatArray, k: int, taken: list[int]) -> tuple[float
         M, t = M - across @ solved[:, :6], t - across @ solved[:, 6]
     scale = np.sqrt(np.maximum(np.diagonal(G[k][:, k]), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-    on = values > FREE
+    on = values > MIN_REDUNDANCY
     part = vectors[:, on].T @ (t / scale)
     return float((part**2 / values[on]).sum()), -(vectors[:, on] @ (part / values[on])) / scale

@@ -30,7 +30,8 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
 from sfm.network import rows_of
 
-DETERMINED = 1e-5  # of the squares of combined columns that photographs, cameras and points must leave
+# Of the squares of combined columns that photographs, cameras and points must leave.
+MIN_DETERMINED_SHARE = 1e-5
 ROUNDING = float(np.sqrt(np.finfo(float).eps))  # of the squares of a column alone that rounding may leave
 SMALLEST_LOG = -600.0  # of a probability that `f_sf` still gives
 MAX_TERMS = 10_000  # of the series beyond it
@@ -337,10 +338,10 @@ def least_share(columns: int) -> float:
     Of several columns a direction below it is left out, as the step along it is larger than what is linear.
     One column alone has no other direction, as x0 has none where P1 and a rotation take most of it.
     """
-    return DETERMINED if columns > 1 else ROUNDING
+    return MIN_DETERMINED_SHARE if columns > 1 else ROUNDING
 
 
-def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = DETERMINED) -> Gain:
+def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MIN_DETERMINED_SHARE) -> Gain:
     """Return the gain of columns with normal equations H, g and squares before the elimination.
 
     Args:
@@ -364,7 +365,7 @@ def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
         squares: of the columns before the elimination, (q,).
     """
     values, vectors, scale = directions_of(H, squares)
-    good = values > DETERMINED
+    good = values > MIN_DETERMINED_SHARE
     half = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
     return np.asarray(half @ half.T)
 
@@ -378,7 +379,7 @@ def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatAr
         squares: of the columns before the elimination, (n, q).
     """
     values, vectors, scale = directions_of(H, squares)
-    good = values > DETERMINED
+    good = values > MIN_DETERMINED_SHARE
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
     gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
     return np.asarray(gains), np.asarray(good.sum(axis=1))

@@ -32,7 +32,14 @@ from sfm.adjustment.hypotheses.families import (
     InteriorFamily,
 )
 from sfm.adjustment.hypotheses.patterns import MIN_GROUP, too_many_cameras
-from sfm.adjustment.hypotheses.score import DETERMINED, NONE, Gain, Reduced, directions_of, reduce_adjustment
+from sfm.adjustment.hypotheses.score import (
+    MIN_DETERMINED_SHARE,
+    NONE,
+    Gain,
+    Reduced,
+    directions_of,
+    reduce_adjustment,
+)
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
@@ -127,11 +134,11 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     D = reduced.whiten(one.columns(a, columns))
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
-    rank = max(int((values > DETERMINED).sum()), 1)
+    rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, rows)
     least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # noncentrality that is found
-    longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
+    longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, MIN_DETERMINED_SHARE))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)

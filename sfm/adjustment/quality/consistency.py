@@ -31,10 +31,11 @@ from sfm.conventions import IntArray
 from sfm.distributions import chi2_isf, chi2_sf
 
 CHANCE = 1e-3  # of so much larger a misfit where the other explanation is the true one
-MOVED = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
+MOVED_SIGMAS = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
-UNEVEN = 1.5  # largest component of a photograph over their median, below which a difference is of no use
+# Largest component of a photograph over their median, below which a difference is of no use.
+MIN_UNEVEN_RATIO = 1.5
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def _uneven(photographs: VarianceComponents) -> Uneven | None:
     probability = float(chi2_sf(statistic, g - 1))
     sigma = np.sqrt(s2)
     worst, median = int(np.argmax(sigma)), float(np.median(sigma))
-    if probability > FAMILY or sigma[worst] < UNEVEN * median:
+    if probability > FAMILY or sigma[worst] < MIN_UNEVEN_RATIO * median:
         return None
     name = photographs.names[int(np.flatnonzero(known)[worst])]
     return Uneven(probability, name, float(sigma[worst]), median)
@@ -136,7 +137,7 @@ def doubtful_points(
             for s in range(len(kept))
         ]
         other, r, instead = min(others)
-        if other - left < limit and _moved(parts, kept, np.append(kept[kept != instead], r)) > MOVED:
+        if other - left < limit and _moved(parts, kept, np.append(kept[kept != instead], r)) > MOVED_SIGMAS:
             names = images[seen.image[r]], images[seen.image[instead]]
             found.append(DoubtfulPoint(adjustment.network.points[j], *names, left, other))
     return tuple(sorted(found, key=lambda one: one.other - one.misfit))

@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.engine.unknowns import interior_names
-from sfm.adjustment.quality.statistics import STRONG
+from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.display import counted
@@ -65,7 +65,7 @@ def exterior_correlations(adjustment: Adjustment) -> ExteriorCorrelations:
 
 
 def orientation_correlations(
-    adjustment: Adjustment, *, limit: float = STRONG
+    adjustment: Adjustment, *, limit: float = MIN_REPORTED_CORRELATION
 ) -> tuple[OrientationCorrelation, ...]:
     """Return the camera parameters correlated with exterior orientation beyond a limit, strongest first.
 
@@ -80,7 +80,7 @@ def orientation_correlations(
 
 
 def strong_correlations(
-    correlations: ExteriorCorrelations, *, limit: float = STRONG
+    correlations: ExteriorCorrelations, *, limit: float = MIN_REPORTED_CORRELATION
 ) -> tuple[OrientationCorrelation, ...]:
     """Return the camera parameters with a correlation beyond a limit, strongest first.
 

@@ -36,12 +36,12 @@ STEPS = 6  # in each direction: c from a fifth to the fivefold
 ALPHA = 0.001  # chance of so much larger a v'Pv where the other solution is the true one
 STATED_FREEDOM = 10  # observations that the stated weights count as in the estimate of the variance
 WEAK_C = 5e-4  # relative standard deviation of c below which a network is not weak, and
-FEW_PHOTOGRAPHS = 5  # from so many photographs on
-LARGE = 4000  # image points from which on a network is not weak
+MIN_STRONG_PHOTOGRAPHS = 5  # from so many photographs on
+MIN_STRONG_IMAGE_POINTS = 4000  # image points from which on a network is not weak
 BARRIER = 3e3  # times v'Pv of the result: what lies beyond is not looked for
 MIN_APART_SIGMAS = 1.0  # root mean square between solutions that are not the same
 MAX_ITERATIONS = 60  # from planes, whose relief is to be found, some fifty
-NEAR = 1e-3  # |A dx| / |v| at which the network is followed to the next c
+FOLLOWING_TOLERANCE = 1e-3  # |A dx| / |v| at which the network is followed to the next c
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,12 @@ def other_solutions(
         None of them where the network is strong, the result did not converge, or nothing is redundant.
     """
     a = adjustment
-    if not a.converged or a.redundancy < 1 or len(a.network.image_points) > LARGE or not _weak(a):
+    if (
+        not a.converged
+        or a.redundancy < 1
+        or len(a.network.image_points) > MIN_STRONG_IMAGE_POINTS
+        or not _weak(a)
+    ):
         return ()
     alone = replace(a.network, image_points=a.network.image_points.select(~a.rejected))
     search = _Search(alone, Datum(a.datum, a.datum_points), a.image_sigma_factor[~a.rejected])
@@ -115,7 +120,7 @@ def _allowed(base: Adjustment) -> float:
 
 def _weak(a: Adjustment) -> bool:
     """Return whether there are few photographs, or a principal distance is not well determined."""
-    if len(a.network.images) < FEW_PHOTOGRAPHS:
+    if len(a.network.images) < MIN_STRONG_PHOTOGRAPHS:
         return True
     for number in set(a.network.camera.tolist()):
         camera = a.estimate.cameras[number]
@@ -154,7 +159,9 @@ class _Search:
     datum: Datum
     factor: FloatArray  # on the standard deviations of the image points, (k,)
 
-    def adjusted(self, start: Estimate, *, held: bool = False, tolerance: float = NEAR) -> Adjustment | None:
+    def adjusted(
+        self, start: Estimate, *, held: bool = False, tolerance: float = FOLLOWING_TOLERANCE
+    ) -> Adjustment | None:
         """Return the adjustment, with c free or held; None where it has no solution.
 
         By Gauss-Newton, which in the bent valleys of weak networks takes a few steps where damping takes

@@ -56,7 +56,7 @@ class PointNormals:
 
 
 MAX_STEPS = 10  # of an intersection that begins at the adjusted point
-SETTLED = 1e-3  # standard deviations
+LAST_STEP_SIGMAS = 1e-3  # standard deviations
 
 
 def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, FloatArray, float]:
@@ -79,7 +79,7 @@ def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, Flo
             return X, np.full((3, 3), np.nan), np.inf
         Q = np.linalg.pinv(parts.N.sum(axis=0))
         step = -Q @ parts.b.sum(axis=0)
-        if step @ parts.N.sum(axis=0) @ step < SETTLED**2:
+        if step @ parts.N.sum(axis=0) @ step < LAST_STEP_SIGMAS**2:
             break
         X = X + step
         alone = replace(alone, residuals=_residuals(alone, X), estimate=_moved(alone.estimate, j, X))

@@ -48,7 +48,7 @@ def standardised_residuals(
     Pv = np.einsum("kab,kb->ka", Ft @ F, residuals)
     PQP = residual_weights(complement, whitening)
     P = np.diagonal(Ft @ F, axis1=1, axis2=2)
-    controlled = PQP > UNCONTROLLED * P
+    controlled = PQP > MIN_CHECKED_REDUNDANCY * P
     return np.where(controlled, Pv / np.sqrt(np.where(controlled, PQP, 1.0)), 0.0)
 
 
@@ -64,7 +64,7 @@ def residual_weights(complement: FloatArray, whitening: FloatArray) -> FloatArra
         return np.diagonal(np.swapaxes(F, 1, 2) @ complement @ F, axis1=1, axis2=2).copy()
 
 
-UNCONTROLLED = 1e-6  # redundancy number below which an observation has no check
+MIN_CHECKED_REDUNDANCY = 1e-6  # redundancy number below which an observation has no check
 
 
 def standardised_of_given(
@@ -83,7 +83,7 @@ def standardised_of_given(
     P = np.diagonal(weight, axis1=1, axis2=2)
     r = np.where(P > 0, 1 - np.diagonal(cofactor @ weight, axis1=1, axis2=2), np.nan)
     Pv = np.einsum("nab,nb->na", weight, difference)
-    checked = PQP > UNCONTROLLED * P
+    checked = PQP > MIN_CHECKED_REDUNDANCY * P
     return np.where(checked, Pv / np.sqrt(np.where(checked, PQP, 1.0)), np.nan), np.clip(r, 0.0, 1.0)
 
 

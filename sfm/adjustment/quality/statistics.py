@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from sfm.adjustment.quality.reliability import UNCONTROLLED, tau_critical
+from sfm.adjustment.quality.reliability import MIN_CHECKED_REDUNDANCY, tau_critical
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.arguments import checked_arguments
@@ -25,10 +25,10 @@ from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, 
 from sfm.errors import GeometryError
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
-FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
+MIN_EXCESS_RATIO = 2.0  # coordinates beyond the critical value over those expected by chance
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
-STRONG = 0.9  # correlation from which two parameters are reported
+MIN_REPORTED_CORRELATION = 0.9  # correlation from which two parameters are reported
 Untested = Literal["redundancy", "reweighted"]  # too small; the weights come from the residuals
 
 
@@ -62,9 +62,10 @@ class CoordinateTest:
 
     @property
     def far_more(self) -> bool:
-        """Whether far more are beyond it: more than FAR_MORE times as many, by chance once in 1 / ALPHA."""
+        """Whether far more are beyond it: MIN_EXCESS_RATIO times as many, by chance once in 1 / ALPHA."""
         return bool(
-            self.beyond > FAR_MORE * self.expected and poisson_sf(self.beyond - 1, self.expected) < ALPHA
+            self.beyond > MIN_EXCESS_RATIO * self.expected
+            and poisson_sf(self.beyond - 1, self.expected) < ALPHA
         )
 
 
@@ -197,7 +198,7 @@ def _coordinate_test(
             f"test of image coordinates: alpha is {alpha:g}, expected more than 0 and below 1"
         )
     r = adjustment.redundancy_numbers
-    checked = np.isfinite(r) & (r > UNCONTROLLED)
+    checked = np.isfinite(r) & (r > MIN_CHECKED_REDUNDANCY)
     shown = np.where(np.isfinite(r), statistic, np.nan)
     beyond = int((np.abs(shown[checked]) > critical).sum())
     return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
@@ -245,7 +246,7 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     P = np.diagonal(np.linalg.inv(adjustment.image_covariance), axis1=1, axis2=2)
     C = adjustment.residual_weights
     unknown = np.isnan(C)
-    controlled = np.nan_to_num(C) > UNCONTROLLED * P
+    controlled = np.nan_to_num(C) > MIN_CHECKED_REDUNDANCY * P
     safe = np.where(controlled, C, 1.0)
 
     def where(values: FloatArray) -> FloatArray:
@@ -281,7 +282,9 @@ def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tupl
     return tuple(tests.values())
 
 
-def correlations(adjustment: Adjustment, *, limit: float = STRONG) -> tuple[Correlation, ...]:
+def correlations(
+    adjustment: Adjustment, *, limit: float = MIN_REPORTED_CORRELATION
+) -> tuple[Correlation, ...]:
     """Return the pairs of parameters of one camera, or of one photograph, correlated beyond a limit.
 
     Args:

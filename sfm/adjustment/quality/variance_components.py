@@ -19,10 +19,11 @@ from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
-SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
-SETTLED_PARTS = 0.01  # the same of the covariance of two parts, and change of the share of one
+LAST_CHANGE = 1e-3  # relative change of a variance component at which its estimation ends
+LAST_CHANGE_OF_PARTS = 0.01  # the same of the covariance of two parts, and change of the share of one
 MAX_ROUNDS = 20
-FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
+# Redundancy of a group of image points below which its variance component is not estimated.
+MIN_REDUNDANCY = 1.0
 IMAGE_POINTS = "image points"
 INTERIOR = "interior orientation"
 FEW_OF_A_KIND = 0.1  # the same of a kind, of which a few scale bars may be all there is
@@ -51,7 +52,7 @@ def variance_components(
         names: names of the groups, g of them.
     """
     covariance = adjustment.network.image_points.covariance
-    return _components(adjustment, covariance, group, names, few=FEW)
+    return _components(adjustment, covariance, group, names, few=MIN_REDUNDANCY)
 
 
 def _components(
@@ -147,10 +148,10 @@ def estimate_components(
     least = np.array([least_factor(float(np.median(stated[group == g]))) for g in range(len(names))])
     tried, rejected = [factor], [adjustment.rejected]
     for _ in range(MAX_ROUNDS):
-        found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
+        found = _components(adjustment, adjustment.image_covariance, group, names, few=MIN_REDUNDANCY).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
         found = np.maximum(found, least / factor)
-        if np.abs(found - 1).max() <= SETTLED:
+        if np.abs(found - 1).max() <= LAST_CHANGE:
             at_least = (factor <= least).any() and adjustment.sigma0 < 1
             return _as_weighted(adjustment) if at_least else adjustment, factor, True
         factor = factor * found
@@ -202,7 +203,7 @@ def estimate_common_part(
         before, squares = squares, _not_negative(S, found)
         change = np.sqrt(_median_trace(squares, parts) / _median_trace(before, parts)) - 1
         share = squares[1] / _median_trace(squares, parts) - before[1] / _median_trace(before, parts)
-        if max(abs(change), abs(share)) <= SETTLED_PARTS:
+        if max(abs(change), abs(share)) <= LAST_CHANGE_OF_PARTS:
             break
     factor, common = np.sqrt(squares).tolist()
     return factor, max(common, MIN_SIGMA_PX)
@@ -240,6 +241,6 @@ def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: Flo
     """
     for at in reversed(range(len(tried))):
         others = any(not np.array_equal(rejected[at], one) for one in rejected[at + 1 :])
-        if others and np.abs(factor / tried[at] - 1).max() <= SETTLED:
+        if others and np.abs(factor / tried[at] - 1).max() <= LAST_CHANGE:
             return at
     return None

@@ -20,7 +20,7 @@ COUNT = 300  # stations that the designer chooses from, each upright and rolled
 DISTANCES = (0.75, 1.25)  # of that at which the object fills the photograph, if nothing is said
 AIMS = 8  # parts of the object that a station may look at, besides its middle
 TRIES = 60  # positions tried for each that is wanted, until it is said that there is no room
-FEWEST = 4  # points that a candidate must show
+MIN_POINTS = 4  # points that a candidate must show
 BASES = (2, 3, 5)
 
 
@@ -81,17 +81,17 @@ def candidates(
         inside += 1
         faced = (planned.normals * -away).sum(axis=1) > 0
         faced |= np.isnan(planned.normals[:, 0])
-        if faced.sum() < FEWEST:
+        if faced.sum() < MIN_POINTS:
             continue
         near = planned.size / nearest > sees_all  # the object does not fit in a photograph from here
         aimed_at = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
         ways = np.array([looking(aim - place) for aim in aimed_at])
         shown = sight_of(planned, camera, np.tile(place, (len(ways), 1)), ways, seeing).seen.sum(axis=1)
         best = int(np.argmax(shown))
-        if shown[best] < FEWEST:
+        if shown[best] < MIN_POINTS:
             continue
         if near and counted % 2:  # half of them look elsewhere, so that neighbours overlap in several ways
-            others = np.flatnonzero(shown >= max(FEWEST, shown[best] / 2))
+            others = np.flatnonzero(shown >= max(MIN_POINTS, shown[best] / 2))
             best = int(others[counted // 2 % len(others)])
         position.append(place)
         rotation.append(ways[best])
@@ -143,7 +143,7 @@ def _no_room(planned: PlannedObject, least: float, most: float, inside: int) -> 
             "another distance or space"
         )
     return (
-        f"plan: of {inside} places that are allowed fewer than 2 show {FEWEST} points; the object faces "
+        f"plan: of {inside} places that are allowed fewer than 2 show {MIN_POINTS} points; the object faces "
         "away, or is too far, too oblique or not sharp from there"
     )
 

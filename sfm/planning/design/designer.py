@@ -30,10 +30,10 @@ from sfm.planning.wanted import MIN_RAYS, Wanted, short_of
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
 
-FEWEST = 4  # photographs of a network whose gross errors can be found
+MIN_PHOTOGRAPHS = 4  # photographs of a network whose gross errors can be found
 MAX_PHOTOGRAPHS = 100
 SWEEPS = 3  # exchanges of all stations at most
-BETTER = 1e-3  # relative decrease of the cost from which an exchange is one
+MIN_DECREASE = 1e-3  # relative decrease of the cost from which an exchange is one
 MAX_RATIO = 25.0  # of the full over the limiting variance of a point that is believed
 NO_BETTER = 0.98  # of the shortfall: a round of additions that leaves more than this gains nothing
 ROUNDS = 6  # of additions and exchanges at most
@@ -82,9 +82,9 @@ def design_network(
 
     Source: Fedorov (1972), Theory of Optimal Experiments; Fraser (1984).
     """
-    if max_photographs < FEWEST:
+    if max_photographs < MIN_PHOTOGRAPHS:
         raise GeometryError(
-            f"plan: at most {counted(max_photographs, 'photograph')}, needed {FEWEST} or more"
+            f"plan: at most {counted(max_photographs, 'photograph')}, needed {MIN_PHOTOGRAPHS} or more"
         )
     found = candidates(planned, camera, allowed, seeing, count=count)
     return _Designer(planned, camera, seeing, wanted, found, max_photographs, bars, given).run()
@@ -115,7 +115,7 @@ class _Designer:
 
     def run(self) -> Design:
         chosen: list[int] = []
-        while len(chosen) < min(FEWEST, self.most):
+        while len(chosen) < min(MIN_PHOTOGRAPHS, self.most):
             chosen.append(self._next(chosen))
         short = self._full(chosen)[1]
         for _ in range(ROUNDS):
@@ -202,7 +202,7 @@ class _Designer:
                 rest = tried[:k] + tried[k + 1 :]
                 new = [*rest, self._next(rest)]
                 new_cost = self._cost(new)
-                if new_cost < (1 - BETTER) * cost:
+                if new_cost < (1 - MIN_DECREASE) * cost:
                     tried, cost = [*tried[:k], new[-1], *tried[k + 1 :]], new_cost
             if tried == chosen:
                 break
@@ -221,7 +221,7 @@ class _Designer:
         self, chosen: list[int], prediction: Prediction, short: float
     ) -> tuple[list[int], Prediction, float]:
         """Return the choice without those photographs that what is wanted does not need."""
-        while len(chosen) > FEWEST:
+        while len(chosen) > MIN_PHOTOGRAPHS:
             order = np.argsort([self._cost(chosen[:k] + chosen[k + 1 :]) for k in range(len(chosen))])
             for k in order[:3]:
                 fewer = chosen[: int(k)] + chosen[int(k) + 1 :]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.reliability import UNCONTROLLED
+from sfm.adjustment.quality.reliability import MIN_CHECKED_REDUNDANCY
 from sfm.adjustment.result import Adjustment
 from sfm.camera import base_name
 from sfm.conventions import FloatArray
@@ -141,7 +141,7 @@ def _names(network: Network) -> Iterator[tuple[str, str]]:
 
 def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
     """Return the size that an error would have, v / r, NaN where nothing checks it, px, (k, 2)."""
-    checked = r > UNCONTROLLED
+    checked = r > MIN_CHECKED_REDUNDANCY
     return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 
 

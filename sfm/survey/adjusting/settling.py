@@ -45,7 +45,7 @@ MANY_ITERATIONS = 300  # from nearer ones, where it has not converged: along a f
 HELD_ONE_AFTER_ANOTHER = ((), (Role.X0, Role.Y0), (Role.X0, Role.Y0, Role.FOCAL))
 CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
 DAMPED_ITERATIONS, UNDAMPED_ITERATIONS = 50, 300  # with the cameras held, where a step is cheap
-NEAR = 1e-3  # |A dx| / |v| that is near enough for a start
+START_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough for a start
 MOTIONS = 7  # of a network whose position, attitude and scale the datum fixes
 
 
@@ -384,7 +384,7 @@ def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
                 reject="none",
                 method=method,
                 max_iterations=steps,
-                tolerance=NEAR,
+                tolerance=START_TOLERANCE,
                 covariance=False,
             )
         except GeometryError:

@@ -27,8 +27,9 @@ from sfm.survey.observation_tables import unused_observations
 from sfm.survey.placing import mounts_give_scale, scale_sigma
 
 WEAK_SCALE = 0.01  # relative standard deviation of a scale from which it is reported
-FAR = 0.2  # relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens
-UNLIKE_SQUARES = 0.005  # relative difference of the sides of a pixel; no sensor of a camera has it
+# Relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens.
+MAX_C_CHANGE = 0.2
+MIN_SIDE_DIFFERENCE = 0.005  # relative difference of the sides of a pixel; no sensor of a camera has it
 
 
 def remarks_on_solution(
@@ -174,7 +175,7 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
         if start is None:
             continue
         found = camera.c_px * float(np.mean(camera.pixel_mm))
-        if abs(found / start - 1) <= FAR:
+        if abs(found / start - 1) <= MAX_C_CHANGE:
             continue
         if not camera.free[0]:
             held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(found, "mm"))
@@ -242,7 +243,7 @@ def unlike_squares(settings: Sequence[CameraSettings], cameras: Sequence[Camera]
             continue
         width, height = first[one.name].pixel_mm.tolist()
         ratio = width / height - 1
-        if abs(ratio) >= UNLIKE_SQUARES:
+        if abs(ratio) >= MIN_SIDE_DIFFERENCE:
             remarks.append(
                 remark(
                     "pixels_not_square",

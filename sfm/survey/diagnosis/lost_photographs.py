@@ -16,7 +16,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.diagnosis.own_camera import LARGER_PART
+from sfm.survey.diagnosis.own_camera import MAJORITY_FRACTION
 
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
 MISFIT = 3.0  # standard deviations of image points, of residuals that another minimum may explain
@@ -114,7 +114,7 @@ def try_other_principal_distances(
         best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))
         return (found if best is None else _restored(best, estimate)), ()
     others = [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
-    least = _oriented(found) + int(LARGER_PART * lost) + 1
+    least = _oriented(found) + int(MAJORITY_FRACTION * lost) + 1
     best = _likeliest(network, estimate, found, others, orient, least=least)
     if best is None:
         return found, ()

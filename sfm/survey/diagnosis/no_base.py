@@ -26,8 +26,9 @@ from sfm.orientation.image_rays import image_tangents
 from sfm.similarity import nearest_rotation
 
 MIN_PARALLAX = 10.0  # standard deviations of image points, below which a depth is known to a tenth at best
-DISTANT = 0.9  # part of the points of a pair that may have no depth, as distant hills behind a near object;
-# a smaller rest may be wrong matches
+# Part of the points of a pair that may have no depth, as distant hills behind a near object;
+# a smaller rest may be wrong matches.
+MAX_DISTANT_FRACTION = 0.9
 MIN_COMMON = 20  # points of a pair of photographs: rotation and camera take five coordinates of them
 SCALES = np.geomspace(0.5, 2.0, 15)  # of c that are tried, 10 % apart; the best is improved
 TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
@@ -57,8 +58,8 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
         return
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one place; rotations "
-        f"alone fit {DISTANT:.0%} of their points to {np.median(parallax):.2g} px, and depths need "
-        f"{needed:.2g} px; photograph from several places"
+        f"alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, and depths "
+        f"need {needed:.2g} px; photograph from several places"
     )
 
 
@@ -112,7 +113,7 @@ def _least_parallax(
 
 
 def _parallax(first: FloatArray, second: FloatArray) -> float:
-    """Return the angle that DISTANT of conjugate rays do not exceed after the rotation that fits most, rad.
+    """Return the angle that most conjugate rays do not exceed after the rotation that fits most, rad.
 
     Args:
         first: rays of one photograph, (k, 3).
@@ -128,4 +129,4 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
         near = apart <= np.median(apart)
         R = nearest_rotation(second[near].T @ first[near])
         apart = np.linalg.norm(first @ R.T - second, axis=1)
-    return float(np.quantile(apart, DISTANT))
+    return float(np.quantile(apart, MAX_DISTANT_FRACTION))

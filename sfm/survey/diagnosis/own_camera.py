@@ -40,11 +40,11 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
-LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
+MAJORITY_FRACTION = 0.5  # of image points or photographs; the others are then what does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
 TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of what fits with c to 2.5 %
 PAIR = 2  # photographs of a camera, of which it is not known which one changed
-OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
+FREED_ROLES = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,11 @@ def find_photograph_cameras(
     known = estimate.determined[seen.point]
     count = np.bincount(seen.image[known], minlength=m)
     against = np.bincount(seen.image[known & ~accepted], minlength=m)
-    enough = count > LARGER_PART * np.bincount(seen.image, minlength=m)
-    lost = against > LARGER_PART * count
+    enough = count > MAJORITY_FRACTION * np.bincount(seen.image, minlength=m)
+    lost = against > MAJORITY_FRACTION * count
     unusual = more_than_chance(against, count, ALPHA)
     doubtful = enough & (unusual | (np.isin(network.images, suspected) & estimate.oriented))
-    if not doubtful.any() or (doubtful & lost).sum() > LARGER_PART * m:
+    if not doubtful.any() or (doubtful & lost).sum() > MAJORITY_FRACTION * m:
         return None
     spread = residual_lengths(network, estimate)[known & accepted]
     sigma_px = float(np.median(spread)) / np.sqrt(2 * np.log(2))  # of a Rayleigh distribution
@@ -184,7 +184,7 @@ def _explained_otherwise(
     if separate is None:
         return True
     camera_of_row = separate.network.camera[separate.network.image_points.image]
-    search = float(np.log(len(OWN) * len(network.images)))
+    search = float(np.log(len(FREED_ROLES) * len(network.images)))
     freed, price = 0, 0.0
     for index in np.unique(camera_of_row[camera_of_row >= len(estimate.cameras)]).tolist():
         q = sum(not group for group in own_estimate.cameras[index].shared)
@@ -215,13 +215,13 @@ def _own_camera(
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
     shared = _alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
-    search = np.log(len(SCALES)) + np.log(len(OWN) * len(network.images) / ALPHA)
+    search = np.log(len(SCALES)) + np.log(len(FREED_ROLES) * len(network.images) / ALPHA)
     best, most = None, 0.0
-    for roles in OWN:
+    for roles in FREED_ROLES:
         freed = camera.plays(*roles)
         freed[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
         found = _alone(alone, start, points, freed)
-        if found is None or found.rejected.sum() > LARGER_PART * n:
+        if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
             continue
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             continue  # no picture of these points, as where their names are wrong
@@ -278,7 +278,7 @@ def _scaled_resection(
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
     tolerance_px = TOLERANCE * max(camera.size_px)
     # one triple of points that fit, but for a probability of ALPHA in all
-    trials = math.ceil(math.log(ALPHA / len(SCALES)) / math.log1p(-((1 - LARGER_PART) ** 3)))
+    trials = math.ceil(math.log(ALPHA / len(SCALES)) / math.log1p(-((1 - MAJORITY_FRACTION) ** 3)))
     for scale in scales:
         p = camera.parameters.copy()
         p[camera.parts[0]] *= scale

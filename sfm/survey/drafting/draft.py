@@ -22,7 +22,7 @@ from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.camera_models import FISHEYE
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
-from sfm.survey.drafting.target_trial import MANY_TARGETS, TargetTrial, try_targets
+from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.targets.codes.families import FAMILIES
@@ -37,7 +37,7 @@ FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
 PITCH = 25.0  # of a plate, UNIT, where none is given: that of many printed boards
 UNIT = "mm"
-SHOWN = 8  # names that a line lists
+MAX_SHOWN = 8  # names that a line lists
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def draft_survey(
     if len(used) < 2:
         raise GeometryError(
             f"{folder}: {counted(len(used), 'photograph')} of one camera, at least 2 are needed"
-            + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:SHOWN])
+            + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:MAX_SHOWN])
         )
     trial = try_targets([folder / name for name in used], store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
@@ -103,7 +103,7 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
     ]
     if all(conversion_of(path) for path in files):
         content = (
-            f"it contains {', '.join(as_plain(path.name) for path in every[:SHOWN])}"
+            f"it contains {', '.join(as_plain(path.name) for path in every[:MAX_SHOWN])}"
             if every
             else "it is empty"
         )
@@ -347,7 +347,7 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
         remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
         remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
-    if trial.codes == "none" and trial.circles >= MANY_TARGETS:
+    if trial.codes == "none" and trial.circles >= MIN_TARGETS:
         remarks.append(remark("circles_without_codes", circles=round(trial.circles)))
     return tuple(remarks)
 

@@ -56,8 +56,9 @@ MIN_READABLE = 2  # photographs
 MIN_CODES = 2  # of a family in one picture, which chance seldom reads
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 LOOK_PX = 900  # longer side of the pictures of a first look
-LARGE = 3.0  # pixels of a photograph over those of such a picture beyond which a first look saves time
-MANY_TARGETS = 12  # circles in a photograph that are no chance finds
+# Pixels of a photograph over those of such a picture beyond which a first look saves time.
+MIN_PIXEL_RATIO = 3.0
+MIN_TARGETS = 12  # circles in a photograph that are no chance finds
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def try_targets(
     progress.stage("trial", TRIED + 5)
     tried, photographs, unreadable = _readable(paths, progress)
     names = tuple(path.name for path in tried)
-    if min(one.size for one in photographs) > LARGE * LOOK_PX**2:
+    if min(one.size for one in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
         greys = [_as_bytes(photograph) for photograph in photographs]
         looks = [_look(grey) for grey in greys]
         board = checkerboard_of_parts(greys, [look.board for look in looks])
@@ -277,7 +278,7 @@ def _look(grey: AnyArray) -> _Look:
         circles = max(circles, len(targets))
         rings = (*RINGS, *NECKLACES)
         if (
-            len(targets) >= MANY_TARGETS
+            len(targets) >= MIN_TARGETS
             or any((_ring_codes(family, picture, targets) >= 0).sum() >= MIN_CODES for family in rings)
             or any(len(number) >= MIN_CODES for number, _ in read_dictionaries(picture).values())
             or any(len(codes) for codes in read_resolved(picture).values())

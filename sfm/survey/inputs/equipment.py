@@ -42,7 +42,7 @@ from sfm.survey.observation_tables import ObservationTable, observation_table
 
 FRAME = "rigid frame"  # the kind of observation that frames are
 PPM = 1e-6
-SMALLEST_PPM = 1e-3  # smaller coefficients are those of nothing, but for 11.5e-6 in place of 11.5
+MIN_PPM = 1e-3  # smaller coefficients are those of nothing, but for 11.5e-6 in place of 11.5
 COORDINATES = ("X", "Y", "Z", "sX", "sY", "sZ")
 
 
@@ -57,7 +57,7 @@ class Calibrated(Section):
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
-        if 0 < abs(self.expansion) < SMALLEST_PPM:
+        if 0 < abs(self.expansion) < MIN_PPM:
             raise ValueError(f"expansion = {self.expansion:g}, needed in 1e-6 per K, such as 11.5 for steel")
         if self.calibrated > date.today():
             raise ValueError(f"calibrated = {self.calibrated}, which is in the future")

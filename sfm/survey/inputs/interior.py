@@ -25,7 +25,7 @@ from sfm.survey.inputs.cameras import free_start_values
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
-SINGULAR = 1e-12  # smallest eigenvalue of a matrix of correlations below which it is none
+MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of a matrix of correlations below which it is none
 
 
 def split_cameras(
@@ -95,7 +95,7 @@ def _correlation(
     for (camera, p, q), value in rho.items():
         j, k = place[camera, p], place[camera, q]
         R[j, k] = R[k, j] = value
-    if np.linalg.eigvalsh(R).min() <= SINGULAR:
+    if np.linalg.eigvalsh(R).min() <= MIN_EIGENVALUE:
         raise SurveyFileError(
             "correlations of the weighted interior orientation: no such covariance matrix exists"
         )

@@ -18,7 +18,8 @@ from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
 MIN_OWN = 3  # photographs of one size that a separate camera is worth
-SAME_ASPECT = 0.005  # relative difference of the ratio of the sides of a photograph that was resampled
+# Relative difference of the ratio of the sides of a photograph that was resampled.
+MAX_ASPECT_DIFFERENCE = 0.005
 RESAMPLED, UPRIGHT, CROPPED = "resampled", "stored upright", "cropped or from another sensor"
 
 Size = tuple[int, int]
@@ -122,7 +123,7 @@ def _kind(size: Size, main: Size) -> str:
     if size == main[::-1]:
         return UPRIGHT
     ratio = (size[0] / size[1]) / (main[0] / main[1])
-    return RESAMPLED if abs(ratio - 1) < SAME_ASPECT else CROPPED
+    return RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
 
 
 def _held(camera: CameraSettings) -> bool:

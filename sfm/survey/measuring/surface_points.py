@@ -42,7 +42,7 @@ from sfm.survey.survey_network import network_of
 # warp take from the shift what the plane through the tie points knows better: without them varnished wood has
 # three times as many matches and half of their errors. Affine windows of 31 px, which measure the mean depth
 # of a curved surface, in all photographs alike, leave 0.93 to 1.8 times as much as smaller ones.
-TRIED = (
+TRIED_WINDOWS = (
     Windows(15),
     Windows(11),
     Windows(21),
@@ -217,11 +217,11 @@ def _best_windows(
     settings: TiePointSettings,
     jobs: int,
 ) -> Windows:
-    """Return the windows of TRIED whose rays, all together, leave the smallest standard deviation."""
+    """Return the windows of TRIED_WINDOWS whose rays, all together, leave the smallest standard deviation."""
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
     costs: list[tuple[Windows, float]] = []
     given = settings.window_px if "window_px" in settings.model_fields_set else None
-    for windows in dict.fromkeys(replace(one, side_px=given or one.side_px) for one in TRIED):
+    for windows in dict.fromkeys(replace(one, side_px=given or one.side_px) for one in TRIED_WINDOWS):
         side = _side(estimate, windows.side_px, settings.max_points)
         trial_side = max(TRIAL_SIDES * windows.side_px + 1, side)
         trial = find_covering_points(

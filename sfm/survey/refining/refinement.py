@@ -45,8 +45,8 @@ from sfm.survey.refining.oriented_windows import (
 )
 from sfm.survey.refining.targets import ModelTargets
 from sfm.survey.refining.windows import (
+    MAX_REDUCED_RATIO,
     MIN_RAYS,
-    REDUCED_ALIKE,
     SHRINKS,
     KeyPoints,
     Limits,
@@ -272,7 +272,7 @@ def refine_model(
         return orient(network, orientation, windows, size.side_px, targets, reasons(windows))
 
     side_px = WINDOWS_PX[0] if window_px is None else window_px
-    size = best(estimate, [Size(side_px, shrink) for shrink in SHRINKS], spread, REDUCED_ALIKE)
+    size = best(estimate, [Size(side_px, shrink) for shrink in SHRINKS], spread, MAX_REDUCED_RATIO)
     oriented = measured(estimate, size)
     if window_px is None:
         sizes = [Size(side, size.shrink) for side in WINDOWS_PX]

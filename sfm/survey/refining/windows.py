@@ -25,7 +25,7 @@ MIN_RAYS = 3  # of a point that is measured
 SHRINKS = (1, 2, 4)  # pixels of a photograph along a side of one, of photographs that are reduced
 # Ratio of precisions up to which finer pixels are taken: over large windows surfaces are not plane, which
 # shifts the matches of all photographs alike, and no residual shows it.
-REDUCED_ALIKE = 1.5
+MAX_REDUCED_RATIO = 1.5
 TRIAL_RAYS = 100  # with fewer the window stays as it is
 
 

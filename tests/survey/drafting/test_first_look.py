@@ -10,12 +10,12 @@ import pytest
 
 from sfm.conventions import AnyArray
 from sfm.survey.drafting import target_trial
-from sfm.survey.drafting.target_trial import LARGE, LOOK_PX, try_targets
+from sfm.survey.drafting.target_trial import LOOK_PX, MIN_PIXEL_RATIO, try_targets
 from sfm.targets.codes import plate_search
 from sfm.targets.codes.plate_search import Part, part_of_checkerboard
 from tests.synthetic import seed_of
 
-SIDE = int(np.sqrt(LARGE) * LOOK_PX) + 200
+SIDE = int(np.sqrt(MIN_PIXEL_RATIO) * LOOK_PX) + 200
 
 
 def texture(seed: str) -> AnyArray:

@@ -37,14 +37,15 @@ from sfm.remarks.remark import Remark, remark
 MAX_ROUNDS = 200  # of data snooping
 MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum show no gross errors
 ROUND_TOLERANCE = 1e-2  # |A dx| / |v| of a last step after which gross errors can be judged
-BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
-BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
+# Spread of residuals over that with the start values, above which gross errors bend the network.
+MIN_BENT_RATIO = 2.0
+MIN_BENT_RATIO_OF_ONE = 10.0  # the same of one photograph, over the median of all photographs
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
 MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they determine no depth
 REWEIGHTINGS = 30
 MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence one after another: more helped none of the 400
 # networks with gross errors of tests.adjustment.test_studies
-REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
+WEIGHT_TOLERANCE = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
 
@@ -178,7 +179,7 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
     limit, first = spread(optimum.state), max(spread(state), least_sigma(layout.observations))
 
     def sound(found: Optimum) -> bool:
-        fits = spread(found.state) <= BENT * first
+        fits = spread(found.state) <= MIN_BENT_RATIO * first
         return found.converged and fits and not _bent_photographs(run, state, found.state).any()
 
     if sound(optimum):
@@ -212,7 +213,9 @@ def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
     observations, active = run.problem.layout.observations, run.problem.layout.active
     before, after = (_median_lengths(observations, at, active) for at in (start, end))
     before = np.maximum(before, least_sigma(observations))
-    return np.asarray(after > np.maximum(BENT * before, BENT_ALONE * np.nanmedian(after)))
+    return np.asarray(
+        after > np.maximum(MIN_BENT_RATIO * before, MIN_BENT_RATIO_OF_ONE * np.nanmedian(after))
+    )
 
 
 def _median_lengths(observations: Observations, state: State, active: BoolArray) -> FloatArray:
@@ -348,7 +351,7 @@ def _reweight(
         weight = new
         optimum = run.again(optimum, weight)
         vague = 0 if optimum.converged else vague + 1
-        if change <= REWEIGHTED or vague > MAX_VAGUE_WEIGHTS:
+        if change <= WEIGHT_TOLERANCE or vague > MAX_VAGUE_WEIGHTS:
             break
     run.remarks = (remark("reweighting_not_converging", rounds=vague),) if vague > MAX_VAGUE_WEIGHTS else ()
     return optimum, weight

@@ -48,10 +48,12 @@ MIN_REDUNDANCY = 1e-6  # of a ray in the direction that the others check less, o
 HUBER = 1.501
 TUKEY = 5.123
 # In a photograph of n image points an error moves the residual of another by about 6 / (2 n) of itself, at
-# most some times that: beside CROWDED points one of BESIDE of the largest tau is a separate error.
-CROWDED = 60
-BESIDE = 0.4
-RETURNS = 0.99  # of the critical value: a rejected one returns below, since at it rounds turn in circles
+# most some times that: beside MIN_CROWDED_POINTS points one of BESIDE_FRACTION of the largest tau is a
+# separate error.
+MIN_CROWDED_POINTS = 60
+BESIDE_FRACTION = 0.4
+# Of the critical value: a rejected one returns below, since at it rounds turn in circles.
+RETURN_FRACTION = 0.99
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
@@ -84,8 +86,8 @@ def snoop(
     suspect = used & (tau > critical)
     worst_image = np.zeros(len(observations.camera))
     np.maximum.at(worst_image, observations.image[suspect], tau[suspect])
-    crowded = np.bincount(observations.image[used], minlength=len(worst_image)) >= CROWDED
-    worst_image[crowded] *= BESIDE
+    crowded = np.bincount(observations.image[used], minlength=len(worst_image)) >= MIN_CROWDED_POINTS
+    worst_image[crowded] *= BESIDE_FRACTION
     worst_point = np.zeros(len(observations.start) - 1)
     np.maximum.at(worst_point, observations.point[suspect], tau[suspect])
     out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])
@@ -152,7 +154,7 @@ def would_pass(
     sigma0 = np.sqrt((vPv + np.sum(predicted * inside, axis=1)) / (redundancy + 2))
     sigma0 = np.maximum(sigma0, rounding_of(observations))
     passes = np.zeros(len(used), dtype=bool)
-    passes[rows] = w <= RETURNS * tau_critical(alpha, redundancy + 2) * sigma0
+    passes[rows] = w <= RETURN_FRACTION * tau_critical(alpha, redundancy + 2) * sigma0
     return passes
 
 
