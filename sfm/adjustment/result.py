@@ -214,7 +214,7 @@ class Adjustment:
 
     @property
     def image_sigma0(self) -> float:
-        """As sigma0, of the image points by themselves: what others are stated to be says nothing of them."""
+        """As sigma0, of the image points by themselves: the stated precision of others has no effect."""
         used, r = ~self.rejected, float(np.nansum(self.redundancy_numbers))
         if not r > 0:
             return self.sigma0

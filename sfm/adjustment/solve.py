@@ -80,7 +80,7 @@ def adjust(
     """Return the least-squares adjustment of a network.
 
     Weights are the inverse covariances of the observations. Which interior parameters are free is
-    said by the cameras of the estimate.
+    stated by the cameras of the estimate.
 
     Args:
         network: what was measured.

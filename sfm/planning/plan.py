@@ -34,7 +34,7 @@ from sfm.planning.weakness import (
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned network with all that is said of it."""
+    """A planned network with all remarks on it."""
 
     name: str
     unit: str  # of lengths
@@ -90,7 +90,7 @@ def describe_plan(
     shortfall: float,
     design: Design | None,
 ) -> Plan:
-    """Return what is to be said of a prediction."""
+    """Return the remarks on a prediction."""
     seen = prediction.sight.seen
     coded = np.union1d(choose_coded(seen), _observed(prediction))
     camera = prediction.cameras[0]

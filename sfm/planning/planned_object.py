@@ -105,10 +105,10 @@ def object_of_mesh(
         count: points.
         open_surface: whether the mesh may have edges of one triangle only; it is seen from the side on which
             its triangles run counter-clockwise.
-        bare: triangles without points, such as the bottom that something stands on, (t,).
+        bare: triangles without points, such as the bottom that an object rests on, (t,).
 
     Raises:
-        GeometryError: no area, too large, fewer than 3 points asked for, a mesh with holes not said to be
+        GeometryError: no area, too large, fewer than 3 points asked for, a mesh with holes not stated to be
             open, or triangles that do not run alike.
     """
     if count < 3:
@@ -118,7 +118,7 @@ def object_of_mesh(
     if edges and not open_surface:
         raise GeometryError(
             f"mesh: {counted(edges, 'edge')} of one triangle only: it has holes, or is an open "
-            "surface, through which points would be seen from behind; close it, or say --open-mesh"
+            "surface, through which points would be seen from behind; close it, or use --open-mesh"
         )
     reversed_ = _reversed_edges(mesh)
     if reversed_:

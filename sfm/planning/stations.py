@@ -72,7 +72,7 @@ class Stations:
 
         Args:
             rig: mounts of its cameras.
-            cameras: the same, for their names, which stand before those of the stations.
+            cameras: the same, for their names, which precede those of the stations.
         """
         m, a = len(self), len(cameras)
         of, at = np.tile(np.arange(a), m), np.repeat(np.arange(m), a)

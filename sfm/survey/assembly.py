@@ -135,7 +135,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
 
 
 def _words(values: dict[str, Any]) -> str:
-    """Return keys with values that say something."""
+    """Return keys with values that are not empty."""
     return "; ".join(
         f"{key} = {_word(value)}"
         for key, value in values.items()

@@ -1,4 +1,4 @@
-"""The distortion model of cameras of which the survey does not say it: central perspective or fisheye.
+"""The distortion model of cameras where the survey does not state it: central perspective or fisheye.
 
 A fisheye lens shows equal angles about equally long. Where its photographs are wide, no polynomial on equal
 tangents describes it, and what a survey of them gives is bent: the image points decide.
@@ -33,7 +33,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
     """Orient a survey, with the fisheye model for cameras whose model is open if that is likelier.
 
     Args:
-        survey: says the models of its cameras, or does not.
+        survey: states the models of its cameras, or does not.
         measured: all image points that have a name.
 
     Returns:

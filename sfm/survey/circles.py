@@ -50,7 +50,7 @@ def check_circles(
     radius. The covariance of the correction is added to that of the image point.
 
     Args:
-        survey: says whether to correct the eccentricity, and the diameter if it is known.
+        survey: states whether to correct the eccentricity, and the diameter if it is known.
         photographs: the targets that `network` was built from.
         naming: which point each of them is.
         network: all image points.
@@ -158,7 +158,7 @@ def _other_sizes(
     uncoded ones; those of a table are judged one by one.
 
     Args:
-        survey: says which diameters are of single targets.
+        survey: states which diameters are of single targets.
         points: names of the targets, (n,).
         stated: their radii, NaN where not stated, object unit, (n,).
         found: their radii by the ellipses, object unit, (n,).

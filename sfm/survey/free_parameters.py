@@ -1,4 +1,4 @@
-"""Which interior parameters are adjusted where the survey does not say: those that its network determines.
+"""Which interior parameters are adjusted where the survey states none: those that its network determines.
 
 A lens that is held at nominal values bends the network; parameters that a network does not determine take
 its precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The one that the network
@@ -37,16 +37,16 @@ MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take 
 ROUNDS = 3  # of tests of what is still held
 FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing determines which; then the others
 
-Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey says what is free
+Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey states what is free
 
 
 @dataclass(frozen=True)
 class FreeParameters:
     """Free parameters of the cameras of a survey."""
 
-    cameras: tuple[CameraSettings, ...]  # all of which say what is free, and of which c is observed
+    cameras: tuple[CameraSettings, ...]  # all of which state what is free, and of which c is observed
     estimate: Estimate  # with the same freed in its cameras; observed ones keep their values
-    remarks: tuple[Remark, ...]  # on each camera that the survey says nothing about
+    remarks: tuple[Remark, ...]  # on each camera that the survey does not describe
 
 
 def choose_free_parameters(
@@ -55,14 +55,14 @@ def choose_free_parameters(
     """Return the interior parameters to adjust, of every camera of a survey.
 
     Args:
-        survey: says what is free of its cameras, or does not.
+        survey: states what is free of its cameras, or does not.
         network: with one camera for each of the survey's, in their order.
         estimate: start values; photographs and points without any take no part in the decision.
         datum: kind of datum; control takes part where photographs by themselves do not determine c.
         extend: whether parameters beyond the candidates are tried.
 
     Returns:
-        The settings with what is free in each, and the estimate. Both as they were where the survey says it
+        The settings with what is free in each, and the estimate. Both as they were where the survey states it
         of every camera.
     """
     silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
@@ -123,7 +123,7 @@ def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings
     rho = 1 - (RATIO_SIGMA / C_SIGMA) ** 2 / 2
     return settings.model_copy(
         update={
-            "c_mm": None,  # the observed value says it
+            "c_mm": None,  # the observed value gives it
             "weighted": tuple((camera.names[s], (float(c[s]), C_SIGMA * abs(float(c[s])))) for s in focal),
             "correlations": tuple((camera.names[focal[0]], camera.names[s], rho) for s in focal[1:]),
         }
@@ -190,7 +190,7 @@ def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
 
 
 def _defect_of_points(part: Network, found: Adjustment) -> int:
-    """Return what points whose rays were rejected add to the rank defect; it says nothing of the cameras."""
+    """Return what points whose rays were rejected add to the rank defect; it is no defect of the cameras."""
     rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
     known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
     if found.datum == "control":

@@ -174,12 +174,12 @@ def _fits(network: Network, found: Orientation) -> BoolArray:
 def _hold_cameras_of_two(
     survey: Survey, network: Network, found: Orientation
 ) -> tuple[Orientation, tuple[Remark, ...]]:
-    """Hold the free parameters of interior orientation where two photographs are all there is, and say so.
+    """Hold the free parameters of interior orientation where two photographs are all there is, and report it.
 
     The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
     Zisserman 2003, sec. 11.1): hardly c, and neither principal point nor distortion, which bend the object
     instead. A control field in the datum determines them, and observed parameters have the stated precision.
-    So is it where the survey does not say what is free, as one that was drafted.
+    So it is where the survey does not state what is free, as one that was drafted.
     """
     estimate = found.estimate
     fixed = len(network.control) if survey.datum.kind == "control" else 0

@@ -47,8 +47,8 @@ def compare_solution(
 ) -> SurveyComparison:
     """Compare a solution with those of other programs.
 
-    The survey stands without them: one that refuses is a warning in the result and does not lose it. A
-    library that is not installed is reported without a warning's weight, since it says nothing of the survey.
+    The survey is valid without them: one that refuses is a warning in the result and does not lose it. A
+    library that is not installed is reported without a warning's weight, since it is no defect of the survey.
 
     Args:
         solution: of the survey.

@@ -259,7 +259,7 @@ def _by_angles(
     target: FloatArray,
     weight: FloatArray,
 ) -> Similarity:
-    """Return the similarity whose rotation is the mean that observed angles say (Horn 1987)."""
+    """Return the similarity whose rotation is the mean of observed angles (Horn 1987)."""
     observed = np.stack([rotation_from_angles(*one) for one in angles])
     R = nearest_rotation(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
     w = weight / weight.sum()
@@ -389,5 +389,5 @@ def place_on_frame(
     scale = object_scale(network, estimate) if len(network.control) and not scaled else 1.0
     try:
         return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
-    except GeometryError:  # too few of them, or on a line: the adjustment has kept what they say
+    except GeometryError:  # too few of them, or on a line: the adjustment has kept their values
         return estimate

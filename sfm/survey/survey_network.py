@@ -63,7 +63,7 @@ def exterior_observations(table: ObservedExterior, images: Sequence[str]) -> Ext
     index = {name: i for i, name in enumerate(images)}
     rows = np.array([k for k, name in enumerate(table.names) if name in index], dtype=np.int64)
     image = np.array([index[table.names[k]] for k in rows], dtype=np.int64)
-    # what was not observed has no weight, and any number may stand in its place
+    # what was not observed has no weight, and any number may be in its place
     value = np.nan_to_num(table.value[rows])
     covariance = np.zeros((len(rows), 6, 6))
     covariance[:, range(6), range(6)] = table.sigma[rows] ** 2

@@ -182,7 +182,7 @@ def test_comparison_says_what_colmap_cannot_share(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "match"),
     [
-        (LENS + 'per_photograph = ["K3"]', r"'K3' stands in per_photograph but is not adjusted"),
+        (LENS + 'per_photograph = ["K3"]', r"'K3' is in per_photograph but is not adjusted"),
         (LENS + 'per_photograph = ["K9"]', r"has no parameter 'K9'"),
         (LENS + 'per_group = ["c"]', r"per_group is given, groups is needed with it"),
         (LENS + 'groups = ["even_*"]', r"groups is given, per_group is needed with it"),

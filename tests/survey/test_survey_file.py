@@ -500,5 +500,5 @@ def test_single_brackets_of_a_camera_are_explained(tmp_path: Path) -> None:
 
 def test_a_parameter_is_free_once(tmp_path: Path) -> None:
     text = FULL.replace('free = ["c",', 'free = ["c","c",')
-    with pytest.raises(SurveyFileError, match=r"camera olympus: parameter 'c' stands 2 times in free"):
+    with pytest.raises(SurveyFileError, match=r"camera olympus: parameter 'c' is 2 times in free"):
         read_survey_file(write(tmp_path, text))

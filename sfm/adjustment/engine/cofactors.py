@@ -151,7 +151,7 @@ def hat_complement(
 def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> Covariance:
     """Return the covariance without what is not determined.
 
-    NaN stands for photographs and points that took no part or have open directions. A parameter of interior
+    NaN marks photographs and points that took no part or have open directions. A parameter of interior
     orientation that a null vector leaves open has an infinite variance and no covariances: no datum fixes it.
 
     Args:

@@ -1,7 +1,7 @@
 """Covariance of the unknowns due to the correlation of neighbouring image points.
 
 Least squares with weights of independent errors stays unbiased where the errors of a photograph are
-correlated, but is less precise than its cofactors say. With the influence Z of the errors e on the unknowns,
+correlated, but is less precise than its cofactors show. With the influence Z of the errors e on the unknowns,
 dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; with R = I it is the usual one.
 R has what each image point has alone, in units of its standard deviation, and what a photograph does to
 neighbours alike, in px: whitened, it is the larger the more precise an image point is.

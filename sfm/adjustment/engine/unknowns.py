@@ -5,7 +5,7 @@ parts of mounts, camera by camera | 3 per kept point]; all other object points a
 that of a photograph, or of a rig at one moment; `photograph_terms` gives the orientation of a photograph by
 the unknowns, whichever they are. Points that observations couple with other unknowns are kept, as those at
 the ends of scale bars. Fixed unknowns keep their place with derivatives 0. A parameter that several cameras
-share stands in one column, that of the first of them.
+share has one column, that of the first of them.
 """
 
 from __future__ import annotations

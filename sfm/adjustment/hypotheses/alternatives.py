@@ -152,7 +152,7 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
         if family.of_given:
             weighted = given.parameter[(given.camera == index) & (given.sigma > 0)]
             some = camera.free & np.isin(np.arange(len(camera.free)), weighted)
-        # the denominator of a fraction says the same as its numerator
+        # the denominator of a fraction describes the same as its numerator
         for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
             owner = owners.setdefault(camera.owner_of(s), {})
             owner.setdefault(camera.names[s], []).append((index, s))
@@ -174,7 +174,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
             H, g, squares = reduced.project(freed)
             gain = gain_of(H, g, squares, least_share(len(H)))
             if gain.rank:
-                # what the photographs say of it once it, or all of the camera, are free
+                # what the photographs show of it once it, or all of the camera, are free
                 variance = float(gain.beta @ H @ gain.beta)
                 spread = min(
                     (
@@ -198,7 +198,7 @@ def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[A
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
-    """Return the spread of what the photographs say of one direction, (m,), over its expected variance.
+    """Return the spread of what the photographs show of one direction, (m,), over its expected variance.
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """

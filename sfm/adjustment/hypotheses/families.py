@@ -43,7 +43,7 @@ Parts = dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | N
 
 @dataclass(frozen=True)
 class Alternative:
-    """One alternative and what the score test says of it."""
+    """One alternative and the outcome of its score test."""
 
     family: Family
     pattern: str  # single | split | linear | alternating | group | each | all

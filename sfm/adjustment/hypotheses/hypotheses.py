@@ -85,7 +85,7 @@ class Judged:
 def judge_alternatives(
     final: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
 ) -> Judged:
-    """Return what the image points say against the assumptions of an adjustment.
+    """Return the evidence of the image points against the assumptions of an adjustment.
 
     Args:
         final: a finished adjustment with its covariance.
@@ -116,7 +116,7 @@ def judge_alternatives(
 def _judge_free(
     plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], without: str | None
 ) -> Judged:
-    """Return what the image points alone say; without their network if they determine none."""
+    """Return the evidence of the image points alone; without their network if they determine none."""
     if plain is None:
         return Judged(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
@@ -161,7 +161,7 @@ def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
 def cause_in_calibration(final: Adjustment) -> Cause | None:
     """Return what given points show: another camera in some photographs, or control that is strained.
 
-    Image points alone say little of the cameras of a few photographs, or of many of a plane. Control that is
+    Image points alone show little of the cameras of a few photographs, or of many of a plane. Control that is
     bent takes up what targets of a plate have in common as well, and is no more than what no camera explains.
 
     Args:

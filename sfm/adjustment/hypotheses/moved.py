@@ -165,7 +165,7 @@ def _shifted(
                 break
             members = again
         if 2 * members.sum() > total:
-            members = ~members  # that the others moved the other way says the same
+            members = ~members  # that the others moved the other way is the same statement
         count = int(members.sum())  # not more than half
         if count < MIN_GROUP:
             continue

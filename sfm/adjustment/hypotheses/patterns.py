@@ -86,7 +86,7 @@ def price_of(rank: int, touched: int, search: float) -> float:
 def patterns_of(m: int) -> Iterator[tuple[str, FloatArray, float]]:
     """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
     if m == MIN_GROUP:
-        yield "pair", np.eye(m)[1:], 0.0  # that the other one differs says the same
+        yield "pair", np.eye(m)[1:], 0.0  # that the other one differs is the same statement
     elif m > MIN_GROUP:
         yield "single", np.eye(m), np.log(m)
     if m < 2 * MIN_GROUP:

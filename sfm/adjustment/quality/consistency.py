@@ -33,7 +33,7 @@ from sfm.distributions import chi2_isf, chi2_sf
 CHANCE = 1e-3  # of so much larger a misfit where the other explanation is the true one
 MOVED_SIGMAS = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
 
-FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
+FAMILY = 0.01  # chance with which each test reports anything in a survey in which nothing is wrong
 # Largest component of a photograph over their median, below which a difference is of no use.
 MIN_UNEVEN_RATIO = 1.5
 

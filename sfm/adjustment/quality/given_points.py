@@ -243,7 +243,7 @@ def judge_points(
 
     Args:
         points: given, and of the free network.
-        level: probability with which right points are said to be wrong.
+        level: probability with which right points are reported as wrong.
         start: approximate similarity, used with fewer than three complete points.
         estimated: whether their standard deviations are unknown.
 

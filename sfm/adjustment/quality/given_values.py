@@ -99,7 +99,8 @@ class Kept:
 
         Source: Rao (1948), Math. Proc. Camb. Phil. Soc. 44(1) (score test).
         """
-        # in parts of what the differences would say of each, were they independent and nothing else unknown
+        # in parts of what the differences would determine of each, were they independent and nothing else
+        # unknown
         scale = 1 / np.linalg.norm(columns / self.model.size[:, None], axis=0)
         g, H = scale * (columns.T @ self.u), scale[:, None] * (columns.T @ self.precision @ columns) * scale
         d, U = np.linalg.eigh((H + H.T) / 2)
@@ -347,7 +348,7 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
 
     Args:
         model: their differences from the free network.
-        level: probability with which right values are said to be wrong.
+        level: probability with which right values are reported as wrong.
     """
     every = model.kept()
     found = Judgement(every.chi2, every.dof, every.probability())

@@ -2,7 +2,7 @@
 
 In weak networks the sum of squares has several minima: of few photographs with small angles c and the
 distance go together, and relief or tilt can be turned inside out as in a drawing of a cube. Each minimum has
-a small standard deviation, which says nothing of the others. The network is therefore followed
+a small standard deviation, which does not show the others. The network is therefore followed
 along c in both directions, from the result and from its reflection in depth, with c held; where v'Pv is as
 small as that of the result, or at a minimum, c is freed and the network adjusted.
 
@@ -110,7 +110,7 @@ def other_solutions(
 def _allowed(base: Adjustment) -> float:
     """Return by how much v'Pv of another solution may be larger.
 
-    With hardly any redundancy v'Pv says little of the weights, and any other solution would pass; they are
+    With hardly any redundancy v'Pv shows little of the weights, and any other solution would pass; they are
     believed as stated, with the weight of some observations.
     """
     freedom = base.redundancy + STATED_FREEDOM

@@ -172,8 +172,8 @@ def estimate_common_part(
 ) -> tuple[float, float]:
     """Return the factor on stated standard deviations of image points, and the sigma of what is not stated.
 
-    The covariance of an image point is f^2 C + s^2 I: C is stated for each, as by matching, f says how far
-    these are from the truth, and s is what they say nothing of, as the shape of a surface inside a window or
+    The covariance of an image point is f^2 C + s^2 I: C is stated for each, as by matching, f states how far
+    these are from the truth, and s is what they do not contain, as the shape of a surface inside a window or
     an unsteady lens. The squares of both are estimated from the residuals by Fisher scoring; the redundancy
     of an image point is taken alike in all directions.
 

@@ -17,9 +17,9 @@ from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations, filling_distance, looking, rolled
 
 COUNT = 300  # stations that the designer chooses from, each upright and rolled
-DISTANCES = (0.75, 1.25)  # of that at which the object fills the photograph, if nothing is said
+DISTANCES = (0.75, 1.25)  # of that at which the object fills the photograph, by default
 AIMS = 8  # parts of the object that a station may look at, besides its middle
-TRIES = 60  # positions tried for each that is wanted, until it is said that there is no room
+TRIES = 60  # positions tried for each that is wanted, until no room is reported
 MIN_POINTS = 4  # points that a candidate must show
 BASES = (2, 3, 5)
 

@@ -2,7 +2,7 @@
 
 The choice goes by the limiting covariance of points, in which the orientations are held (`gain`); each
 point's share of what that ignores - orientation, self-calibration, datum - is taken from the full covariance
-of the network so far. What is said of the design is always the full covariance.
+of the network so far. Figures of the design always are of the full covariance.
 
 Source: Fraser (1984) (zero- to first-order design); Fedorov (1972), Theory of Optimal Experiments (greedy
 choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing cameras).
@@ -37,7 +37,7 @@ MIN_DECREASE = 1e-3  # relative decrease of the cost from which an exchange is o
 MAX_RATIO = 25.0  # of the full over the limiting variance of a point that is believed
 NO_BETTER = 0.98  # of the shortfall: a round of additions that leaves more than this gains nothing
 ROUNDS = 6  # of additions and exchanges at most
-PATIENCE = 6  # photographs that gain nothing one after the other, until it is said what limits
+PATIENCE = 6  # photographs that gain nothing one after the other, until the limit is reported
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.visibility import Sight
 from sfm.planning.stations import Stations
 
-POWER = 4  # of the variances in the sum that stands for the worst: smooth, so that ties are broken
+POWER = 4  # of the variances in the sum that represents the worst: smooth, so that ties are broken
 
 
 def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight: Sight) -> FloatArray:

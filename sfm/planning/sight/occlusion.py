@@ -1,4 +1,4 @@
-"""Points hidden by a mesh: does a triangle stand between a point and a projection centre?
+"""Points hidden by a mesh: is a triangle between a point and a projection centre?
 
 The triangles are sorted into a tree of boxes, halved along their longest side, so that a ray meets few.
 

@@ -402,7 +402,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
 
     Args:
         network: the part that is to be adjusted.
-        estimate: its cameras say what is free.
+        estimate: its cameras state what is free.
         datum: kind of datum; control and observed exterior orientation count in that of control.
     """
     m, n, k = len(network.images), len(network.points), len(network.image_points)

@@ -100,7 +100,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     that they were zoomed, c is adjusted per photograph.
 
     Args:
-        survey: says the datum and the a priori sigma, and gives observed exterior orientation.
+        survey: gives the datum, the a priori sigma and observed exterior orientation.
         matched: all image points, and approximate values of all that is to be adjusted.
 
     Raises:

@@ -205,7 +205,7 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     """Return a remark for each camera that photographs of a plate should calibrate, with c held after all.
 
     Args:
-        survey: says what is free of its cameras, or leaves it to the photographs.
+        survey: states what is free of its cameras, or leaves it to the photographs.
         estimate: adjusted cameras; those of single photographs are named by these behind that of the survey.
     """
     if not _calibrates(survey):
@@ -230,7 +230,7 @@ def unlike_squares(settings: Sequence[CameraSettings], cameras: Sequence[Camera]
     """Return a remark on each camera whose nominal sensor size makes pixels that are not square.
 
     Args:
-        settings: what the survey says of its cameras. A pixel size that is stated is not judged; nor is one
+        settings: of the cameras in the survey. A pixel size that is stated is not judged; nor is one
             with b1, or fx and fy, among the free parameters: the photographs determine the ratio.
         cameras: of its solution; those of single photographs are named by these behind that of the survey.
     """

@@ -2,7 +2,7 @@
 
 A zoom that slipped, a lens that was focused anew or a picture that was resampled shows the points of the
 others at another scale. Its exterior orientation takes up a part of that, and the rejection of image points
-the rest, so that a photograph with a few accepted points would stand among the oriented ones.
+the rest, so that a photograph with a few accepted points would be among the oriented ones.
 
 The photographs are tried that lose more points to the test than chance makes. Each is adjusted alone on
 the points of the others, with the camera that it shares and with per-photograph parameters. The likelihood

@@ -1,4 +1,4 @@
-"""Which photographs of a folder were taken with one camera, and what their files say of it."""
+"""Which photographs of a folder were taken with one camera, and the data of it in their files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CameraGroup:
     c_mm: float
     c_source: str
     assumed: bool  # whether pixel or principal distance is known from nowhere
-    fisheye: str  # lens or camera whose name says that it is one; "" where none does
+    fisheye: str  # lens or camera whose name shows that it is one; "" where none does
     remarks: tuple[Remark, ...]  # what a person should know of the photographs
 
 
@@ -54,7 +54,7 @@ def group_photographs(
     """Return the cameras that photographs were taken with.
 
     Photographs belong together that agree in make, model, serial number, lens, focal length and size. Where
-    no file names the maker, the part of the names before their last number stands for the camera.
+    no file names the maker, the part of the names before their last number names the camera.
 
     Args:
         metadata: of every readable photograph, by its file name.

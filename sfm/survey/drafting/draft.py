@@ -170,7 +170,7 @@ def _text(
     lines += [
         "",
         "[adjust]",
-        f"sigma_px = {sigma:g}  # of an image coordinate before adjusting; the report says what fits",
+        f"sigma_px = {sigma:g}  # of an image coordinate before adjusting; the report states what fits",
         "",
         "[compare]",
         'backend = "colmap"  # adjust with COLMAP too and compare; "none" saves the time',
@@ -179,7 +179,7 @@ def _text(
 
 
 def _free(trial: TargetTrial) -> tuple[str, ...]:
-    """Return what is free of the cameras; of texture nothing is said, and the adjustment chooses."""
+    """Return what is free of the cameras; for texture nothing is stated, and the adjustment chooses."""
     if trial.plate is not None:
         return FREE_BY_PLATES
     return FREE_BY_TARGETS if trial.codes != "none" else ()

@@ -44,7 +44,7 @@ class JudgedGiven:
     remarks: tuple[Remark, ...] = ()
     tests: tuple[GivenTest, ...] = ()
     placing: Similarity | None = None
-    """object frame from that of the free network; None where nothing says it"""
+    """object frame from that of the free network; None where nothing gives it"""
     checks_handedness: bool = False  # whether a mirrored network does not fit
 
 

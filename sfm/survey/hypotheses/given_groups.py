@@ -59,7 +59,7 @@ class Task:
 
     @property
     def level(self) -> float:
-        """Probability with which one kind of right given values is said to be wrong."""
+        """Probability with which one kind of right given values is reported as wrong."""
         kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
         return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
 

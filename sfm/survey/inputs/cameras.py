@@ -58,7 +58,7 @@ def start_cameras(
     """Return the cameras with their start values, in the order of the survey file.
 
     Args:
-        settings: what the survey says of its cameras; what they leave out is taken from the photographs.
+        settings: of the cameras in the survey; what they leave out is taken from the photographs.
         source: what messages call the survey.
         metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
         camera: index of the camera of each photograph, (m,).
@@ -150,7 +150,7 @@ def free_start_values(settings: CameraSettings, name: str, given: StartCameras |
     """Return the start values of [approximate] for what is free of a camera, by parameter.
 
     Args:
-        settings: say what is free.
+        settings: state what is free.
         name: of the camera in the table, or of one of its photographs or groups with separate values.
         given: the table, None without.
     """

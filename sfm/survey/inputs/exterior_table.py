@@ -26,7 +26,7 @@ from sfm.survey.inputs.given import (
 from sfm.survey.inputs.settings import RigSettings
 
 FULL_TURN = 360.0  # deg
-MIN_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
+MIN_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa describe nearly the same
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ObservedExterior:
     names: tuple[str, ...]  # photographs, (e,)
     value: FloatArray  # X0, Y0, Z0, omega, phi, kappa; NaN where not observed, (e, 6)
     sigma: FloatArray  # standard deviations, 0 = fixed, infinite where not observed, (e, 6)
-    table: CsvTable  # where they stand, for messages
+    table: CsvTable  # where they are, for messages
 
     @classmethod
     def from_arrays(
@@ -86,7 +86,7 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
 
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
-            negative or stands alone or is missing, one so small that its unit must be another, angles of
+            negative or alone or missing, one so small that its unit must be another, angles of
             which only some are fixed, or that cannot be distinguished.
     """
     header = read_header(path)
@@ -179,7 +179,7 @@ def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: 
 
 
 def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) -> None:
-    """Refuse observed orientations (degrees) that no adjustment can take as they stand."""
+    """Refuse observed orientations (degrees) that no adjustment can take as they are."""
     columns = (*SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
     table.refuse(sigma, sigma < 0, columns, "0 (fixed) or more")
     known = value[np.isfinite(value[:, :3]).all(axis=1), :3]

@@ -94,7 +94,7 @@ class StartOrientations:
     names: tuple[str, ...]  # photographs, (m,)
     position: FloatArray  # projection centres X0, object unit, (m, 3)
     rotation: FloatArray  # R, image to object axes, (m, 3, 3)
-    table: CsvTable  # where they stand, for messages
+    table: CsvTable  # where they are, for messages
 
     @classmethod
     def from_arrays(
@@ -118,7 +118,7 @@ class StartCameras:
     camera: tuple[str, ...]  # camera of each row, or photograph or group of one with other values, (k,)
     parameter: tuple[str, ...]  # (k,)
     value: FloatArray  # in the parameter's unit, (k,)
-    table: CsvTable  # where they stand, for messages
+    table: CsvTable  # where they are, for messages
 
     def of(self, camera: str) -> dict[str, float]:
         """Return the values of one camera, by parameter."""
@@ -143,7 +143,7 @@ class Observations:
     sigma: FloatArray | None  # standard deviations in the same unit, NaN where there is none, None without
     # any, (k, 2)
     unit: str  # px | mm
-    table: CsvTable  # where they stand, for messages
+    table: CsvTable  # where they are, for messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
 
     @classmethod

@@ -37,7 +37,8 @@ def split_cameras(
     """Return the network and estimate with the interior orientations that the final adjustment has.
 
     Args:
-        cameras: of the survey; they say which parameters are observed, of each photograph, or of each group.
+        cameras: of the survey; they state which parameters are observed, of each photograph, or of each
+            group.
         network: with one camera for each of the survey's, in their order.
         estimate: of the same.
         given: start values of single photographs or groups.

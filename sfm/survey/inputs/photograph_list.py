@@ -134,9 +134,9 @@ def refuse_incomplete_cameras(
     """Raise SurveyFileError if the pixel size or principal distance of cameras is not known from anywhere.
 
     Args:
-        settings: what the survey says of its cameras.
+        settings: of the cameras in the survey.
         source: what messages call the survey.
-        photographs: whose EXIF data may say the rest.
+        photographs: whose EXIF data may give the rest.
     """
     lines = []
     for number, one in enumerate(settings):
@@ -155,7 +155,7 @@ def refuse_incomplete_cameras(
 
 
 def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
-    """Return (what to write, where EXIF data have it) of what a camera does not say."""
+    """Return (what to write, where EXIF data have it) of what a camera does not state."""
     said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
     wanted = []
     if one.pixel_mm is None and one.sensor_mm is None:

@@ -95,7 +95,7 @@ def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> 
 
 
 def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
-    """Raise SurveyFileError where what is said of a plate is incomplete, or belongs to none."""
+    """Raise SurveyFileError where the description of a plate is incomplete, or belongs to none."""
     given = [name for name in OF_PLATES if name in targets.model_fields_set]
     if targets.codes not in PLATES:
         if given:

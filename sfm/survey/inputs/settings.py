@@ -1,4 +1,4 @@
-"""The sections of the survey file: what each may say, its types and bounds."""
+"""The sections of the survey file: their keys, types and bounds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 MAX_TABLES = 100  # of survey observations
 MAX_RIGS, MAX_PATTERN = 100, 200  # rigs, and characters of the expression that finds a moment
-# parameters that are adjusted where a survey says nothing, as far as its photographs determine them
+# parameters that are adjusted where a survey states nothing, as far as its photographs determine them
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
@@ -143,7 +143,7 @@ class CameraSettings(Section):
 
     @property
     def may_be_free(self) -> tuple[str, ...]:
-        """Parameters that are adjusted without an observation, or may be where nothing is said."""
+        """Parameters that are adjusted without an observation, or may be where nothing is stated."""
         if self.states_free:
             return self.free
         return tuple(name for name in MODELS[self.model].names if name in FREED_FIRST)

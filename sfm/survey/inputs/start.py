@@ -5,7 +5,7 @@ Image points outside their photograph: no photograph has them, so that a setting
 Single ones are gross errors and are left out by name. More of them refuse the survey, with what would bring
 them inside: x and y exchanged, another unit, or a larger photograph.
 
-Image points that stand more than once in a table: one point measured twice in one photograph.
+Image points that are more than once in a table: one point measured twice in one photograph.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.survey_network import network_of
 
-ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
+ALPHA = 0.001  # probability with which measurements that agree are taken for contradicting ones
 
 MARGIN_PX = 1.0  # that programs which count pixels from 1 or from corners differ by
 MAX_OUTSIDE = 0.05  # of the image points: as many gross errors as measuring ever makes
@@ -123,7 +123,7 @@ def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
 
 
 def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:
-    """Return start values from [approximate] and the control; NaN for what nothing is said about.
+    """Return start values from [approximate] and the control; NaN for what is not given.
 
     Args:
         survey: gives them, and states whether the control is the datum.
@@ -138,7 +138,7 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
 
 
 def given_values(survey: Survey, network: Network, cameras: tuple[Camera, ...] = ()) -> Estimate:
-    """Return what [approximate] says of photographs and points; NaN for all others.
+    """Return the values of [approximate] for photographs and points; NaN for all others.
 
     Args:
         survey: gives them.
@@ -258,7 +258,7 @@ def _alternatives(
 
 @dataclass(frozen=True)
 class Merged:
-    """Image points of which each stands once."""
+    """Image points, each once."""
 
     image_points: ImagePoints
     same: tuple[tuple[int, int], ...]  # (photograph, point) of identical ones, merged
@@ -267,7 +267,7 @@ class Merged:
     dropped_rows: int  # image points that are left out
 
     def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
-        """Return what was done with the image points that stand more than once."""
+        """Return what was done with the image points that were there more than once."""
         kinds = {
             "image_points_identical": self.same,
             "image_points_averaged": self.averaged,
@@ -281,7 +281,7 @@ class Merged:
 
 
 def merge_repeated(seen: ImagePoints) -> Merged:
-    """Return image points of which each stands once in its photograph, where it stood first.
+    """Return image points, each once in its photograph, where it was first.
 
     Identical positions are one measurement that was written twice. Different ones are two measurements:
     their weighted mean, if a chi-square test of their differences passes; else it is not known which is

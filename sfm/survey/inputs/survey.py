@@ -179,7 +179,7 @@ class Survey:
 
     @property
     def reject(self) -> str:
-        """How gross errors are treated; given observations are adjusted as they are unless it is said."""
+        """How gross errors are treated; given observations are adjusted as they are unless it is stated."""
         return self.adjust.reject or ("tau" if self.observations is None else "none")
 
     @property
@@ -356,7 +356,7 @@ def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:
     """Return the codes of a survey, rings with the radii that it states, None where targets have none.
 
     Args:
-        targets: what the survey says of them.
+        targets: as the survey describes them.
         codes: name of the family, or path of the table.
 
     Raises:

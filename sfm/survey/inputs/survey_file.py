@@ -1,4 +1,4 @@
-"""The survey file (TOML): read and checked; what its sections may say is in `sfm.survey.inputs.settings`."""
+"""The survey file (TOML): read and checked; its sections are described in `sfm.survey.inputs.settings`."""
 
 from __future__ import annotations
 

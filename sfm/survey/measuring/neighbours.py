@@ -21,7 +21,7 @@ MIN_SPREAD_SIGMAS = 2.0
 
 
 def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray:
-    """Return the photographs that stand nearest to each, nearest first, NONE where there are no more, (m, k).
+    """Return the photographs that are nearest to each, nearest first, NONE where there are no more, (m, k).
 
     Positions in EXIF data are compared in their standard deviations. Where they differ by no more than their
     errors they decide nothing, and no photograph has neighbours.

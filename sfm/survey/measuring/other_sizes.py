@@ -106,12 +106,12 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
 def _size(path: Path) -> Size | None:
     try:
         return read_metadata(path).size_px
-    except PhotographError:  # said where it is measured
+    except PhotographError:  # reported where it is measured
         return None
 
 
 def _main_size(camera: CameraSettings, counted: dict[Size, list[int]]) -> Size | None:
-    """Return the size of a camera: what the survey says if a photograph has it, else the most frequent."""
+    """Return the size of a camera: that of the survey if a photograph has it, else the most frequent."""
     if camera.size_px in counted:
         return camera.size_px
     if camera.size_px is not None or not counted:

@@ -38,7 +38,7 @@ def each_photograph(
 
     Args:
         photographs: the files.
-        work: what is done with a file; PhotographError says why it cannot be read.
+        work: what is done with a file; PhotographError gives the reason why it cannot be read.
         picture: what identifies the picture in its result, as a copy that was saved again
             has other bytes; empty where nothing does.
         jobs: how many photographs are worked on at a time.
@@ -109,18 +109,18 @@ def find_copies(photographs: PhotographList) -> tuple[int, ...]:
     number = Counter(sizes)
     for k, path in enumerate(photographs.paths):
         if sizes[k] and number[sizes[k]] > 1:
-            with suppress(PhotographError):  # what cannot be read is said where it is measured
+            with suppress(PhotographError):  # a file that cannot be read is reported where it is measured
                 first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
     return tuple(first)
 
 
 def why_failed(error: PhotographError, path: Path) -> str:
-    """Return why a photograph cannot be read, without its name, which stands beside the reason."""
+    """Return why a photograph cannot be read, without its name, which is beside the reason."""
     return str(error).removeprefix(f"{path.name}: ")
 
 
 def in_brackets(failed: Sequence[FailedImage]) -> str:
-    """Return which photographs could not be read and why, the first of many, to stand behind a message."""
+    """Return which photographs could not be read and why, the first of many, to follow a message."""
     if not failed:
         return ""
     named = (f"{one.image}: {one.reason.text.rstrip('.')}" for one in failed)

@@ -74,7 +74,7 @@ def cover_photographs(
     """Return the network of a textured survey with points wherever its photographs have texture.
 
     Args:
-        survey: says the window, or does not, and the sigma of an image coordinate.
+        survey: gives the window, or does not, and the sigma of an image coordinate.
         measured: the tie points.
         start: orientation of the photographs.
         jobs: photographs worked on at a time.
@@ -138,7 +138,7 @@ def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
 def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray, sigma_px: float) -> Network:
     """Return the network with the share of matching in its covariances as the residuals show it.
 
-    Their median stays: sigma0 goes on to say how much worse the image points are than was expected.
+    Their median stays: sigma0 still shows how much worse the image points are than was expected.
 
     Args:
         network: covering points, weighted as expected.
@@ -161,7 +161,7 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
 
     try:
         factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], sigma_px)
-    except GeometryError:  # which the adjustment of the survey says, or mends
+    except GeometryError:  # which the adjustment of the survey reports, or mends
         return network
     shown = factor**2 * matching + common_px**2 * np.eye(2)
     usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))

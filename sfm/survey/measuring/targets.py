@@ -40,7 +40,7 @@ def measure_photographs(
     file is a copy of another.
 
     Args:
-        survey: says what the targets look like and what is known of the cameras.
+        survey: describes the targets and what is known of the cameras.
         photographs: the files.
         jobs: how many photographs are worked on at a time.
         store: keeps what is measured and spares measuring it again; None to measure everything.
@@ -83,7 +83,7 @@ def measure_photographs(
 def _read_and_measure(
     path: Path, settings: TargetSettings, family: TargetFamily | None, store: MeasuredStore | None
 ) -> tuple[Metadata, Targets, bool]:
-    targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
+    targets, stored = measure_photograph(path, settings, family, store)  # reports faults of a file best
     return read_metadata(path), targets, stored
 
 

@@ -54,7 +54,8 @@ def tie_photographs(
     with the reason, as is a copy of another.
 
     Args:
-        survey: says detector and windows, what is known of the cameras, and the sigma of an image coordinate.
+        survey: gives detector and windows, what is known of the cameras, and the sigma of an image
+            coordinate.
         photographs: the files.
         jobs: how many photographs are worked on at a time.
         store: keeps what single photographs show and spares finding it again; None to find everything.

@@ -60,7 +60,7 @@ def measure_model_targets(
     """Find and measure the coded targets in the photographs of a model, and where the object frame is.
 
     Args:
-        survey: says what the targets look like, and gives control and scale bars; its cameras are not used.
+        survey: describes the targets, and gives control and scale bars; its cameras are not used.
         network: the model.
         estimate: its solution.
         images_dir: folder of its photographs.

@@ -52,7 +52,7 @@ class Limits(NamedTuple):
 class Windows:
     """Image points measured anew."""
 
-    xy: FloatArray  # px, NaN where the flag says why, (k, 2)
+    xy: FloatArray  # px, NaN with the reason in the flag, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
     flag: IntArray  # see LsmFlag, (k,)
 

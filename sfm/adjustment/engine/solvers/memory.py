@@ -13,7 +13,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
-UNKNOWN = 8e9  # bytes where the system does not say what it has
+UNKNOWN = 8e9  # bytes where the system does not state what it has
 # What a container may take, in bytes, of control groups of version 2 and 1: beyond it processes are ended
 LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
@@ -26,7 +26,7 @@ def available_bytes() -> float:
     for file in LIMITS:
         try:
             known = min(known, float(file.read_text(encoding="ascii")))
-        except (OSError, ValueError):  # there is no such file, or it says "max"
+        except (OSError, ValueError):  # there is no such file, or it contains "max"
             continue
     if resource is not None:  # ulimit -v
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]

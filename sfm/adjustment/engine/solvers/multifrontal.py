@@ -81,7 +81,7 @@ class MultifrontalSolver:
 
     @cached_property
     def limit(self) -> float:
-        """Memory that may be taken, bytes, asked for once in an adjustment: files say it."""
+        """Memory that may be taken, bytes, asked for once in an adjustment: files state it."""
         return memory.available_bytes()
 
     def factor(

@@ -161,7 +161,7 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
 
 
 def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
-    """Raise SurveyFileError where a camera in AICON's form is incomplete or stands beside other values."""
+    """Raise SurveyFileError where a camera in AICON's form is incomplete or is beside other values."""
     given = dict(camera.balanced)
     if camera.model != BALANCED_MODEL:
         raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected {BALANCED_MODEL}")
@@ -207,7 +207,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         for parameter in names:
             if names.count(parameter) > 1:
                 raise SurveyFileError(
-                    f"{at}: parameter '{parameter}' stands {names.count(parameter)} times in {key}, once is "
+                    f"{at}: parameter '{parameter}' is {names.count(parameter)} times in {key}, once is "
                     "needed"
                 )
     for one, other, both in (
@@ -229,7 +229,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         )
     if camera.calibration is not None:
         for key in sorted(camera.model_fields_set - {"name", "images", "size_px", *CALIBRATION_KEYS}):
-            raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration says it all")
+            raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration gives all")
     elif camera.calibration_use != "fixed":
         raise SurveyFileError(f"{at}: calibration_use is given, calibration is needed with it")
     for parameter in start:
@@ -239,7 +239,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         if parameter not in camera.adjusted:
             key = "per_photograph" if parameter in camera.per_photograph else "per_group"
             raise SurveyFileError(
-                f"{at}: parameter '{parameter}' stands in {key} but is not adjusted, it is needed in free or "
+                f"{at}: parameter '{parameter}' is in {key} but is not adjusted, it is needed in free or "
                 "weighted"
             )
     if bool(camera.per_group) != bool(camera.groups):

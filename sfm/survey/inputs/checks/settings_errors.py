@@ -36,7 +36,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
 
     Args:
         path: the survey file, or what else messages begin with.
-        text: what it says; empty for settings from Python.
+        text: its content; empty for settings from Python.
         error: what pydantic found.
         whole: the file as a section, for the keys that it may have.
     """
@@ -82,7 +82,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
 
 
 def _found(value: Any) -> str:
-    """Show a value as it stands in a TOML file, shortened."""
+    """Show a value as it is in a TOML file, shortened."""
     shown = str(value).lower() if isinstance(value, bool) else repr(value)
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
@@ -115,7 +115,7 @@ def _section_in(annotation: Any) -> type[Section] | None:
 
 
 def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:
-    """Return the line of the survey file on which the key of a location stands, None if not found."""
+    """Return the line of the survey file on which the key of a location is, None if not found."""
     keys = [str(part) for part in location if isinstance(part, str)]
     # An index behind the table is that of a table in double brackets, a later one counts values of a key.
     number = location[1] if len(location) > 1 and isinstance(location[1], int) else 0
