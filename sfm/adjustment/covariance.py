@@ -27,7 +27,7 @@ from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
-from sfm.adjustment.engine.observed import Observed, observed_of
+from sfm.adjustment.engine.observed import ObservedKind, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
@@ -45,7 +45,7 @@ class Marginal:
 
     adjustment: Adjustment
     layout: Unknowns
-    observed: tuple[Observed, ...]
+    observed: tuple[ObservedKind, ...]
     optimum: Optimum
     cofactors: Cofactors
 

@@ -84,7 +84,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     together = first.common is not None and second.common is not None
     if not together:
         _refuse_shared_calibration(first, second)
-    a, b = _of_own_photographs(first.result, "a"), _of_own_photographs(second.result, "b")
+    a, b = _with_prefixed_photographs(first.result, "a"), _with_prefixed_photographs(second.result, "b")
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
     rows_a, rows_b = a.covariance_rows(pa), b.covariance_rows(pb)
@@ -132,7 +132,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     )
 
 
-def _of_own_photographs(result: Solution, prefix: str) -> Solution:
+def _with_prefixed_photographs(result: Solution, prefix: str) -> Solution:
     """Return a result whose photographs have other names than those of another epoch."""
     names = tuple(f"{prefix}/{name}" for name in result.network.images)
     return replace(result, network=replace(result.network, images=names))

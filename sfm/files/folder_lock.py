@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import lock_descriptor, unlock_descriptor
 
 from sfm.errors import FolderInUseError, OutputError
-from sfm.files.open_folders import make_folder, open_own
+from sfm.files.open_folders import make_folder, open_regular_file
 
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
 TEXT_AT = 1  # Windows keeps others from reading the locked byte, the first
@@ -80,7 +80,7 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
 def owner_of(path: Path) -> Owner | None:
     """Read who owns the lock file `path`, or has left it behind; None if that is not stated."""
     try:
-        handle = open_own(path, os.O_RDONLY)
+        handle = open_regular_file(path, os.O_RDONLY)
     except (OSError, OutputError):
         return None
     try:
@@ -92,7 +92,7 @@ def owner_of(path: Path) -> Owner | None:
 def _open_and_lock(path: Path, folder: Path) -> int:
     """Open and lock the file that is at `path` now, not one that its owner has just removed."""
     while True:
-        handle = open_own(path, os.O_RDWR | os.O_CREAT)
+        handle = open_regular_file(path, os.O_RDWR | os.O_CREAT)
         if not lock_descriptor(handle, blocking=False):
             owner = _owner(handle)
             os.close(handle)

@@ -16,7 +16,7 @@ from typing import Any
 
 from sfm.display import listed
 from sfm.errors import OutputError
-from sfm.files.open_folders import open_own, refuse_links
+from sfm.files.open_folders import open_regular_file, refuse_links
 
 MANIFEST = "manifest.json"
 WRITER = "kolinear"
@@ -89,7 +89,7 @@ def manifest_text(hashes: dict[str, list[str]]) -> str:
 def read_manifest(folder: Path) -> dict[str, list[str]]:
     """Return the hashes that files of a folder may have, by name; none without a list that can be read."""
     try:
-        handle = open_own(folder / MANIFEST, os.O_RDONLY)
+        handle = open_regular_file(folder / MANIFEST, os.O_RDONLY)
         with os.fdopen(handle, "rb") as file:
             data = file.read(MAX_MANIFEST_BYTES)
         found: Any = json.loads(data)

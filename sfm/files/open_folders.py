@@ -109,7 +109,7 @@ def move(source: Path, source_folder: int | None, target: Path, target_folder: i
         os.rename(source.name, target.name, src_dir_fd=source_folder, dst_dir_fd=target_folder)
 
 
-def open_own(path: Path, flags: int) -> int:
+def open_regular_file(path: Path, flags: int) -> int:
     """Open a regular file that has no second name, following no link, and return its handle.
 
     Args:

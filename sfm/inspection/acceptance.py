@@ -158,7 +158,7 @@ def accept_result(
     for name in (*lengths.start, *lengths.end):
         if name not in points.names:
             raise UnknownNameError(f"lengths: point {name} is not in the result {result.name}")
-    _refuse_own_scale(result.name, lengths, bars, control)
+    _refuse_tested_scale(result.name, lengths, bars, control)
     functions = [
         distance(point_function(points, start), point_function(points, end))
         for start, end in zip(lengths.start, lengths.end, strict=True)
@@ -196,7 +196,7 @@ def accept_result(
     )
 
 
-def _refuse_own_scale(
+def _refuse_tested_scale(
     name: str, lengths: CalibratedLengths, bars: Sequence[str] | None, control: Sequence[str]
 ) -> None:
     """Refuse lengths on a bar that gave the scale."""

@@ -120,7 +120,7 @@ class PlannedSurvey:
 
 
 @dataclass(frozen=True)
-class Achieved:
+class AchievedPrecision:
     """Precision that a simulated survey achieved, against the prediction of its plan."""
 
     points: int  # planned points that were measured
@@ -428,7 +428,7 @@ def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
 
 def achieved(
     plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px: float, *, seed: int = 0
-) -> Achieved:
+) -> AchievedPrecision:
     """Return what a simulated survey achieved against its plan.
 
     Args:
@@ -464,7 +464,7 @@ def achieved(
     if result.point_covariance is None:
         raise SurveyFileError("simulation: the result has no standard deviations")
     sigma = motion.scale * np.sqrt(np.trace(result.point_covariance[j], axis1=1, axis2=2) / 3)
-    return Achieved(
+    return AchievedPrecision(
         int(found.sum()),
         len(plan.points),
         float(np.median(sigma / predicted)),

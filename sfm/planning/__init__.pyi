@@ -1,6 +1,6 @@
 """The public names of `sfm.planning`, a row each."""
 
-from sfm.planning.design.candidates import Allowed as Allowed
+from sfm.planning.design.candidates import StationLimits as StationLimits
 from sfm.planning.design.designer import Design as Design
 from sfm.planning.design.designer import design_network as design_network
 from sfm.planning.further import Further as Further
@@ -28,6 +28,6 @@ from sfm.planning.stations import Stations as Stations
 from sfm.planning.stations import arrangement as arrangement
 from sfm.planning.target_size import TargetSize as TargetSize
 from sfm.planning.target_size import compute_target_size as compute_target_size
-from sfm.planning.wanted import Wanted as Wanted
+from sfm.planning.wanted import WantedPrecision as WantedPrecision
 from sfm.planning.weakness import Calibratability as Calibratability
 from sfm.planning.weakness import calibratability as calibratability

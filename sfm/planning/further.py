@@ -20,7 +20,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
-from sfm.planning.design.candidates import Allowed, Candidates, candidates
+from sfm.planning.design.candidates import Candidates, StationLimits, candidates
 from sfm.planning.design.gain import gains, image_rows
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.shots import Shot, shots
@@ -153,12 +153,12 @@ def _faced(network: Network, estimate: Estimate, rows: IntArray) -> PlannedObjec
     return PlannedObject(tuple(network.points[j] for j in rows), estimate.points[rows], normals)
 
 
-def _room(planned: PlannedObject, position: FloatArray) -> Allowed:
+def _room(planned: PlannedObject, position: FloatArray) -> StationLimits:
     """Return the room that a survey was photographed from, a little larger."""
     nearest = np.linalg.norm(planned.xyz[None] - position[:, None], axis=2).min(axis=1)
     low, high = position.min(axis=0), position.max(axis=0)
     margin = ROOM * float(np.linalg.norm(high - low)) + 1e-6 * planned.size
-    return Allowed(
+    return StationLimits(
         (DISTANCES[0] * float(nearest.min()), DISTANCES[1] * float(nearest.max())),
         np.stack([low - margin, high + margin]),
     )

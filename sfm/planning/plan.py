@@ -21,7 +21,7 @@ from sfm.planning.sight import MIN_PIXELS
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations
 from sfm.planning.target_size import STEEPEST_DEG, TargetSize, compute_target_size
-from sfm.planning.wanted import Wanted, short_of
+from sfm.planning.wanted import WantedPrecision, short_of
 from sfm.planning.weakness import (
     Calibratability,
     WeakPoint,
@@ -40,7 +40,7 @@ class Plan:
     unit: str  # of lengths
     prediction: Prediction
     seeing: Seeing
-    wanted: Wanted
+    wanted: WantedPrecision
     design: Design | None  # None where the stations were given
     shortfall: float  # largest of predicted over wanted; 0 where nothing is wanted
     weak: tuple[WeakPoint, ...]
@@ -67,7 +67,7 @@ def plan_of(
     stations: Stations,
     seeing: Seeing,
     *,
-    wanted: Wanted,
+    wanted: WantedPrecision,
     bars: Sequence[ScaleBarPlan] = (),
     given: Callable[[Network], Network] | None = None,
 ) -> Plan:
@@ -86,7 +86,7 @@ def describe_plan(
     unit: str,
     prediction: Prediction,
     seeing: Seeing,
-    wanted: Wanted,
+    wanted: WantedPrecision,
     shortfall: float,
     design: Design | None,
 ) -> Plan:

@@ -25,7 +25,7 @@ ALPHA = 0.001  # of the test of one point among many
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WantedPrecision:
     """Each None if it is not asked for; lengths in the object unit."""
 
     sigma: float | None = None  # of every point, RMS of its coordinates
@@ -72,7 +72,7 @@ def found_displacement(prediction: Prediction) -> FloatArray:
     return prediction.largest_sigma * displacement_per_sigma()
 
 
-def short_of(prediction: Prediction, wanted: Wanted, points: BoolArray) -> float:
+def short_of(prediction: Prediction, wanted: WantedPrecision, points: BoolArray) -> float:
     """Return the largest of what is predicted over what is wanted; 1 or less where all of it is reached.
 
     Infinite where a point has fewer than MIN_RAYS, or the network leaves something undetermined.

@@ -15,7 +15,7 @@ from sfm.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, fixed, length_of, significant
-from sfm.report.page import YES, Column, Folded, Note, Page, Part, Section, Table, axes, values_of
+from sfm.report.page import YES, Column, FoldedParts, Note, Page, Part, Section, Table, axes, values_of
 
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -64,7 +64,7 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
             Section("Test", *_test(found, tested)),
             Section("Picture", picture),
             *(Section(f"Camera {one.camera}", *_camera(one, second)) for one in found.interior),
-            Section("Points", Folded(counted(len(rows), "point"), Table(columns, rows, "differences"))),
+            Section("Points", FoldedParts(counted(len(rows), "point"), Table(columns, rows, "differences"))),
         ),
         summary=_summary(found, tested),
     )

@@ -22,7 +22,7 @@ from sfm.report.numbers import finer_unit, general, significant
 from sfm.report.page import (
     YES,
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Note,
     Page,
@@ -180,7 +180,7 @@ def _section(pair: EpochPair, number: int) -> Section:
         _steps(found),
         test,
         _picture(found, number),
-        Folded(counted(len(d.points), "point"), *points, open=bool(found.moved.any())),
+        FoldedParts(counted(len(d.points), "point"), *points, open=bool(found.moved.any())),
         *(part for block in pair.blocks for part in _block(block, factor, unit)),
         *_mounts(pair, factor, unit),
     )

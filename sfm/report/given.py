@@ -14,7 +14,7 @@ from sfm.report.findings.given_residuals import Given
 from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant, with_exponent
 from sfm.report.page import (
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Note,
     Paragraph,
@@ -109,7 +109,7 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
     yield Note(R_AND_W)
     rows.sort(key=lambda row: -abs(np.nan_to_num(row[-1])))
     table = Table(heads, rows, all_in="given.csv")
-    yield table if len(rows) <= MAX_OPEN else Folded(counted(len(rows), "value"), table, in_text=True)
+    yield table if len(rows) <= MAX_OPEN else FoldedParts(counted(len(rows), "value"), table, in_text=True)
     if found.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
         yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
 

@@ -26,7 +26,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from sfm.errors import OutputError
-from sfm.files.open_folders import make_folder, open_own
+from sfm.files.open_folders import make_folder, open_regular_file
 from sfm.report.findings.findings import Findings
 from sfm.runtime.progress import SILENT, Progress
 
@@ -67,7 +67,7 @@ class SurveyLog:
                 else:
                     remove_log(path)  # another run may have it open still
                 flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_EXCL)
-                self._file = os.fdopen(open_own(path, flags), "a", encoding="utf-8")
+                self._file = os.fdopen(open_regular_file(path, flags), "a", encoding="utf-8")
             except OSError as error:
                 raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
 
@@ -173,7 +173,7 @@ def result_entries(findings: Findings) -> dict[str, Any]:
 def refuse_other_log(path: Path) -> None:
     """Raise OutputError where something stands that is no log, or a link on the way to it."""
     try:
-        os.close(open_own(path, os.O_RDONLY))
+        os.close(open_regular_file(path, os.O_RDONLY))
         if path.stat().st_size and not any({"time", "event"} <= entry.keys() for entry in read_log(path)):
             raise OutputError(f"{path}: is no log of Kolinear, and is left alone; needed another --out")
     except FileNotFoundError:

@@ -21,7 +21,7 @@ from sfm.report.figures.plots import plot
 from sfm.report.numbers import fixed, general, signed, significant, with_sigma
 from sfm.report.page import (
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Note,
     Page,
@@ -65,7 +65,7 @@ def page(found: Measurement, *, result: Solution) -> Page:
             Section("Shapes", *(part for fit in found.shapes for part in _shape(found, fit))),
             Section("Distances, angles and heights", quantities if quantities.rows else None),
             Section("Alignment", *_alignment(found.alignment, u)),
-            Section("Points", Folded(counted(len(rows), "point"), Table(columns, rows, "points"))),
+            Section("Points", FoldedParts(counted(len(rows), "point"), Table(columns, rows, "points"))),
         ),
         tiles=(
             Tile("Points", len(points.names), groups),
@@ -118,7 +118,7 @@ def _tolerances(found: Measurement) -> tuple[Part, ...]:
     parts: list[Part] = [Table(columns, rows), note]
     for k, one in enumerate(found.tolerances):
         caption = f"Deviations of {one.name} from {one.against}, with its limits."
-        folded = Folded(counted(len(one.points), "deviation"), _deviations(found, [one], file=""))
+        folded = FoldedParts(counted(len(one.points), "deviation"), _deviations(found, [one], file=""))
         parts += [Heading(one.name), plot(f"deviations {k}", caption, deviation_figure(one, u)), folded]
     return tuple(parts)
 
@@ -170,7 +170,7 @@ def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
         Heading(f"{fit.name}: {fit.shape.kind.name}"),
         _parameters(found, [fit], file=""),
         facts(rows),
-        Folded(counted(len(fit.points), "point"), points),
+        FoldedParts(counted(len(fit.points), "point"), points),
     )
 
 
@@ -242,7 +242,7 @@ def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
     columns = (Column("point"), *axes("d", u, signed), Column("used", flag=USED))
     differences = [(n, *d, used) for n, d, used in zip(fit.names, fit.difference, fit.used, strict=True)]
     title = f"{counted(len(fit.names), 'difference')}, aligned minus nominal"
-    return facts(rows), Folded(title, Table(columns, differences))
+    return facts(rows), FoldedParts(title, Table(columns, differences))
 
 
 def point_sigma(found: Measurement) -> FloatArray:

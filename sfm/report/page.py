@@ -256,7 +256,7 @@ class Card:
     kind: ClassVar[str] = "card"
 
 
-class Folded:
+class FoldedParts:
     """Parts that a click unfolds; a text has them where that is stated."""
 
     kind: ClassVar[str] = "folded"
@@ -274,7 +274,7 @@ class Cards:
         self.cards = tuple(cards)
 
 
-Part = Table | Plot | Paragraph | Folded | Cards
+Part = Table | Plot | Paragraph | FoldedParts | Cards
 
 
 class Section:
@@ -384,4 +384,4 @@ def values_of(one: object, names: str) -> dict[str, Any]:
 
 def _unfolded(parts: Iterable[Part]) -> Iterable[Part]:
     for part in parts:
-        yield from _unfolded(part.parts) if isinstance(part, Folded) else (part,)
+        yield from _unfolded(part.parts) if isinstance(part, FoldedParts) else (part,)

@@ -38,7 +38,7 @@ from sfm.report.numbers import (
 from sfm.report.page import (
     YES,
     Column,
-    Folded,
+    FoldedParts,
     Note,
     Page,
     Paragraph,
@@ -95,7 +95,7 @@ def page(plan: Plan) -> Page:
             Section("Camera", *_camera(plan)),
             *((Section("Rig", *_rigs(plan)),) if plan.prediction.stations.rig is not None else ()),
             *((Section("Gain", *_gain(plan)),) if plan.contributions else ()),
-            Section("Points", Folded(counted(len(points.rows), "point"), points)),
+            Section("Points", FoldedParts(counted(len(points.rows), "point"), points)),
         ),
         viewer=plan_viewer(plan),
         summary=_summary(plan),

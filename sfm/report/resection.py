@@ -11,7 +11,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import ResectionSolution
 from sfm.report.page import Column, Table, plain
-from sfm.textbook.resection.by_method import Resected
+from sfm.textbook.resection.by_method import ResectionResult
 from sfm.textbook.resection.dlt import DirectLinearTransformation
 
 EXTERIOR = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
@@ -23,7 +23,7 @@ METHODS = (
 )
 
 
-def resection_json(found: Resected, c: float) -> dict[str, Any]:
+def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
     """Return what one method finds, ready for JSON.
 
     Args:
@@ -62,7 +62,7 @@ def resection_json(found: Resected, c: float) -> dict[str, Any]:
     return {name: plain(value) for name, value in known.items() if value is not None}
 
 
-def comparison_json(found: dict[str, Resected | GeometryError], c: float) -> list[dict[str, Any]]:
+def comparison_json(found: dict[str, ResectionResult | GeometryError], c: float) -> list[dict[str, Any]]:
     """Return what all methods find, or why one finds nothing, ready for JSON; c in mm."""
     return [
         {"method": name, "error": str(one)} if isinstance(one, GeometryError) else resection_json(one, c)
@@ -70,7 +70,7 @@ def comparison_json(found: dict[str, Resected | GeometryError], c: float) -> lis
     ]
 
 
-def comparison_table(found: dict[str, Resected | GeometryError], c: float) -> str:
+def comparison_table(found: dict[str, ResectionResult | GeometryError], c: float) -> str:
     """Return what all methods find side by side, and below why others find nothing; c in mm."""
     rows, remarks = [], []
     for name, one in found.items():
@@ -83,7 +83,7 @@ def comparison_table(found: dict[str, Resected | GeometryError], c: float) -> st
     return (Table(METHODS, rows).text + "".join(remarks)).rstrip("\n")
 
 
-def resection_text(found: Resected, c: float) -> str:
+def resection_text(found: ResectionResult, c: float) -> str:
     """Return what one method finds as text; c in mm."""
     lines = [f"{found.method}, {counted(found.points, 'point')}"]
     for k, one in enumerate(found.solutions, start=1):

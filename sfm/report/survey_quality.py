@@ -27,7 +27,7 @@ from sfm.report.numbers import (
 )
 from sfm.report.page import (
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Note,
     Paragraph,
@@ -206,7 +206,7 @@ def image_point_parts(f: Findings) -> Iterator[Part]:
         "much to correct it, unless sigma0 is several times too large."
     )
     if s.known:
-        yield Folded("Tests and reliability of single image coordinates", *_reliability(f), in_text=True)
+        yield FoldedParts("Tests and reliability of single image coordinates", *_reliability(f), in_text=True)
 
 
 def _reliability(f: Findings) -> Iterator[Part]:
@@ -299,7 +299,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         yield Paragraph(f"Radial distortion together against 0 (F test): {'; '.join(tests)}.")
     if single := f.interior.single:
         summary = f"{counted(len(single), 'parameter')} of single photographs and groups"
-        yield Folded(summary, _parameters(single, of=True), open=len(single) <= MAX_OPEN, in_text=True)
+        yield FoldedParts(summary, _parameters(single, of=True), open=len(single) <= MAX_OPEN, in_text=True)
     for rig in f.rigs:
         yield Heading(f"Rig {rig.name}")
         yield Paragraph(
@@ -313,7 +313,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
             for name, value, sigma, is_length in mount.values
         ]
         yield Table(columns("camera", "", ">value", ">sigma", "unit"), rows)
-    yield Folded("Correlations and significance of camera parameters", *_correlations(f), in_text=True)
+    yield FoldedParts("Correlations and significance of camera parameters", *_correlations(f), in_text=True)
 
 
 def _correlations(f: Findings) -> Iterator[Part]:
@@ -328,7 +328,7 @@ def _correlations(f: Findings) -> Iterator[Part]:
     others = [pair for pair in s.correlations if pair not in s.camera_correlations]
     if others:
         summary = f"{len(others)} strong correlations within the exterior orientation of a photograph"
-        yield Folded(summary, _pairs(others))
+        yield FoldedParts(summary, _pairs(others))
     if strong:
         heads = (Column("camera parameter"), Column("strongly correlated with"))
         rows = [
@@ -380,4 +380,4 @@ def component_parts(f: Findings) -> Iterator[Part]:
         some = [row for row in rows if row[0] == kind]
         if kind != "kind" or len(some) > 1:
             table = Table(columns, some, all_in=VARIANCE_COMPONENTS.file)
-            yield Folded(f"Variance components by {name}", table, in_text=True)
+            yield FoldedParts(f"Variance components by {name}", table, in_text=True)

@@ -23,7 +23,7 @@ from sfm.report.page import (
     Card,
     Cards,
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Link,
     Note,
@@ -254,7 +254,7 @@ def rejected(report: Report) -> Section:
                 f"standard deviations; they took no part in the result. {limits}"
             )
         )
-        parts += [_rejected_points(a), Folded("Rejected rays by point", _rejected_rays(f), in_text=True)]
+        parts += [_rejected_points(a), FoldedParts("Rejected rays by point", _rejected_rays(f), in_text=True)]
     else:
         words = f"None of the {len(a.rejected)} image points was rejected in the adjustment."
         parts.append(Paragraph(f"{words} {limits}"))
@@ -303,7 +303,7 @@ def _rejected_rays(f: Findings) -> Table:
     return Table(columns("point", "rays", "photographs"), rows, all_in="image_points.csv")
 
 
-def _candidates(f: Findings) -> Folded:
+def _candidates(f: Findings) -> FoldedParts:
     """Return what was measured in each photograph, and why other candidates were not."""
     result = f.result
     used = dict(zip(f.result.adjustment.network.images, f.geometry.image_points.tolist(), strict=True))
@@ -325,7 +325,7 @@ def _candidates(f: Findings) -> Folded:
         "Clutter in view makes many of them; the overlays show each."
     )
     heads = columns("photograph", ">measured", ">accepted in the result", *(f">{one}" for one in reasons))
-    return Folded("Candidates in the photographs", note, Table(heads, rows, total=total), open=True)
+    return FoldedParts("Candidates in the photographs", note, Table(heads, rows, total=total), open=True)
 
 
 def coordinates(report: Report) -> Section:
@@ -376,8 +376,8 @@ def coordinates(report: Report) -> Section:
             Paragraph("In the folder of this report:"),
             facts([(Link(name, name), words) for name, words in files]),
         ),
-        Folded(counted(len(points.rows), "object point"), points, open=len(points.rows) <= MAX_OPEN),
-        Folded(f"Exterior orientation of {counted(len(photographs.rows), 'photograph')}", photographs),
+        FoldedParts(counted(len(points.rows), "object point"), points, open=len(points.rows) <= MAX_OPEN),
+        FoldedParts(f"Exterior orientation of {counted(len(photographs.rows), 'photograph')}", photographs),
         key="coordinates",
         in_text=False,
     )
@@ -457,7 +457,7 @@ def photographs(report: Report) -> Section:
         cards.append(Card(f"overlays/{one.file_name}", one.thumbnail, one.image, words))
     others = [(Link(one.image, f"overlays/{one.file_name}"),) for one in overlays[MAX_LISTED:]]
     without = f"{counted(len(others), 'further photograph')}, without a small picture here"
-    more = Folded(without, Table(columns("photograph"), others)) if others else None
+    more = FoldedParts(without, Table(columns("photograph"), others)) if others else None
     return Section("The photographs", legend, Cards(cards), more, key="photographs", in_text=False)
 
 

@@ -9,7 +9,18 @@ from collections.abc import Iterable, Iterator
 
 from sfm.display import NO_BREAK, bound
 from sfm.report.figures.plot_data import Plot
-from sfm.report.page import Cards, Folded, Heading, Note, Page, Paragraph, Part, Subheading, Table, one_line
+from sfm.report.page import (
+    Cards,
+    FoldedParts,
+    Heading,
+    Note,
+    Page,
+    Paragraph,
+    Part,
+    Subheading,
+    Table,
+    one_line,
+)
 
 WIDTH = 100
 MAX_ROWS = 10  # of a table
@@ -41,7 +52,7 @@ def _lines(parts: Iterable[Part]) -> Iterator[str]:
                 heading = ["", f"{one_line(part.text)} ".ljust(WIDTH, "-")]
             case Subheading():
                 heading += ["", *wrapped(MARGIN + one_line(part.text), behind=4)]
-            case Folded():
+            case FoldedParts():
                 found = list(_lines(part.parts)) if part.in_text else []
             case Paragraph():
                 found = wrapped(MARGIN + one_line(part.text), behind=4)

@@ -16,7 +16,7 @@ from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import fixed, general
-from sfm.report.page import YES, Column, Folded, Note, Page, Paragraph, Section, Table
+from sfm.report.page import YES, Column, FoldedParts, Note, Page, Paragraph, Section, Table
 
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost is constant, for the sake "
@@ -77,7 +77,7 @@ def page(found: Validation) -> Page:
                 ),
             ),
             Section("Time", plot("time", TIME_CAPTION, time_figure(found))),
-            Section("All networks", Folded(counted(len(found.trials), "network"), trials)),
+            Section("All networks", FoldedParts(counted(len(found.trials), "network"), trials)),
         ),
         summary={
             "backend": found.backend,

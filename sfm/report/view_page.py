@@ -14,7 +14,7 @@ from sfm.files.whole_files import refuse_existing, whole_file
 from sfm.remarks.verdict import Line
 from sfm.report.html import html
 from sfm.report.numbers import fixed
-from sfm.report.page import Banner, Column, Folded, Page, Section, Table, axes, facts
+from sfm.report.page import Banner, Column, FoldedParts, Page, Section, Table, axes, facts
 from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, Pictures, cut_pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -67,7 +67,7 @@ def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
             f"{', '.join(counted(len(them), noun) for them, noun in counts)}.",
             tuple(Line("note", note) for note in viewer.notes),
         ),
-        (Section("Figures", figures, Folded("Object points", Table(columns, rows))),),
+        (Section("Figures", figures, FoldedParts("Object points", Table(columns, rows))),),
         viewer=viewer,
         pictures_beside=bool(pictures.beside),
     )

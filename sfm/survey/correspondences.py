@@ -205,7 +205,9 @@ def _match_and_adjust(
         estimate = restore_strayed(estimate, adjusted, images, points, tolerance_px=tolerance_px)
         spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
-    return _with_own_cameras(survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px)
+    return _match_by_photograph_cameras(
+        survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px
+    )
 
 
 def restore_strayed(
@@ -233,7 +235,7 @@ def restore_strayed(
     return replace(estimate, position=position, rotation=rotation)
 
 
-def _with_own_cameras(
+def _match_by_photograph_cameras(
     survey: Survey, photographs: MeasuredPhotographs, matched: _Matched, tolerance_px: float
 ) -> _Matched:
     """Match photographs that fit only with a per-photograph camera by that camera; else return what is there.

@@ -22,7 +22,7 @@ from sfm.textbook.photo_coordinates import pixel_from_photo as pixel_from_photo
 from sfm.textbook.photo_coordinates import radial_from_table as radial_from_table
 from sfm.textbook.photo_coordinates import refraction_coefficient as refraction_coefficient
 from sfm.textbook.pyramid import match_pyramid as match_pyramid
-from sfm.textbook.resection.by_method import Resected as Resected
+from sfm.textbook.resection.by_method import ResectionResult as ResectionResult
 from sfm.textbook.resection.by_method import Task as Task
 from sfm.textbook.resection.by_method import resect as resect
 from sfm.textbook.resection.by_method import resect_by_all as resect_by_all

@@ -15,7 +15,7 @@ from sfm.adjustment.hypotheses.columns import columns_of, interior_step, object_
 from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.hypotheses import (
     Cause,
-    Judged,
+    JudgedAssumptions,
     contradicted_parameters,
     find_causes,
     free_network,
@@ -381,7 +381,7 @@ def test_the_free_network_is_the_adjustment_itself_where_nothing_else_was_observ
         {"redundancy": 1},
     ):
         assert free_network(replace(a, **wrong)) is None  # type: ignore[arg-type]
-    assert judge_alternatives(replace(a, converged=False)) == Judged()
+    assert judge_alternatives(replace(a, converged=False)) == JudgedAssumptions()
     assert contradicted_parameters(replace(a, converged=False)) == ()
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([9.0]), np.array([1e-3]))
     final = replace(a, network=replace(a.network, scale_bars=bars), sigma0=5.0)
@@ -421,7 +421,7 @@ def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: 
     monkeypatch.setattr(hypotheses, "find_causes", lambda *_: ())
     monkeypatch.setattr(hypotheses, "unchecked_assumptions", lambda *_: ())
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 6)
-    assert judge_alternatives(a) == Judged()
+    assert judge_alternatives(a) == JudgedAssumptions()
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     (one,) = judge_alternatives(a).unchecked
     assert one.kind == "too_many_to_test" and one.names("photographs") == a.network.images

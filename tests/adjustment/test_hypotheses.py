@@ -21,7 +21,11 @@ from sfm.adjustment.hypotheses.columns import (
     object_fields,
 )
 from sfm.adjustment.hypotheses.families import GIVEN, HELD
-from sfm.adjustment.hypotheses.hypotheses import Judged, contradicted_parameters, judge_alternatives
+from sfm.adjustment.hypotheses.hypotheses import (
+    JudgedAssumptions,
+    contradicted_parameters,
+    judge_alternatives,
+)
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.adjustment.result import Adjustment
@@ -288,7 +292,7 @@ def test_what_could_not_be_tested_is_remarked() -> None:
     one = judge_alternatives(a).unchecked[0]
     assert (one.kind, one.number("needed")) == ("photographs_untested", 4)
     assert kinds_of(judge_alternatives(replace(a, redundancy=1)).unchecked) == ("assumptions_untested",)
-    assert judge_alternatives(replace(a, sigma0=0.0)) == Judged()
+    assert judge_alternatives(replace(a, sigma0=0.0)) == JudgedAssumptions()
 
 
 @pytest.mark.slow

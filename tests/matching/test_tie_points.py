@@ -32,7 +32,7 @@ from sfm.conventions import (
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import MAX_SHARED_FRACTION, Covered, Windows, first_alike, points_apart
+from sfm.matching.lsm.coverage import MAX_SHARED_FRACTION, CoveredPixels, Windows, first_alike, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -245,7 +245,7 @@ def test_texture_is_the_same_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_covered_pixels_are_not_free() -> None:
-    covered = Covered([(100, 120), (50, 50)])
+    covered = CoveredPixels([(100, 120), (50, 50)])
     covered.cover(np.array([0, 0]), np.array([[20.0, 30.0], [118.0, 98.0]]), np.array([10.0, 20.0]))
     assert int(covered.pixels(0).sum()) > 100 and not covered.pixels(1).any()
     at = np.array([[20.0, 30.0], [31.0, 30.0], [27.0, 30.0], [100.0, 20.0]])

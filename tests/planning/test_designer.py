@@ -11,7 +11,7 @@ import pytest
 from sfm.camera import camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.planning.design.candidates import Allowed, candidates
+from sfm.planning.design.candidates import StationLimits, candidates
 from sfm.planning.design.designer import design_network
 from sfm.planning.design.gain import POWER, gains, image_rows
 from sfm.planning.planned_object import PlannedObject, object_of_points, shape_object
@@ -19,7 +19,13 @@ from sfm.planning.prediction import predict_network
 from sfm.planning.shots import choose_coded, roll_deg
 from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import Stations, arrangement, looking, rolled
-from sfm.planning.wanted import MIN_RAYS, Wanted, displacement_per_sigma, found_displacement, short_of
+from sfm.planning.wanted import (
+    MIN_RAYS,
+    WantedPrecision,
+    displacement_per_sigma,
+    found_displacement,
+    short_of,
+)
 from sfm.runtime.progress import Silent, StageClock
 from tests.synthetic import seed_of
 
@@ -27,19 +33,19 @@ CAMERA = camera_from_values(
     "c", "brown", (6000, 4000), (0.006, 0.006), c_mm=28.0, free=("c", "x0", "y0", "K1", "K2", "P1", "P2")
 )
 SEEING = Seeing(sigma_px=0.05)
-CORRIDOR = Allowed((1.0, 2.4), np.array([[-2.5, -2.4, 0.2], [2.5, -0.5, 2.3]]))
+CORRIDOR = StationLimits((1.0, 2.4), np.array([[-2.5, -2.4, 0.2], [2.5, -0.5, 2.3]]))
 OBJECTS = {  # shape, sizes [m], where one may stand, wanted sigma [m]
-    "plate": ("plate", (1.0, 0.7), Allowed(floor=0.0), 8e-6),
-    "box": ("box", (1.0, 0.6, 0.4), Allowed(floor=0.0), 1.5e-5),
-    "cylinder": ("cylinder", (0.8, 1.0), Allowed(floor=0.0), 2e-5),
-    "dish": ("dish", (1.0, 0.25), Allowed(floor=0.3), 8e-6),
+    "plate": ("plate", (1.0, 0.7), StationLimits(floor=0.0), 8e-6),
+    "box": ("box", (1.0, 0.6, 0.4), StationLimits(floor=0.0), 1.5e-5),
+    "cylinder": ("cylinder", (0.8, 1.0), StationLimits(floor=0.0), 2e-5),
+    "dish": ("dish", (1.0, 0.25), StationLimits(floor=0.3), 8e-6),
     "wall": ("wall", (4.0, 2.0), CORRIDOR, 4e-5),
 }
 MOST = 60
 RINGS = ("ring", "two-rings", "hemisphere")
 
 
-def needed(planned: PlannedObject, wanted: Wanted, make: object, most: int = MOST) -> int:
+def needed(planned: PlannedObject, wanted: WantedPrecision, make: object, most: int = MOST) -> int:
     """Return the fewest photographs with which an arrangement reaches what is wanted; most + 1: none."""
     every = np.ones(len(planned.names), dtype=bool)
     for count in range(4, most + 1):
@@ -55,7 +61,7 @@ def needed(planned: PlannedObject, wanted: Wanted, make: object, most: int = MOS
 def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int, int, int]:
     """Return photographs needed: designed, by the best of the rings, by the luckiest of random choices."""
     kind, sizes, allowed, sigma = OBJECTS[name]
-    planned, wanted = shape_object(kind, sizes, points), Wanted(sigma=sigma)
+    planned, wanted = shape_object(kind, sizes, points), WantedPrecision(sigma=sigma)
     found = design_network(planned, CAMERA, allowed, SEEING, wanted, max_photographs=MOST, count=count)
     assert found.reached, found.limit
     every = np.ones(points, dtype=bool)
@@ -85,7 +91,7 @@ def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int,
 
 def test_fewer_photographs_than_a_ring_or_at_random() -> None:
     kind, sizes, allowed, sigma = OBJECTS["box"]
-    planned, wanted = shape_object(kind, sizes, 40), Wanted(sigma=4 * sigma)
+    planned, wanted = shape_object(kind, sizes, 40), WantedPrecision(sigma=4 * sigma)
     steps: list[str] = []
     watching = Silent()
     watching.step = lambda name, done=None, total=None: steps.append(name)  # type: ignore[method-assign]
@@ -114,7 +120,7 @@ def test_five_objects_need_fewer_photographs_than_rings_or_at_random(name: str) 
 def test_1000_points_and_300_candidates_are_designed_within_a_minute() -> None:
     planned = shape_object("box", (1.0, 0.6, 0.4), 1000)
     start = time.process_time()
-    found = design_network(planned, CAMERA, Allowed(floor=0.0), SEEING, Wanted(sigma=1.5e-5))
+    found = design_network(planned, CAMERA, StationLimits(floor=0.0), SEEING, WantedPrecision(sigma=1.5e-5))
     seconds = time.process_time() - start  # of one core; the machine may have other work
     print(f"{len(found.prediction.stations)} photographs in {seconds:.1f} s, reached {found.reached}")
     assert found.reached and found.photographs_tried == 600
@@ -161,7 +167,7 @@ def test_candidates_keep_to_what_is_allowed() -> None:
     assert np.allclose(turn, rolled(np.eye(3)))
 
 
-BEHIND = Allowed(space=np.array([[-3.0, 1.0, 0.0], [3.0, 3.0, 2.0]]))
+BEHIND = StationLimits(space=np.array([[-3.0, 1.0, 0.0], [3.0, 3.0, 2.0]]))
 
 
 @pytest.mark.parametrize(
@@ -169,27 +175,33 @@ BEHIND = Allowed(space=np.array([[-3.0, 1.0, 0.0], [3.0, 3.0, 2.0]]))
     [
         (BEHIND, "places that are allowed fewer than 2 show 4 points; the object faces away"),
         (
-            Allowed(space=np.array([[50.0, 50, 50], [60, 60, 60]])),
+            StationLimits(space=np.array([[50.0, 50, 50], [60, 60, 60]])),
             "no room within .* needed a space that reaches",
         ),
-        (Allowed(distance=(5.0, 2.0)), "distances 5 to 2, needed 0 < least < most"),
+        (StationLimits(distance=(5.0, 2.0)), "distances 5 to 2, needed 0 < least < most"),
         (
-            Allowed(distance=(5.0, 5.0001), space=np.array([[-1.0, -1, 0], [1, 0, 1]])),
+            StationLimits(distance=(5.0, 5.0001), space=np.array([[-1.0, -1, 0], [1, 0, 1]])),
             "no station is 5 to 5.0001",
         ),
-        (Allowed(space=np.array([[1.0, -1, 0], [-1, 0, 1]])), "a side without length"),
+        (StationLimits(space=np.array([[1.0, -1, 0], [-1, 0, 1]])), "a side without length"),
     ],
 )
-def test_where_nobody_can_stand_is_said(allowed: Allowed, message: str) -> None:
+def test_where_nobody_can_stand_is_said(allowed: StationLimits, message: str) -> None:
     planned = shape_object("wall", (2.0, 1.0), 30)
     with pytest.raises(GeometryError, match=message):
-        design_network(planned, CAMERA, allowed, SEEING, Wanted(sigma=1e-4), count=20)
+        design_network(planned, CAMERA, allowed, SEEING, WantedPrecision(sigma=1e-4), count=20)
 
 
 def test_what_limits_a_design_is_said() -> None:
     planned = shape_object("plate", (1.0, 0.7), 20)
     few = design_network(
-        planned, CAMERA, Allowed(floor=0.0), SEEING, Wanted(sigma=1e-7), max_photographs=6, count=40
+        planned,
+        CAMERA,
+        StationLimits(floor=0.0),
+        SEEING,
+        WantedPrecision(sigma=1e-7),
+        max_photographs=6,
+        count=40,
     )
     assert not few.reached and few.shortfall > 1 and "the 6 photographs that are allowed" in few.limit
     assert len(few.prediction.stations) == 6
@@ -203,19 +215,19 @@ def test_displacements_and_lengths_that_are_wanted() -> None:
         np.sqrt(2) * 4.55, abs=0.2
     )  # root of 20.7: m 3, 0.1 %, 80 %
     worst = float(found_displacement(p).max())
-    assert short_of(p, Wanted(displacement=worst), every) == pytest.approx(1.0)
-    assert short_of(p, Wanted(length_sigma=2 * p.length_sigma), every) == pytest.approx(0.5)
+    assert short_of(p, WantedPrecision(displacement=worst), every) == pytest.approx(1.0)
+    assert short_of(p, WantedPrecision(length_sigma=2 * p.length_sigma), every) == pytest.approx(0.5)
     turned = replace(planned, normals=planned.normals * np.where(np.arange(20) == 4, -1.0, 1.0)[:, None])
     unseen = predict_network(turned, CAMERA, p.stations, SEEING)  # lengths between the others count
-    assert not unseen.determined[4] and short_of(unseen, Wanted(length_sigma=1.0), every) == np.inf
-    assert short_of(unseen, Wanted(length_sigma=p.length_sigma), np.arange(20) != 4) == pytest.approx(
-        1, abs=0.2
-    )
+    assert not unseen.determined[4] and short_of(unseen, WantedPrecision(length_sigma=1.0), every) == np.inf
+    assert short_of(
+        unseen, WantedPrecision(length_sigma=p.length_sigma), np.arange(20) != 4
+    ) == pytest.approx(1, abs=0.2)
     lonely = replace(p, sight=p.sight.of(np.arange(6)))
     lonely.sight.why[MIN_RAYS - 1 :, 0] = 1
-    assert short_of(lonely, Wanted(sigma=1.0), every) == np.inf
+    assert short_of(lonely, WantedPrecision(sigma=1.0), every) == np.inf
     with pytest.raises(GeometryError, match="wanted sigma is -1"):
-        Wanted(sigma=-1.0)
+        WantedPrecision(sigma=-1.0)
 
 
 def test_coded_targets_give_every_photograph_five() -> None:

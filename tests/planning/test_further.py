@@ -22,7 +22,7 @@ from sfm.planning.prediction import predict_network
 from sfm.planning.sight.image_precision import TargetImage
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations, arrangement
-from sfm.planning.wanted import Wanted
+from sfm.planning.wanted import WantedPrecision
 from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest
@@ -88,7 +88,7 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     target = TargetImage(contrast=120, noise=3, blur_px=0.8)
     stations: Stations = arrangement("ring:8", plate, camera)
     seeing = Seeing(diameter=12.0, target=target)
-    plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=Wanted())
+    plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=WantedPrecision())
     write_page(plan, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
     assert (read.seen == plan.prediction.sight.seen).all() and read.cameras[0].free.sum() == 1
@@ -110,7 +110,7 @@ def test_targets_that_overlap_are_refused(tmp_path: Path) -> None:
     plate = shape_object("plate", (100.0, 100.0), 20)
     seeing = Seeing(diameter=12.0)
     plan = plan_of(
-        "plate", "mm", plate, camera, arrangement("ring:6", plate, camera), seeing, wanted=Wanted()
+        "plate", "mm", plate, camera, arrangement("ring:6", plate, camera), seeing, wanted=WantedPrecision()
     )
     write_page(plan, tmp_path / "plan")
     with pytest.raises(GeometryError, match="overlap; needed fewer points or smaller targets"):
@@ -135,7 +135,7 @@ def test_groups_that_nothing_joins_are_named() -> None:
     named = {}
     for rings in ("two-rings:16", "ring:16"):
         stations = arrangement(rings, box, camera)
-        plan = plan_of("box", "mm", box, camera, stations, seeing, wanted=Wanted())
+        plan = plan_of("box", "mm", box, camera, stations, seeing, wanted=WantedPrecision())
         found = of_kind(verdict_of_plan(plan).remarks, "plan_not_connected", "plan_undetermined")
         named[rings] = [(one.kind, one.names("photographs"), one.names("others")) for one in found]
         assert sorted(name for group in plan.groups for name in group) == sorted(stations.names)

@@ -25,7 +25,7 @@ from sfm.planning.prediction import ScaleBarPlan, predict_network
 from sfm.planning.sight.image_precision import TargetImage
 from sfm.planning.sight.visibility import Seeing, Why
 from sfm.planning.stations import arrangement
-from sfm.planning.wanted import Wanted
+from sfm.planning.wanted import WantedPrecision
 from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan, rows
 from tests.rigs import make_rig
@@ -236,7 +236,7 @@ def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) 
     seeing = Seeing(diameter=12.0, target=TargetImage(contrast=120, noise=3, blur_px=0.8))
     stations = arrangement("ring:5", plate, small).with_rig(mounts, cameras)
     bar = ScaleBarPlan(plate.names[3], plate.names[16], 0.02)
-    found = plan_of("plate", "mm", plate, cameras, stations, seeing, wanted=Wanted(), bars=[bar])
+    found = plan_of("plate", "mm", plate, cameras, stations, seeing, wanted=WantedPrecision(), bars=[bar])
     write_page(found, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
     assert read.coded[[3, 16]].all()

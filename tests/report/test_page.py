@@ -25,7 +25,7 @@ from sfm.report.page import (
     Card,
     Cards,
     Column,
-    Folded,
+    FoldedParts,
     Heading,
     Link,
     Mark,
@@ -75,7 +75,7 @@ def page(found: Levelling) -> Page:
         judge((), {"good": worst, "fair": worst, "bad": worst}),
         (
             Section("Heights", facts([("Sigma", f"{significant(1000 * sigma)} mm")]), Note("Levelled.")),
-            Section("Points", Folded("all", Table(columns, rows, "heights"))),
+            Section("Points", FoldedParts("all", Table(columns, rows, "heights"))),
         ),
         summary={"sigma": sigma, "largest": np.nanmax(np.abs(level)), "differences": level},
     )
@@ -127,7 +127,12 @@ def test_every_kind_of_part_is_rendered_and_escaped() -> None:
     cells = (Mark(EVIL, "bad"), Link(EVIL, 'a b"/x.html'))
     table = Table((Column(EVIL), Column(EVIL)), [cells], total=("sum", None))
     words = (Heading(EVIL), Subheading(EVIL), Paragraph(EVIL), Note(EVIL), Statement(EVIL, "bad"))
-    parts = (*words, Folded(EVIL, table, open=True), Cards([Card('a b"/x.jpg', b"jpeg", EVIL, EVIL)]), None)
+    parts = (
+        *words,
+        FoldedParts(EVIL, table, open=True),
+        Cards([Card('a b"/x.jpg', b"jpeg", EVIL, EVIL)]),
+        None,
+    )
     text = html(small(*parts, tiles=(Tile(EVIL, EVIL, EVIL, wide=True),)))
     assert EVIL not in text and text.count("&lt;img src=x") == 16
     assert "<h4>&lt;img" in text and '<p class="verdict bad">&lt;img' in text and "<div class=wide>" in text
@@ -150,8 +155,8 @@ def test_a_page_as_text_has_tables_facts_and_words() -> None:
         *(Heading("Empty"), Note("a note"), Heading("Rows"), Paragraph("Words of 10 mm. " * 10)),
         facts([("name", "value " * 20), ("other", "b")]),
         Table(long, [("a|b", 1.0), ("c\nd", 10.0)] + [("e", 2.0)] * MAX_TEXT_ROWS, all_in="all.csv"),
-        Folded("left out", Paragraph("hidden")),
-        Folded("shown", Table(long, [("x" * 95, 1.0)], total=("sum", 3.0)), in_text=True),
+        FoldedParts("left out", Paragraph("hidden")),
+        FoldedParts("shown", Table(long, [("x" * 95, 1.0)], total=("sum", 3.0)), in_text=True),
     )
     sections = (Section("First", *parts), Section("Not here", Paragraph("gone"), in_text=False))
     verdict = judge(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.page import Folded, Heading, Part, Table
+from sfm.report.page import FoldedParts, Heading, Part, Table
 from sfm.report.pages import page_of
 from sfm.survey.inputs.survey import read_survey
 from tests.places import ROOT
@@ -20,7 +20,7 @@ OF_FIGURES = ("", "observations", "standard deviation", "reliability")  # first 
 
 def labels(parts: tuple[Part, ...]) -> Iterator[str]:
     for part in parts:
-        if isinstance(part, Folded):
+        if isinstance(part, FoldedParts):
             yield from labels(part.parts)
         elif isinstance(part, Heading):
             yield re.sub(r"^The \d+ ", "", part.text)

@@ -14,7 +14,7 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import AnyArray
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import Covered, Windows
+from sfm.matching.lsm.coverage import CoveredPixels, Windows
 from sfm.matching.tracks import feature_tracks
 from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
@@ -251,7 +251,7 @@ def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_b
     # normals that look at the second photograph, hardly look at it, and look away
     normal = np.stack([to_second, across + 0.2 * to_second, -to_second])
     places = _Places(0, np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
-    covered_pixels = Covered([(360, 480)] * 3)
+    covered_pixels = CoveredPixels([(360, 480)] * 3)
     assert _visible(truth, camera, places, covered_pixels, 11, 15)[1][1].tolist() == [True, False, False]
     assert not _visible(truth, camera, places, covered_pixels, 181, 15)[0][1].any()  # of 360 rows
     covered_pixels.cover(np.array([1]), np.array([[240.0, 180.0]]), np.array([1000.0]))

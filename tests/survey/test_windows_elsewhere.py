@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.hypotheses import Judged
+from sfm.adjustment.hypotheses.hypotheses import JudgedAssumptions
 from sfm.remarks.remark import of_kind, remark
 from sfm.survey.adjusting import solution
 from sfm.survey.adjusting.solution import solve_survey
@@ -26,7 +26,9 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
         remark("points_moved", points=[name], distance=0.1, shift=9.0, wrong=1.0, **{"from": "image 5"})
         for name in ("7", "17")
     ]
-    monkeypatch.setattr(solution, "judge_alternatives", lambda *_, **__: Judged(causes=(moved[0],)))
+    monkeypatch.setattr(
+        solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
+    )
     monkeypatch.setattr(solution, "explain_rejections", lambda *_, **__: (moved[1],))
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(POINTS, 2))

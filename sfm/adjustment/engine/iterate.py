@@ -26,7 +26,7 @@ from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
 from sfm.adjustment.engine.null_space import on_sound_points, with_further
-from sfm.adjustment.engine.observed import Observed, couples_poses, vPv_of
+from sfm.adjustment.engine.observed import ObservedKind, couples_poses, vPv_of
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
@@ -71,7 +71,7 @@ class Problem:
     """Constants of all steps and rounds of an adjustment."""
 
     layout: Unknowns  # order of the unknowns
-    observed: tuple[Observed, ...]  # observations beside image points
+    observed: tuple[ObservedKind, ...]  # observations beside image points
     datum: ResolvedDatum
     space: Space  # for the normal equations, used again and again
     solver: Solver  # of the reduced normal equations
@@ -104,7 +104,7 @@ class Step(Move):
         return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
 
 
-def problem_of(layout: Unknowns, observed: tuple[Observed, ...], datum: ResolvedDatum) -> Problem:
+def problem_of(layout: Unknowns, observed: tuple[ObservedKind, ...], datum: ResolvedDatum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses the solver of the normal equations."""
     keep_freed_memory()
     solver = DenseSolver(layout) if couples_poses(observed) else choose_solver(layout)

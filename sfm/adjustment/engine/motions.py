@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dgeqrf, dorgqr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed import Observed, reduced_rows
+from sfm.adjustment.engine.observed import ObservedKind, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -73,7 +73,7 @@ class Motions:
 
 
 def motions_of(
-    layout: Unknowns, observed: tuple[Observed, ...], state: State, datum: ResolvedDatum
+    layout: Unknowns, observed: tuple[ObservedKind, ...], state: State, datum: ResolvedDatum
 ) -> Motions:
     """Return the motions that the observations leave open and the constraints that the datum puts on them.
 
@@ -204,7 +204,7 @@ def _regular_inverse(BH: FloatArray) -> FloatArray:
 
 def _seen_by_datum(
     layout: Unknowns,
-    observed: tuple[Observed, ...],
+    observed: tuple[ObservedKind, ...],
     state: State,
     H: FloatArray,
     fixed_mounts: FloatArray,

@@ -29,7 +29,7 @@ from sfm.adjustment.engine.accumulate import (
     sum_poses,
 )
 from sfm.adjustment.engine.collinearity import Observations, State, new_workspace
-from sfm.adjustment.engine.observed import Observed, Terms, terms_of
+from sfm.adjustment.engine.observed import ObservedKind, Terms, terms_of
 from sfm.adjustment.engine.ordering import by_photograph
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
@@ -70,7 +70,7 @@ class Equations(NamedTuple):
 
 def normal_equations(
     layout: Unknowns,
-    observed: tuple[Observed, ...],
+    observed: tuple[ObservedKind, ...],
     state: State,
     weight: FloatArray,
     *,

@@ -25,7 +25,7 @@ from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedKind:
     """Observations of one kind that take part in an adjustment."""
 
     index: int  # of their kind among `Network.kinds`
@@ -69,7 +69,7 @@ class Reduced(NamedTuple):
 
 def observed_of(
     network: Network, layout: Unknowns, state: State, *, use_control: bool
-) -> tuple[Observed, ...]:
+) -> tuple[ObservedKind, ...]:
     """Return the observations of a network beside its image points that take part in its adjustment."""
     found = []
     for index, kind in enumerate(network.kinds):
@@ -84,7 +84,7 @@ def observed_of(
         if weight.any():
             taken = some.linearise(state).taken
             fitted = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
-            found.append(Observed(index, some, rows, weight, fitted))
+            found.append(ObservedKind(index, some, rows, weight, fitted))
     return tuple(found)
 
 
@@ -119,17 +119,17 @@ def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
     return columns
 
 
-def count_of(observed: tuple[Observed, ...]) -> int:
+def count_of(observed: tuple[ObservedKind, ...]) -> int:
     """Return how many scalar observations there are beside image points."""
     return sum(one.count for one in observed)
 
 
-def vPv_of(observed: tuple[Observed, ...], state: State) -> float:
+def vPv_of(observed: tuple[ObservedKind, ...], state: State) -> float:
     """Return v'Pv of the observations beside image points."""
     return sum(one.vPv(state) for one in observed)
 
 
-def reduced_rows(one: Observed, layout: Unknowns, state: State) -> Reduced:
+def reduced_rows(one: ObservedKind, layout: Unknowns, state: State) -> Reduced:
     """Return the derivatives of observations of a kind by the reduced unknowns, kept points included."""
     linear = one.kind.linearise(state)
     columns, parts = [], []
@@ -207,7 +207,7 @@ class Terms:
 
 
 def terms_of(
-    observed: tuple[Observed, ...], layout: Unknowns, state: State, V: FloatArray, gp: FloatArray
+    observed: tuple[ObservedKind, ...], layout: Unknowns, state: State, V: FloatArray, gp: FloatArray
 ) -> Terms:
     """Return what the observations add to the reduced normal equations; those of points alone to V and gp.
 
@@ -235,6 +235,6 @@ def terms_of(
     return Terms(tuple(rows), vPv)
 
 
-def couples_poses(observed: tuple[Observed, ...]) -> bool:
+def couples_poses(observed: tuple[ObservedKind, ...]) -> bool:
     """Return whether observations depend on two photographs each, which only a full matrix has room for."""
     return any(sum(block.of == PHOTOGRAPH for block in one.kind.blocks()) > 1 for one in observed)

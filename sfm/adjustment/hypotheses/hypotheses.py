@@ -75,7 +75,7 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedAssumptions:
     """Tests of the assumptions of an adjustment by the image points."""
 
     causes: tuple[Remark, ...] = ()  # of what contradicts them, the clearest first
@@ -84,7 +84,7 @@ class Judged:
 
 def judge_alternatives(
     final: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
-) -> Judged:
+) -> JudgedAssumptions:
     """Return the evidence of the image points against the assumptions of an adjustment.
 
     Args:
@@ -94,9 +94,9 @@ def judge_alternatives(
     """
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
-        return Judged()  # no result, or one that nothing contradicts
+        return JudgedAssumptions()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
-        return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
+        return JudgedAssumptions(unchecked=(remark("too_many_to_test", photographs=photographs),))
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     found = _judge_free(free_network(final), unit, bodies, without)
@@ -115,21 +115,21 @@ def judge_alternatives(
 
 def _judge_free(
     plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], without: str | None
-) -> Judged:
+) -> JudgedAssumptions:
     """Return the evidence of the image points alone; without their network if they determine none."""
     if plain is None:
-        return Judged(unchecked=(remark("assumptions_untested"),))
+        return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
     try:
         moving = _moving_bodies(plain, bodies)
         causes = find_causes(plain, moving)
         unchecked = unchecked_assumptions(plain, len(moving), without)
     except np.linalg.LinAlgError:
-        return Judged(unchecked=(remark("assumptions_untested"),))
+        return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)
-    return Judged(tuple(remark_of(plain, one, unit, without) for one in causes), unchecked)
+    return JudgedAssumptions(tuple(remark_of(plain, one, unit, without) for one in causes), unchecked)
 
 
 def _is_calibration(final: Adjustment) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm.adjustment.engine.cofactors import Cofactors
 from sfm.adjustment.engine.iterate import Optimum
-from sfm.adjustment.engine.observed import Observed, Reduced, reduced_rows
+from sfm.adjustment.engine.observed import ObservedKind, Reduced, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import ObservedResiduals
 from sfm.conventions import FloatArray
@@ -88,7 +88,7 @@ def standardised_of_given(
 
 
 def residuals_of_observed(
-    one: Observed, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
+    one: ObservedKind, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
 ) -> ObservedResiduals:
     """Return the residuals of observations of a kind, with their redundancy numbers and tests.
 

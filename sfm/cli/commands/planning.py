@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.planning_inputs import (
-    Planned,
+    PlannedSetup,
     bars_of,
     camera_of,
     numbers,
@@ -233,13 +233,13 @@ def network_command(
         from sfm.cli.console import print_verdict
         from sfm.conventions import METRES
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.planning.design.candidates import Allowed
+        from sfm.planning.design.candidates import StationLimits
         from sfm.planning.design.designer import design_network
         from sfm.planning.findings import verdict_of_plan
         from sfm.planning.plan import describe_plan, plan_of
         from sfm.planning.sight.image_precision import TargetImage
         from sfm.planning.sight.visibility import Seeing
-        from sfm.planning.wanted import Wanted
+        from sfm.planning.wanted import WantedPrecision
         from sfm.report.pages import write_page
         from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
@@ -248,7 +248,7 @@ def network_command(
     refuse_foreign_folder(out)
     if unit not in METRES:
         raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
-    wanted = Wanted(sigma, length_sigma, displacement)
+    wanted = WantedPrecision(sigma, length_sigma, displacement)
     if stations is None and not wanted.anything:
         raise SurveyFileError(
             "plan: neither --stations nor what is wanted; needed one of --stations, --sigma, "
@@ -268,7 +268,7 @@ def network_command(
         if survey is not None:
             taken = survey_plan(survey, object_, unit, free_mounts=free_mounts)
         else:
-            taken = Planned((camera_of(str(camera), camera_name, c, free),))
+            taken = PlannedSetup((camera_of(str(camera), camera_name, c, free),))
         one = taken.reference
         depth = _depth(one, f_number, focus, confusion, to_mm)
         seeing = Seeing(
@@ -290,7 +290,7 @@ def network_command(
             )
         else:
             taken.refuse_to_design()
-            allowed = Allowed(
+            allowed = StationLimits(
                 None if distance is None else _two(numbers("--distance", distance, 2)),
                 None if space is None else _space(space),
                 floor,

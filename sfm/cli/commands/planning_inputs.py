@@ -210,7 +210,7 @@ def _of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> 
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedSetup:
     """Cameras of a plan, and what is observed beside image points."""
 
     cameras: tuple[Camera, ...]
@@ -257,7 +257,7 @@ class Planned:
         return [table for table in tables if table.of.texts_of == PHOTOGRAPH]
 
 
-def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: bool) -> Planned:
+def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: bool) -> PlannedSetup:
     """Return cameras, rig, scale bars and observations of a planned survey.
 
     Args:
@@ -297,4 +297,4 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
         return network if rig is None or free_mounts else with_given_mounts(survey, network)
 
     bars = tuple(ScaleBarPlan(bar.start, bar.end, bar.sigma) for bar in survey.scale_bars)
-    return Planned(cameras, rig, bars, given, survey)
+    return PlannedSetup(cameras, rig, bars, given, survey)

@@ -34,7 +34,7 @@ UNCHECKED = 1e-9  # redundancy of a constraint below which nothing checks it
 
 
 @dataclass(frozen=True)
-class Weighted:
+class WeightedFit:
     """A shape adjusted with the covariance of its points, and its equations there."""
 
     shape: Shape
@@ -58,7 +58,7 @@ def refine_weighted(
     offset: FloatArray,
     size: float = 1.0,
     placed: bool = True,
-) -> Weighted:
+) -> WeightedFit:
     """Return the shape of the least v' Q^-1 v near a start.
 
     Args:
@@ -114,7 +114,7 @@ def refine_weighted(
     inverse: FloatArray = np.asarray(np.linalg.inv(N))
     linear = -(inverse @ PA.T)
     by_point = linear.reshape(len(dp), n, -1)
-    return Weighted(
+    return WeightedFit(
         shape,
         adjusted,
         B,

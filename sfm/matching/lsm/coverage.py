@@ -44,7 +44,7 @@ def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
     return next(windows for windows, cost in costs if cost <= MAX_COST_RATIO * best)
 
 
-class Covered:
+class CoveredPixels:
     """Which pixels of photographs have been measured, a bit each."""
 
     def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:

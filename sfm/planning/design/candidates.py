@@ -25,7 +25,7 @@ BASES = (2, 3, 5)
 
 
 @dataclass(frozen=True)
-class Allowed:
+class StationLimits:
     """Where one may stand."""
 
     distance: tuple[float, float] | None = None  # to the nearest point of the object, least and most, object
@@ -48,7 +48,7 @@ class Candidates:
 
 
 def candidates(
-    planned: PlannedObject, camera: Camera, allowed: Allowed, seeing: Seeing, *, count: int = COUNT
+    planned: PlannedObject, camera: Camera, allowed: StationLimits, seeing: Seeing, *, count: int = COUNT
 ) -> Candidates:
     """Return stations that may be taken, spread evenly over the room that is allowed.
 
@@ -104,7 +104,7 @@ def candidates(
     return Candidates(stations, sight_of(planned, camera, stations.position, stations.rotation, seeing))
 
 
-def _distances(planned: PlannedObject, camera: Camera, allowed: Allowed) -> tuple[float, float]:
+def _distances(planned: PlannedObject, camera: Camera, allowed: StationLimits) -> tuple[float, float]:
     """Return least and largest distance to the nearest point of the object."""
     if allowed.distance is not None:
         least, most = allowed.distance
@@ -118,7 +118,7 @@ def _distances(planned: PlannedObject, camera: Camera, allowed: Allowed) -> tupl
     )
 
 
-def _room(planned: PlannedObject, allowed: Allowed, most: float) -> tuple[FloatArray, FloatArray]:
+def _room(planned: PlannedObject, allowed: StationLimits, most: float) -> tuple[FloatArray, FloatArray]:
     low, high = planned.xyz.min(axis=0) - most, planned.xyz.max(axis=0) + most
     if allowed.space is not None:
         if not (allowed.space[0] < allowed.space[1]).all():

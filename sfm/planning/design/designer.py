@@ -21,12 +21,12 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Network
-from sfm.planning.design.candidates import COUNT, Allowed, Candidates, candidates
+from sfm.planning.design.candidates import COUNT, Candidates, StationLimits, candidates
 from sfm.planning.design.gain import cost_of, gains, image_rows
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.sight.visibility import Seeing
-from sfm.planning.wanted import MIN_RAYS, Wanted, short_of
+from sfm.planning.wanted import MIN_RAYS, WantedPrecision, short_of
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
 
@@ -55,9 +55,9 @@ class Design:
 def design_network(
     planned: PlannedObject,
     camera: Camera,
-    allowed: Allowed,
+    allowed: StationLimits,
     seeing: Seeing,
-    wanted: Wanted,
+    wanted: WantedPrecision,
     *,
     max_photographs: int = MAX_PHOTOGRAPHS,
     count: int = COUNT,
@@ -98,7 +98,7 @@ class _Designer:
         planned: PlannedObject,
         camera: Camera,
         seeing: Seeing,
-        wanted: Wanted,
+        wanted: WantedPrecision,
         found: Candidates,
         most: int,
         bars: Sequence[ScaleBarPlan],

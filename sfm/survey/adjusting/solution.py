@@ -112,7 +112,10 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
         report_step("adjusting c of each photograph")
         with suppress(GeometryError):
             zoomed = _solution(survey, matched, varying)
-            a, focal = zoomed.adjustment, [c for _, c, _ in _own_c(varying, zoomed.adjustment.estimate)]
+            a, focal = (
+                zoomed.adjustment,
+                [c for _, c, _ in _c_per_photograph(varying, zoomed.adjustment.estimate)],
+            )
             differs = any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal)  # more than by focusing
             if a.converged and not a.undetermined and differs:
                 return zoomed
@@ -168,7 +171,7 @@ def _solution(
             *settled.held,
             *(
                 remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit))
-                for name, c, unit in _own_c(varying, final.estimate)
+                for name, c, unit in _c_per_photograph(varying, final.estimate)
             ),
             *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
             *not_calibrated(survey, final.estimate),
@@ -241,7 +244,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     chosen = choose_free_parameters(
         survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum
     )
-    cameras = tuple(_with_own_c(one) if one.name in varying else one for one in chosen.cameras)
+    cameras = tuple(_with_c_per_photograph(one) if one.name in varying else one for one in chosen.cameras)
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
@@ -258,7 +261,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     )
 
 
-def _with_own_c(settings: CameraSettings) -> CameraSettings:
+def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
     """Return the settings with c per photograph, if it is adjusted."""
     focal = tuple(one.name for one in MODELS[settings.model].parameters if one.role is Role.FOCAL)
     if not set(focal) <= set(settings.free):
@@ -504,7 +507,7 @@ def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
     )
 
 
-def _own_c(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:
+def _c_per_photograph(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:
     """Yield the name of each camera of which every photograph has c by itself, these c, and their unit."""
     for name in sorted(varying):
         cameras = [

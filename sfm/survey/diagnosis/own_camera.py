@@ -94,11 +94,11 @@ def find_photograph_cameras(
     sigma_px = float(np.median(spread)) / np.sqrt(2 * np.log(2))  # of a Rayleigh distribution
     cameras, owner = list(estimate.cameras), network.camera.copy()
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
-    left, remarks, with_own = [], [], []
+    left, remarks, changed = [], [], []
     out = np.zeros(m, dtype=bool)
     for i in np.flatnonzero(doubtful).tolist():
         name, before = network.images[i], estimate.cameras[network.camera[i]]
-        fit = _own_camera(network, estimate, i, np.flatnonzero((seen.image == i) & known), sigma_px)
+        fit = _photograph_camera(network, estimate, i, np.flatnonzero((seen.image == i) & known), sigma_px)
         if fit is None:
             out[i] = lost[i]
             if lost[i] and oriented[i]:
@@ -109,7 +109,7 @@ def find_photograph_cameras(
         owner[i] = len(cameras)
         cameras.append(camera)
         position[i], rotation[i] = found.estimate.position[0], found.estimate.rotation[0]
-        with_own.append(name)
+        changed.append(name)
         same = np.flatnonzero(network.camera == network.camera[i])
         remarks.append(
             remark(
@@ -124,15 +124,15 @@ def find_photograph_cameras(
                 other=[network.images[k] for k in same if k != i] if len(same) == PAIR else None,
             )
         )
-    if with_own:
+    if changed:
         cameras[: len(estimate.cameras)] = [_sharing(camera) for camera in estimate.cameras]
         own_network = replace(network, camera=owner)
         own_estimate = replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation)
         if _explained_otherwise(network, estimate, own_network, own_estimate, accepted, ~out):
-            with_own, remarks = [], []
+            changed, remarks = [], []
         else:
             network, estimate = own_network, own_estimate
-    if not with_own and not out.any():
+    if not changed and not out.any():
         return None
     position = np.where(out[:, None], np.nan, estimate.position)
     rotation = np.where(out[:, None, None], np.nan, estimate.rotation)
@@ -141,7 +141,7 @@ def find_photograph_cameras(
         replace(estimate, position=position, rotation=rotation),
         tuple(left),
         tuple(remarks),
-        tuple(with_own),
+        tuple(changed),
         out,
     )
 
@@ -194,7 +194,7 @@ def _explained_otherwise(
     return other.evidence > gained
 
 
-def _own_camera(
+def _photograph_camera(
     network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float
 ) -> tuple[Camera, Adjustment] | None:
     """Return the per-photograph camera with which a photograph fits the points of the others, if one does."""

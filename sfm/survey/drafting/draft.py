@@ -23,7 +23,7 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.camera_models import FISHEYE
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
-from sfm.survey.inputs.survey_file import is_own_file
+from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.targets.codes.families import FAMILIES
 from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
@@ -115,7 +115,7 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
         if not is_plain(path.name):
             unreadable.append((as_plain(path.name), "its name has control or invisible characters"))
             continue
-        if not (path.resolve().is_relative_to(folder.resolve()) or is_own_file(path)):
+        if not (path.resolve().is_relative_to(folder.resolve()) or is_home_file(path)):
             unreadable.append((path.name, "a link out of the folder, and not to a file in your home folder"))
             continue
         try:

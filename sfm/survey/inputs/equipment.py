@@ -46,7 +46,7 @@ MIN_PPM = 1e-3  # smaller coefficients are those of nothing, but for 11.5e-6 in 
 COORDINATES = ("X", "Y", "Z", "sX", "sY", "sZ")
 
 
-class Calibrated(Section):
+class CalibratedEquipment(Section):
     """Data of a bar or a frame beside its lengths."""
 
     name: Name  # by which surveys refer to it
@@ -73,7 +73,7 @@ class Calibrated(Section):
         return PPM * float(np.hypot(self.expansion * temperature_sigma, away * self.expansion_sigma))
 
 
-class Bar(Calibrated):
+class Bar(CalibratedEquipment):
     """[[bar]]: a scale bar."""
 
     points: Annotated[Names, Field(max_length=2)] = ()  # names of its ends
@@ -81,7 +81,7 @@ class Bar(Calibrated):
     sigma: Length  # standard deviation of the length
 
 
-class Frame(Calibrated):
+class Frame(CalibratedEquipment):
     """[[frame]]: targets that are rigid to one another, as of a bar of several, a scale cross or a probe."""
 
     file: Name  # point,X,Y,Z,sX,sY,sZ in a separate system, beside the equipment file

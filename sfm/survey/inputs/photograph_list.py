@@ -18,7 +18,7 @@ from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import inside, is_own_file
+from sfm.survey.inputs.survey_file import inside, is_home_file
 
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
@@ -67,7 +67,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
         )
 
     def refuse_outside(path: Path) -> None:
-        if images_dir is not None and is_own_file(path):
+        if images_dir is not None and is_home_file(path):
             return
         name = path.relative_to(folder).as_posix()
         inside(folder, name, survey.source, allow_outside=survey.allow_outside)

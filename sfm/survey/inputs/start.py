@@ -257,7 +257,7 @@ def _alternatives(
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergedImagePoints:
     """Image points, each once."""
 
     image_points: ImagePoints
@@ -280,7 +280,7 @@ class Merged:
         )
 
 
-def merge_repeated(seen: ImagePoints) -> Merged:
+def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
     """Return image points, each once in its photograph, where it was first.
 
     Identical positions are one measurement that was written twice. Different ones are two measurements:
@@ -290,7 +290,7 @@ def merge_repeated(seen: ImagePoints) -> Merged:
     key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
     _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
     if (count == 1).all():
-        return Merged(seen, (), (), (), 0)
+        return MergedImagePoints(seen, (), (), (), 0)
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
     keep: BoolArray = np.zeros(len(seen), dtype=bool)
     keep[first] = True
@@ -316,4 +316,4 @@ def merge_repeated(seen: ImagePoints) -> Merged:
         kinds[kind].append((int(seen.image[one]), int(seen.point[one])))
     merged = ImagePoints(seen.image, seen.point, xy, covariance, seen.stated).select(keep)
     same, averaged, contradicting = (tuple(pairs) for pairs in kinds)
-    return Merged(merged, same, averaged, contradicting, dropped)
+    return MergedImagePoints(merged, same, averaged, contradicting, dropped)

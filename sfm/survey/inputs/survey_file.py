@@ -175,7 +175,7 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
     return path
 
 
-def is_own_file(path: Path) -> bool:
+def is_home_file(path: Path) -> bool:
     """Return whether a link leads to a file in the user's home folder, and through no hidden folder there.
 
     Links to photographs in a folder that the user names are how photographs are put together, and no attack.

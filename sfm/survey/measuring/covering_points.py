@@ -19,7 +19,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.threads import in_threads
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import Covered, Windows
+from sfm.matching.lsm.coverage import CoveredPixels, Windows
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
@@ -117,7 +117,7 @@ def find_covering_points(
     margin = windows.side_px // 2 + BORDER_PX
     tie_rows = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
-    covered = Covered([estimate.cameras[lens].size_px[::-1] for lens in camera])
+    covered = CoveredPixels([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
 
@@ -156,7 +156,7 @@ def _visible(
     estimate: Estimate,
     camera: IntArray,
     places: _Places,
-    covered: Covered,
+    covered: CoveredPixels,
     margin: int,
     side_px: int,
 ) -> tuple[BoolArray, BoolArray]:

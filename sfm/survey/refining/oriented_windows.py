@@ -25,7 +25,7 @@ SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces a
 
 
 @dataclass(frozen=True)
-class Oriented:
+class OrientedKeyPoints:
     """Key points measured anew, and the orientation given by those whose windows do not overlap."""
 
     windows: Windows
@@ -47,7 +47,7 @@ def orient(
     window_px: int,
     targets: ModelTargets | None,
     lost: list[tuple[str, int]],
-) -> Oriented:
+) -> OrientedKeyPoints:
     """Adjust what was measured with windows that do not overlap, and find what does not fit.
 
     Raises:
@@ -99,7 +99,7 @@ def orient(
     whole, _ = whole_model(
         network, came, adjusted.estimate, windows, images, of_model, TOLERANCE_FACTOR * spread
     )
-    return Oriented(windows, window_px, anew, rows, rays, solved, whole, accepted, spread, lost)
+    return OrientedKeyPoints(windows, window_px, anew, rows, rays, solved, whole, accepted, spread, lost)
 
 
 def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[str, int]]) -> None:

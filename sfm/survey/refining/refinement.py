@@ -34,7 +34,7 @@ from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.refining.model_photographs import outside_masks
 from sfm.survey.refining.oriented_windows import (
-    Oriented,
+    OrientedKeyPoints,
     by_count,
     describe_reasons,
     orient,
@@ -266,7 +266,7 @@ def refine_model(
     def best(orientation: Estimate, sizes: list[Size], spread_px: float, alike: float) -> Size:
         return best_size(keys, orientation, sizes, alike=alike, tolerance_px=TOLERANCE_FACTOR * spread_px)
 
-    def measured(orientation: Estimate, size: Size) -> Oriented:
+    def measured(orientation: Estimate, size: Size) -> OrientedKeyPoints:
         windows = match_windows(keys, orientation, size, progress=progress)
         progress.stage("adjustment")
         return orient(network, orientation, windows, size.side_px, targets, reasons(windows))

@@ -48,7 +48,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Resected:
+class ResectionResult:
     """The result of one method; None where it gives nothing. Lengths in the object unit, angles in rad."""
 
     method: str
@@ -67,7 +67,7 @@ class Resected:
 
 
 @checked_arguments()
-def resect(task: Task, method: str) -> Resected:
+def resect(task: Task, method: str) -> ResectionResult:
     """Return the exterior orientation of a photograph by one of `resection.METHODS`.
 
     Args:
@@ -94,7 +94,7 @@ def resect(task: Task, method: str) -> Resected:
 
 
 @checked_arguments()
-def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
+def resect_by_all(task: Task) -> dict[str, ResectionResult | GeometryError]:
     """Return what each method finds, or why it finds nothing, by its name.
 
     Church's method starts from what Fischler and Bolles find where no start is given.
@@ -104,10 +104,10 @@ def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
 
     Source: the comparison of the methods in document 001, sec. 4.1.
     """
-    found: dict[str, Resected | GeometryError] = {}
+    found: dict[str, ResectionResult | GeometryError] = {}
     for method in _FUNCTIONS:
         first = found.get("fischler-bolles")
-        if task.start is None and method == "church" and isinstance(first, Resected):
+        if task.start is None and method == "church" and isinstance(first, ResectionResult):
             started = replace(task, start=first.solutions[0].position)
         else:
             started = task
@@ -120,22 +120,22 @@ def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
 
 def _closed(
     method: str, function: Callable[[FloatArray, FloatArray], tuple[ResectionSolution, ...]]
-) -> Callable[[Task], Resected]:
-    return lambda task: Resected(method, len(task.points), function(task.tangents, task.points))
+) -> Callable[[Task], ResectionResult]:
+    return lambda task: ResectionResult(method, len(task.points), function(task.tangents, task.points))
 
 
-def _church(task: Task) -> Resected:
+def _church(task: Task) -> ResectionResult:
     if task.start is None:
         raise GeometryError("church: a start position is needed (--start X,Y,Z)")
     result = resect_church(task.tangents, task.points, task.start[:3])
-    return Resected("church", len(task.points), (result,), history=result.history)
+    return ResectionResult("church", len(task.points), (result,), history=result.history)
 
 
-def _dlt(task: Task) -> Resected:
+def _dlt(task: Task) -> ResectionResult:
     checked_points("dlt", task.xy_mm, task.points, needed=6)
     result = resect_dlt(task.xy_mm, task.points)
     solution = ResectionSolution(result.position, result.rotation, result.residuals / task.c)
-    return Resected(
+    return ResectionResult(
         "dlt",
         len(task.points),
         (solution,),
@@ -145,7 +145,7 @@ def _dlt(task: Task) -> Resected:
     )
 
 
-def _robust(task: Task) -> Resected:
+def _robust(task: Task) -> ResectionResult:
     uv, xyz = checked_points("robust", task.tangents, task.points, needed=4)
     result = (
         resect_unknown_noise(uv, xyz)
@@ -154,7 +154,7 @@ def _robust(task: Task) -> Resected:
     )
     if not result.found:
         raise GeometryError(f"robust: {result.reason}")
-    return Resected(
+    return ResectionResult(
         "robust",
         len(task.points),
         (ResectionSolution(result.position, result.rotation, result.residuals[result.inliers]),),
@@ -167,13 +167,13 @@ def _robust(task: Task) -> Resected:
     )
 
 
-def _least_squares(task: Task) -> Resected:
+def _least_squares(task: Task) -> ResectionResult:
     uv, xyz = checked_points("least-squares", task.tangents, task.points, needed=3)
     position, rotation = _start(task)
     result = resect_least_squares(uv, xyz, position, rotation)
     if not result.converged:
         raise GeometryError("least-squares: no convergence from this start, a nearer one is needed")
-    return Resected(
+    return ResectionResult(
         "least-squares",
         len(task.points),
         (ResectionSolution(result.position, result.rotation, result.residuals),),
@@ -200,7 +200,7 @@ def _start(task: Task) -> tuple[FloatArray, FloatArray]:
     return task.start, rotation_from_position(task.tangents, task.points, task.start)
 
 
-_FUNCTIONS: dict[str, Callable[[Task], Resected]] = {
+_FUNCTIONS: dict[str, Callable[[Task], ResectionResult]] = {
     "fischler-bolles": _closed("fischler-bolles", resect_fischler_bolles),
     "p4p": _closed("p4p", resect_p4p),
     "church": _church,

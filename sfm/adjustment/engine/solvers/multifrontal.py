@@ -39,7 +39,7 @@ from sfm.adjustment.engine.normals import Equations, times_schur
 from sfm.adjustment.engine.solvers import memory
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
-from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
+from sfm.adjustment.engine.solvers.multifrontal_factor import EliminatedFront, MultifrontalFactor
 from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -160,10 +160,10 @@ class MultifrontalSolver:
             weak = weak or bool(np.diagonal(corner).min() ** 2 < WEAK_PIVOT)
         return factor.with_border(X, corner, weak=weak)
 
-    def _eliminate(self, equations: Equations, added: FloatArray) -> list[Eliminated] | None:
+    def _eliminate(self, equations: Equations, added: FloatArray) -> list[EliminatedFront] | None:
         """Return all fronts eliminated, added to the diagonal; None if one is not positive definite."""
         fronts = self.fronts.fronts
-        found: list[Eliminated | None] = [None] * len(fronts)
+        found: list[EliminatedFront | None] = [None] * len(fronts)
         left: dict[int, FloatArray] = {}  # what fronts leave to their parents
 
         def eliminate(begin: int, end: int) -> bool:
@@ -202,7 +202,7 @@ class MultifrontalSolver:
         return F
 
 
-def _eliminated(F: FloatArray, pivots: int) -> tuple[Eliminated, FloatArray] | None:
+def _eliminated(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray] | None:
     """Return the factor of the first unknowns of a front, and what they leave of the rest."""
     U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
     if info != 0:
@@ -212,7 +212,7 @@ def _eliminated(F: FloatArray, pivots: int) -> tuple[Eliminated, FloatArray] | N
     if len(K):
         K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
         rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
-    return Eliminated(U.T, K, float(np.diagonal(U).min())), rest
+    return EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
 
 
 def _largest(vectors: FloatArray) -> IntArray:

@@ -31,7 +31,7 @@ from sfm.kernels.blocks import add_product
 from sfm.kernels.options import kernel
 
 
-class Eliminated(NamedTuple):
+class EliminatedFront(NamedTuple):
     """Part of the factor left by eliminating the photographs of a front."""
 
     L: FloatArray  # of the unknowns of the pivots, lower triangle, (j, j)
@@ -46,7 +46,7 @@ class MultifrontalFactor:
     layout: Unknowns
     fronts: Fronts
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
-    eliminated: list[Eliminated]  # L of A + added = L L', front by front
+    eliminated: list[EliminatedFront]  # L of A + added = L L', front by front
     C: FloatArray  # (6 m, i + 3 s)
     further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
     X: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # A^-1 C, (6 m, i + 3 s)
