@@ -1,6 +1,6 @@
 """COLMAP through pycolmap: its Ceres bundle adjustment of our networks.
 
-The only module that imports pycolmap. What its adjuster knows less of than Kolinear's:
+The only module that imports pycolmap. Limits of its adjuster against Kolinear's:
 
     weights        COLMAP's adjuster gives every image coordinate the same weight
     constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras

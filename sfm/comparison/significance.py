@@ -6,8 +6,8 @@ the covariance of all points together is known, both are brought into one datum 
 `sfm.comparison.congruency`, which also finds the points that moved; then the alignment is over those that did
 not. Where only the covariance of each single point is known, each difference d is tested by
 T = d' (Qa + Qb)^-1 d / 3, an approximation that is made for free networks only. Results that were adjusted
-from the same image points are not independent and are not tested. What else than points that moved may be
-the reason is in `sfm.comparison.causes`.
+from the same image points are not independent and are not tested. Reasons other than points that moved
+are in `sfm.comparison.causes`.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
 Concepts of network and deformation analysis, sec. 7.

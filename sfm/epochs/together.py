@@ -5,9 +5,9 @@ same in all of them, B x = 0, then make one adjustment of it. With the covarianc
 
     M = B Q B',  x' = x - Q B' M^-1 B x,  Q' = Q - Q B' M^-1 B Q,
 
-to the first order in the corrections, which are of the size of standard deviations. What epochs were given
-alike (bars, control, a calibration) is one observation and correlates them before. T = (B x)' M^-1 B x over
-the number of conditions shows whether the camera is the same at all.
+to the first order in the corrections, which are of the size of standard deviations. A value given alike
+to epochs (bars, control, a calibration) is one observation and correlates them before. T = (B x)' M^-1 B x
+over the number of conditions shows whether the camera is the same at all.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, secs. 3.2.7 (constraints)
 and 4.2 (their test); Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.

@@ -15,7 +15,7 @@ MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger 
 MAX_SAID = 200  # characters of the text of the parser
 MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
 
-# What people write in place of TOML: what the line looks like, and what to write.
+# Usual mistakes in TOML: what the line looks like, and what to write.
 SLIPS = (
     (
         re.compile(r"=\s*(?:[-+]?\d+,\d+\s*(?:#.*)?$|\[[^\]\"']*\d,0\d)"),

@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all, and never by way of a link that somebody has laid there.
 
 New files are made under unpredictable names and moved to their place by one rename, which
-follows no link. What is there already is replaced only where it is known to be written by the program.
+follows no link. Existing files are replaced only where it is known to be written by the program.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A transformation x' = s R x + t that is computed from the points themselves makes their errors part of it:
 dx' = s R dx + M dT with dT = F dx, so that Q' = (D + M F) Q (D + M F)', the S-transformation to the new
-datum. What it is defined by has no variance afterwards.
+datum. The defining coordinates have no variance afterwards.
 
 A best fit is weighted with the covariance of the points as it is in their datum: in another datum of the same
 network it lies elsewhere within its uncertainty, and its test is the same.

@@ -1,8 +1,8 @@
 """Acceptance test of a measuring system by calibrated lengths: VDI/VDE 2634 part 1.
 
 The error of a length measurement is the measured minus the calibrated length. It may be A + K L, and no more
-than B. Whether it is proven to be, ISO 14253-1 says with the uncertainty of the calibration. What part 1 asks
-for and the data lack is listed. It is no test by ISO 10360-13, which is for area scanners.
+than B. ISO 14253-1 decides with the uncertainty of the calibration whether that is proven. Requirements of
+part 1 that the data do not meet are listed. It is no test by ISO 10360-13, which is for area scanners.
 
 Source: VDI/VDE 2634 part 1 (2002), Optical 3D measuring systems: imaging systems with point-by-point probing,
 secs. 3 and 4; ISO 14253-1:2017.

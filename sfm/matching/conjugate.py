@@ -1,7 +1,7 @@
 """Conjugate points: from points of one photograph to the same points in another, and how well.
 
-Correlation finds the place to a pixel in a search window, least squares matching takes it from there. What is
-not found in this way is looked for again with templates that are turned and scaled.
+Correlation finds the place to a pixel in a search window, least squares matching takes it from there. Points
+not found in this way are looked for again with templates that are turned and scaled.
 """
 
 from __future__ import annotations

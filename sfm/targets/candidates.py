@@ -113,7 +113,7 @@ def find_duplicates(
     And how much farther holes are from the centres of what they are in than perspective puts them, (k, 2).
 
     Of concentric ellipses the one with a code is kept, else the smallest: a retro-reflective dot with a dark
-    rim in glare is seen as bright dot and, larger, as the dark rim. What is in another candidate and not
+    rim in glare is seen as bright dot and, larger, as the dark rim. A candidate inside another and not
     shown to be concentric, of the polarity that fewer targets of the photograph have, is a stain.
     """
     duplicate, off_centre = np.zeros(len(fit.xy), dtype=bool), np.zeros((len(fit.xy), 2))

@@ -325,7 +325,7 @@ def _along_valley(
 ) -> tuple[State, float] | None:
     """Return where a share of a step leads along the bent valley that it runs in, and the share.
 
-    A straight step leaves such a valley soon, and a share of it creeps. What leads back to the bottom is the
+    A straight step leaves such a valley soon, and a share of it creeps. The way back to the bottom is the
     next step under the condition that the unknowns of the cameras do not go on along the first. A valley that
     a straight share leaves by the square of it, and the way back by its square, allows the root.
 

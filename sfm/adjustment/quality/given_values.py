@@ -94,8 +94,8 @@ class Kept:
         """Return what parameters beside those of the model would explain, by the score test.
 
         Args:
-            columns: derivatives of the differences by them, none of them 0, (m, q). What cannot be
-                distinguished from the parameters of the model explains nothing.
+            columns: derivatives of the differences by them, none of them 0, (m, q). Columns that cannot
+                be distinguished from the parameters of the model explain nothing.
 
         Source: Rao (1948), Math. Proc. Camb. Phil. Soc. 44(1) (score test).
         """

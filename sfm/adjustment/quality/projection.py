@@ -1,8 +1,8 @@
 """Projection uncertainty: how well a calibrated camera knows where a direction is seen in the photograph.
 
-The covariance of the interior orientation moves the picture of a distant point. What a rotation of the
-camera does as well is no error of the camera, since every use of it finds the rotation anew: it is taken out
-by the small rotation that fits best to the image points of the calibration. Between these the camera is
+The covariance of the interior orientation moves the picture of a distant point. The part that equals a
+rotation of the camera is no error of the camera, since every use of it finds the rotation anew: it is taken
+out by the small rotation that fits best to the image points of the calibration. Between these the camera is
 known, beyond them the uncertainty grows.
 
 Source: law of propagation of variances; Kogan, mrcal, "Projection uncertainty".

@@ -202,8 +202,9 @@ def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
 def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
     """Return the cameras unshared, with what they share held fixed at its value, and what that is, in words.
 
-    COLMAP shares all parameters of a camera among its photographs or none. What several cameras share in
-    part, such as one distortion for photographs that differ in c, can only be held at the survey's result.
+    COLMAP shares all parameters of a camera among its photographs or none. Parameters that several cameras
+    share in part, such as one distortion for photographs that differ in c, can only be held at the survey's
+    result.
 
     Args:
         cameras: interior orientations, some parameters of which may be shared.

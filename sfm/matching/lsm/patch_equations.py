@@ -29,8 +29,9 @@ UNDETERMINED = 1e-9  # part of a diagonal that rounding of float32 intensities l
 # Source: Abramowitz and Stegun (1964), table 25.2 (seven-point formula).
 SLOPE = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
 SLOPE_NOISE = 2.0 * (SLOPE[0] ** 2 + SLOPE[1] ** 2 + SLOPE[2] ** 2)
-# What noise of variance 1 adds to products of blur's rows: (1 -2 1) across (1 2 1) / 4, halved, and its mixed
-# difference: of xx or yy with itself, of xx with yy, of xy with itself, and of xx or yy with intensities.
+# Contributions of noise of variance 1 to products of blur's rows: (1 -2 1) across (1 2 1) / 4, halved, and
+# its mixed difference: of xx or yy with itself, of xx with yy, of xy with itself, and of xx or yy with
+# intensities.
 BLUR_NOISE = (9.0 / 16.0, 1.0 / 16.0, 1.0 / 4.0, -1.0 / 2.0)
 
 

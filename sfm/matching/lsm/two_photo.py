@@ -116,7 +116,7 @@ def match_lsm(
         interpolation: kernel for the right photograph; on fine texture bilinear costs 1.25 times and bicubic
             1.06 times the standard deviation of six_tap, and both are off by up to 0.013 px where all of the
             patch is shifted by the same 0.1 to 0.4 px, six_tap by 0.002 px.
-        stop_px: the shift of the step that would come next is shorter than this. What is left of it has the
+        stop_px: the shift of the step that would come next is shorter than this. The remaining shift has the
             direction of the start, which neighbouring points have in common: 0.002 px turn photographs.
         max_steps: after so many a patch counts as diverged.
         max_shift_px: farther from the start is too far.

@@ -6,7 +6,8 @@ from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
 WRONG_SIZE = "pitch is mistyped or nominal, or a plate was printed to another scale"
-# What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
+# A value that a test rejects is worth a warning, and is an error where it shifts the result beyond what is
+# right.
 DETECTED = Grade("shift", error=WRONG_SIGMAS)
 # Held or weighted coordinates of a wrong shape pull image points, points and photographs away.
 PULLED = (

@@ -27,7 +27,7 @@ from sfm.result import SurveyResult
 
 MM = 1e-3  # m
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
-# What is left of the error of a value that is checked less is below the rounding and the neglected second
+# The rest of the error of a value that is checked less is below the rounding and the neglected second
 # order of the others, and w magnifies that.
 MIN_REDUNDANCY = 1e-3
 MAX_MAGNIFICATION = 1.0  # of the median image distance c over the object distance; macrophotography is beyond

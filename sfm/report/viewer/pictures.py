@@ -1,7 +1,7 @@
 """Pictures of a page to explore: thumbnails, photographs and crops about the targets, within a budget.
 
-Thumbnails come first, then photographs, then crops, those of the largest residuals first. What has no room in
-the page lies in files beside it: every photograph, and the crops of each in one picture of cells.
+Thumbnails come first, then photographs, then crops, those of the largest residuals first. Files beside the
+page have what has no room in it: every photograph, and the crops of each in one picture of cells.
 """
 
 from __future__ import annotations

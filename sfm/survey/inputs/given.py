@@ -1,7 +1,7 @@
 """Input of a survey besides photographs: control, image points, sizes, start values.
 
 Each kind is a frozen dataclass that is made from a CSV file by its `read_...`, or from arrays by
-`from_arrays`; both refuse the same, with the line or row and the column. What is true of all tables is in
+`from_arrays`; both refuse the same, with the line or row and the column. Rules of all tables are in
 `sfm.files.csv_tables`.
 """
 

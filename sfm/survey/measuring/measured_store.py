@@ -1,7 +1,7 @@
 """The store of what was measured in photographs: what was measured once in one is not measured again.
 
 It lies in the cache folder of the user, never beside photographs or results, which may come from somebody
-else. What was measured is kept by the content of the photograph, the settings and the code that measures, so
+else. Measurements are kept by the content of the photograph, the settings and the code that measures, so
 an entry can be missing or unreadable but never out of date. The folder may be removed at any time.
 """
 

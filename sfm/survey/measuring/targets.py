@@ -141,7 +141,7 @@ def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFam
 def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:
     """Return the covariance of image points for the adjustment, px^2, shape (k, 2, 2).
 
-    The fit of a target knows the noise of the photograph only. What it cannot know (JPEG, print, lens,
-    a sheet that is not flat) comes on top with the survey's sigma of an image coordinate.
+    The fit of a target knows the noise of the photograph only. Errors that it cannot know (JPEG, print, lens,
+    a sheet that is not flat) are added by the survey's sigma of an image coordinate.
     """
     return np.asarray(targets.covariance + sigma_px**2 * np.eye(2))

@@ -28,7 +28,7 @@ _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
 # Half the part of the short semi-axis loses one of seven oblique rings on a screen; half or twice that
 # in px, for large dots, changes none of them.
 MAX_SPREAD, MAX_GLOW_PX, MAX_GLOW = 0.14, 1.5, 0.25  # the last in short semi-axes
-# What the spreads and the blur of the cells' ends over that of the dot are before the ring is looked at: 0
+# Prior values of the spreads and of the blur of the cells' ends over that of the dot: 0
 # and 1 with these standard deviations, the last of its logarithm.
 # That of the glow is in px; half or twice as much changes none of seven oblique rings on a screen.
 _SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25

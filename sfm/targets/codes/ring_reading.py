@@ -21,7 +21,7 @@ RADII = np.array([-0.45, 0.25, 0.5, 0.75, 1.4])
 # (both sides) that makes a reading of arcs certain.
 HALF = 0.5
 MARGIN = 0.15
-# What is around a dot is no code where nothing in the ring is above this level.
+# A dot has no code where nothing in the ring around it is above this level.
 MIN_SET = 0.3
 # Step from clear to set cells in units of that from background to dot, and the least gap between the levels
 # of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
@@ -151,8 +151,8 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
     clear cells, clear ring and what is behind set cells, but for the border of a label, are at the level of
     the background, set cells at one level but for shading, and each cell is the same on all radii and over
-    its length. What the model does not explain of the dot (misfit, in steps), as halos of sharpening, it does
-    not explain of the samples.
+    its length. A misfit of the model at the dot (in steps), as by halos of sharpening, is a
+    misfit of the samples too.
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0

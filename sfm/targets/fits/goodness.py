@@ -256,8 +256,8 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
     """Set the shares of the circumference where the background is only a thin stroke, and where glare is.
 
     The stroke of a letter "o" is one: the intensity comes back to that of the target nearer to the edge than
-    any ring of a code. What is much farther from the background than the target is glare about the rim of a
-    retro-reflective target.
+    any ring of a code. Intensities much farther from the background than the target are glare about the rim
+    of a retro-reflective target.
     """
     h, w = image.shape
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]

@@ -1,7 +1,7 @@
 """Noise of the outlines of targets: how much larger than by the noise of intensities the variances are.
 
 Harmonics 3 to 6 of an outline follow no ellipse. They are estimated jointly with it on what is left of the
-edge. What the targets of a photograph have in common is shape. The rest shows the variance of the first
+edge. Deviations common to the targets of a photograph are shape. The rest shows the variance of the first
 harmonic, which is the centre, whatever makes it: rough printing, compression, correlated noise.
 """
 

@@ -38,7 +38,7 @@ POOR_FIT = 0.12
 ROUNDS = 3
 # So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
 SKIRT_BLURS = 1.5
-# What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike
+# Residuals larger than usual by so many robust sigmas of the logarithms over the photograph are unlike
 # the others. Their scatter is that of the variance of 200 pixels at least.
 POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.

@@ -14,7 +14,7 @@ except ImportError:  # Windows
 
 SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
 UNKNOWN = 8e9  # bytes where the system does not state what it has
-# What a container may take, in bytes, of control groups of version 2 and 1: beyond it processes are ended
+# Limits of containers, in bytes, of control groups of version 2 and 1: beyond it processes are ended
 LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
