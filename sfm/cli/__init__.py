@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
-from sfm.cli.outlets import guard_outlets
+from sfm.cli.streams import guard_streams
 from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import closed_current_folder, refuse_folder_settings
 from sfm.runtime.installation import load_adapters, refuse_mixed_installation
@@ -28,7 +28,7 @@ def main() -> None:
 
     Exit code 2 means something that a person can put right, 70 an unforeseen error.
     """
-    guard_outlets()
+    guard_streams()
     try:
         with stopped_once():
             try:

@@ -34,7 +34,7 @@ from sfm.survey.diagnosis.contradicting_codes import (
     plates_elsewhere,
     remarks_on_contested,
 )
-from sfm.survey.diagnosis.own_camera import find_photograph_cameras
+from sfm.survey.diagnosis.photograph_cameras import find_photograph_cameras
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs

@@ -18,8 +18,8 @@ from sfm.survey.drafting.draft import Draft, draft_survey
 
 FOUR_LINES = """
 import sys
-from sfm.cli.outlets import guard_outlets
-guard_outlets()
+from sfm.cli.streams import guard_streams
+guard_streams()
 for k in range(2):
     print(2 * k)
     print(2 * k + 1, file=sys.stderr)
@@ -43,7 +43,7 @@ def test_a_decimal_comma_is_explained(
     assert "comma" not in refused(capsys, monkeypatch, "init", "here", "--pitch", "wide")
 
 
-def test_lines_of_both_outlets_keep_their_order() -> None:
+def test_lines_of_both_streams_keep_their_order() -> None:
     done = subprocess.run(
         [sys.executable, "-c", FOUR_LINES], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=True
     )

@@ -10,10 +10,10 @@ import pytest
 from sfm.camera import project
 from sfm.depth_reversal import reverse_depth
 from sfm.network import ImagePoints, empty_estimate
-from sfm.orientation.incremental import misfits
+from sfm.orientation.incremental import poor_photographs
 from sfm.orientation.incremental.growth import residual_lengths
-from sfm.orientation.incremental.misfits import _Resected
-from sfm.orientation.incremental.rivals import bounded_costs
+from sfm.orientation.incremental.other_solutions import bounded_costs
+from sfm.orientation.incremental.poor_photographs import _Resected
 from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity
 from sfm.survey.orientation import refine
@@ -146,12 +146,12 @@ def test_what_fits_turned_over_by_chance_is_no_mirrored_picture(
 ) -> None:
     """Names of another scene: no resection as it is, and one of some points turned over."""
     monkeypatch.setattr(
-        misfits,
+        poor_photographs,
         "_resected",
         lambda *_, turned_over=False: (
             _Resected(turned, fitting) if turned_over else _Resected(before, 20 if np.isfinite(before) else 0)
         ),
     )
-    monkeypatch.setattr(misfits, "_medians_px", lambda _: np.array([np.nan, 0.1, 0.1, 0.2]))
+    monkeypatch.setattr(poor_photographs, "_medians_px", lambda _: np.array([np.nan, 0.1, 0.1, 0.2]))
     growth: Any = SimpleNamespace(reasons={})
-    assert misfits._is_mirrored(growth, 0) == mirrored == bool(growth.reasons)
+    assert poor_photographs._is_mirrored(growth, 0) == mirrored == bool(growth.reasons)

@@ -27,7 +27,7 @@ from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import refine
-from tests.survey.test_own_camera import with_zoom
+from tests.survey.test_photograph_cameras import with_zoom
 from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations, survey_of
 from tests.synthetic import SIZE_PX as OF_NETWORK

@@ -24,15 +24,15 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.given_values import start_from_given
 from sfm.orientation.incremental.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
-from sfm.orientation.incremental.misfits import judge_misfits
-from sfm.orientation.incremental.remaining_points import intersect_remaining
-from sfm.orientation.incremental.rivals import (
+from sfm.orientation.incremental.other_solutions import (
     SMALLER_TOLERANCES,
     bounded_costs,
     casts_doubt,
     reversed_growth,
     worst_photographs,
 )
+from sfm.orientation.incremental.poor_photographs import judge_misfits
+from sfm.orientation.incremental.remaining_points import intersect_remaining
 from sfm.orientation.incremental.starting_pair import Start
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity

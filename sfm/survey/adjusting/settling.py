@@ -33,7 +33,7 @@ from sfm.observations.kind import is_observed
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.diagnosis.own_camera import PhotographCameras, find_photograph_cameras
+from sfm.survey.diagnosis.photograph_cameras import PhotographCameras, find_photograph_cameras
 from sfm.survey.inputs.interior import without_idle_cameras
 from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.survey import Survey

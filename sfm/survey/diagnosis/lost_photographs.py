@@ -16,7 +16,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.diagnosis.own_camera import MAJORITY_FRACTION
+from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
 MISFIT = 3.0  # standard deviations of image points, of residuals that another minimum may explain

@@ -15,7 +15,7 @@ from sfm.camera import tangents_from_pixel
 from sfm.conventions import FloatArray
 from sfm.network import rows_of
 from sfm.orientation.incremental.growth import Growth, Refine
-from sfm.orientation.incremental.rivals import CONTRADICTING
+from sfm.orientation.incremental.other_solutions import CONTRADICTING
 from sfm.remarks.remark import remark
 
 MIN_OTHERS = 3  # oriented photographs that one is judged by

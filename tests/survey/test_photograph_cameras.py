@@ -17,7 +17,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.correspondences import restore_strayed
-from sfm.survey.diagnosis.own_camera import SCALES, TOLERANCE
+from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
 from sfm.survey.inputs.settings import AdjustSettings
 from tests.survey.faults import planted
 from tests.surveys import survey_of
@@ -52,9 +52,9 @@ def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     own = {camera.name: camera for camera in a.estimate.cameras}
     assert own["synthetic image 8"].value("c") == pytest.approx(factor * 10.0, rel=2e-3)
     assert own["synthetic"].value("c") == pytest.approx(10.0, rel=2e-3)
-    (own_camera,) = of_kind(result.remarks, "camera_per_photograph")
-    assert own_camera.names("photograph") == ("image 8",) and own_camera.names("parameters")[0] == "c"
-    assert own_camera.number("change") == pytest.approx(100 * (factor - 1), abs=0.3)
+    (found,) = of_kind(result.remarks, "camera_per_photograph")
+    assert found.names("photograph") == ("image 8",) and found.names("parameters")[0] == "c"
+    assert found.number("change") == pytest.approx(100 * (factor - 1), abs=0.3)
     assert findings_of(result).verdict.level == "fair"
 
 

@@ -10,7 +10,7 @@ from typing import Any, TextIO
 READER_GONE = 141  # exit code; 128 + SIGPIPE, as a shell reports it of other programs
 
 
-def guard_outlets() -> None:
+def guard_streams() -> None:
     """Make stdout and stderr tolerate readers that end and names that they cannot encode.
 
     A reader of stdout that ends, as `head` does, ends the program quietly; one of stderr ends nothing. Lines
@@ -25,7 +25,7 @@ def guard_outlets() -> None:
 
 
 def _guarded(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
-    """Return what writes to the same file, pipe or socket; terminals and absent outlets stay as they are."""
+    """Return what writes to the same file, pipe or socket; terminals and absent streams stay as they are."""
     if not isinstance(outlet, io.TextIOWrapper) or outlet.isatty():
         return outlet
     outlet.flush()
