@@ -1,4 +1,4 @@
-"""What people get wrong at the first try, and what they are told; `python -m tests.first_tries` prints it.
+"""What people get wrong at the first try, and the messages they get; `python -m tests.first_tries` prints it.
 
 Every try is a survey or a command with one mistake; `tests/cli/test_first_tries.py` checks the answers.
 """
@@ -44,7 +44,7 @@ class Try:
 
 
 def answer(one: Try, folder: Path) -> Answer:
-    """Run a try in a folder of its own."""
+    """Run a try in a separate folder."""
     words = one.words(folder)
     found = CliRunner().invoke(app, list(words))
     if isinstance(found.exception, KolinearError):

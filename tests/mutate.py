@@ -1,4 +1,4 @@
-"""What the tests hold: small changes of the program, each of which a test must notice.
+"""Strength of the tests: small changes of the program, each of which a test must notice.
 
     python -m tests.mutate [COUNT [SEED [ROOM ...]]]       `make mutate`
 
@@ -38,7 +38,7 @@ from tests.places import ROOT
 
 TIMEOUT = 300  # s, of the tests of one mutation
 Ended = Literal["killed", "survived", "timed out"]
-ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that hold it
+ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that check it
     "sfm/adjustment/hypotheses": (
         "tests/adjustment/test_alternatives.py",
         "tests/adjustment/test_columns.py",

@@ -116,7 +116,7 @@ def test_doctor_calls_the_core_sound(
     assert f"colmap: no comparison, {INSTALL_PYCOLMAP}" in " ".join(told.split())
 
 
-def test_a_camera_that_was_not_looked_up_is_told() -> None:
+def test_a_camera_that_was_not_looked_up_is_reported() -> None:
     unknown: list[Remark] = []
     assert sfm.api.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
     (one,) = unknown

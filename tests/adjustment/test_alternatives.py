@@ -441,7 +441,7 @@ def test_of_two_photographs_of_a_camera_neither_is_blamed() -> None:
 
 
 @pytest.mark.parametrize("which", [6, 7])
-def test_a_zoomed_photograph_of_two_is_told_from_a_camera_that_varies(which: int) -> None:
+def test_a_zoomed_photograph_of_two_is_reported_from_a_camera_that_varies(which: int) -> None:
     """Before, image 7 was not: c moved no distortion, whose errors c of every photograph took up."""
     cause = hypotheses.find_causes(zoomed_pair(which))[0]
     assert cause.alternative.kind == "two_cameras" and cause.as_well == ()

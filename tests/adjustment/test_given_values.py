@@ -68,7 +68,7 @@ def test_two_of_five_are_identified_and_two_against_two_are_not() -> None:
     assert judge_values(bars(0.0, 0.0, 0.3, 0.3), LEVEL).doubtful == (0, 1, 2, 3)
 
 
-def test_the_margin_decides_whether_one_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_margin_decides_whether_one_is_reported_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Removing either of two of three heals; chi-square differs by 8.2, and 13.8 are needed."""
     model = bars(-2.2 * SIGMA, 0.0, 4.6 * SIGMA)
     fall = sorted(model.kept((k,)).chi2 for k in range(3))

@@ -72,7 +72,7 @@ def test_huber_limits_the_harm_of_gross_errors() -> None:
 
 
 @pytest.mark.parametrize("reject", ["huber", "tukey"])
-def test_a_photograph_that_nothing_holds_is_told(reject: str) -> None:
+def test_a_photograph_that_nothing_holds_is_reported(reject: str) -> None:
     """It converges wherever the photograph is; one was 1e140 mm away."""
     rng = seed_of("let go")
     network, truth = make_network(rng, images=8, points=30)

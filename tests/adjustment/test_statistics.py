@@ -297,6 +297,6 @@ def values_of(a: Adjustment) -> tuple[FloatArray, ...]:
         ([0.5], "points of type float64, expected names, indices or a mask"),
     ],
 )
-def test_datum_points_that_are_not_there_are_told(plain: Adjustment, points: object, message: str) -> None:
+def test_missing_datum_points_are_reported(plain: Adjustment, points: object, message: str) -> None:
     with pytest.raises(GeometryError, match=message):
         change_datum(plain, Datum("free", points))

@@ -218,7 +218,7 @@ def test_names_that_disks_and_tables_do_not_take_fail_alone(
     assert "3 of 5 surveys" in (out / "index.html").read_text(encoding="utf-8")
 
 
-def test_tables_that_cannot_be_read_are_told_by_their_reader(tmp_path: Path) -> None:
+def test_tables_that_cannot_be_read_are_reported_by_their_reader(tmp_path: Path) -> None:
     files = [write_observed_survey(tmp_path / name, name) for name in ("pipe", "folder", "none")]
     for file in files:
         (file.parent / "image_points.csv").unlink()
@@ -233,7 +233,7 @@ def test_tables_that_cannot_be_read_are_told_by_their_reader(tmp_path: Path) -> 
     ]
 
 
-def test_photographs_that_are_no_files_are_told_and_do_not_stop_the_others(tmp_path: Path) -> None:
+def test_photographs_that_are_no_files_are_reported_and_do_not_stop_the_others(tmp_path: Path) -> None:
     survey = write_photograph_survey(tmp_path / "a", "a")
     for number in (1, 2):
         (tmp_path / "a" / f"photo {number}.png").unlink()

@@ -1,4 +1,4 @@
-"""What a batch leaves behind in memory: objects and blocks that Python holds, counted, not estimated."""
+"""Memory left by a batch: objects and blocks that Python keeps, counted, not estimated."""
 
 from __future__ import annotations
 

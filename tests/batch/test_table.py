@@ -51,7 +51,7 @@ def test_stage_photographs_and_time_left_are_seen(clock: list[float]) -> None:
     assert "2 of 2 surveys, 1 failed" in seen(table) and "left" not in seen(table)
 
 
-def test_compiling_is_told_once(clock: list[float]) -> None:
+def test_compiling_is_reported_once(clock: list[float]) -> None:
     file = io.StringIO()
     table = BatchTable(Console(file=file, width=200))
     table.planned(["a", "b"])

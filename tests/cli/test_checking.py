@@ -1,4 +1,4 @@
-"""`kolinear doctor` tells a working installation from one that measures wrongly; kernels compile once."""
+"""`kolinear doctor` separates a working installation from one that measures wrongly; kernels compile once."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ codes = [0, 11, 0, 0]
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is told of compiling, whether or not this is the first run after a change."""
+    """Compiling is not reported, whether or not this is the first run after a change."""
     monkeypatch.setattr(starting, "_announce_compiling", lambda: None)
 
 
@@ -368,7 +368,7 @@ def test_the_time_counts_the_report(
     assert float(line.split()[1]) > sum(stages.values()) + 1.4
 
 
-def test_compiling_is_told_when_it_happens_and_only_then(tmp_path: Path) -> None:
+def test_compiling_is_reported_when_it_happens_and_only_then(tmp_path: Path) -> None:
     text = "from numba import njit\n@njit(cache=True)\ndef f(x):\n    return x\n"
     (tmp_path / "kernel.py").write_text(text, encoding="utf-8")
     code = (

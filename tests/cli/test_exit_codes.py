@@ -1,4 +1,4 @@
-"""What nobody has foreseen is one line and exit code 70, in every command and in a batch; never 1."""
+"""An unforeseen error is one line and exit code 70, in every command and in a batch; never 1."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_a_limit_of_memory_ends_in_one_line() -> None:
     assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith("kolinear: not enough memory")
 
 
-def test_errors_of_kolinear_are_told_as_they_are() -> None:
+def test_errors_of_kolinear_are_reported_as_they_are() -> None:
     with pytest.raises(KolinearError) as caught, working_on("photograph a"):
         raise KolinearError("what was needed")
     assert error_in_words(caught.value) == "what was needed" and not hasattr(caught.value, "__notes__")
@@ -224,7 +224,7 @@ READER_GONE = "import sys; sys.argv[0] = 'kolinear'; from sfm.cli import main; m
 
 
 def without_reader(*arguments: object, stdout: bool = True, stderr: bool = False) -> tuple[int, str, str]:
-    """Run the command with outlets that nobody reads any more."""
+    """Run the command with outputs that no one reads any more."""
     reader, writer = os.pipe()
     os.close(reader)
     run = subprocess.run(

@@ -292,7 +292,7 @@ def test_key_depends_on_content_settings_and_codes(tmp_path: Path) -> None:
     assert measured_key(tmp_path / "b.png", TARGETS, settings[0]) == keys[0]
 
 
-def test_a_full_disk_is_told_by_the_log_with_its_name(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_by_the_log_with_its_name(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("this system has no disk that is always full")
     path = tmp_path / "log.jsonl"

@@ -22,7 +22,7 @@ from tests.surveys import write_observed_survey
     "one",
     [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * one.photographs) for one in TRIES],
 )
-def test_a_first_try_is_told_what_is_wrong(one: Try, tmp_path: Path) -> None:
+def test_a_first_try_is_reported_what_is_wrong(one: Try, tmp_path: Path) -> None:
     found = answer(one, tmp_path)
     assert found.code == one.code, found.text
     for words in one.told:

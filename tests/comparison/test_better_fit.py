@@ -42,7 +42,7 @@ def test_a_camera_that_fits_many_times_better_is_no_agreement() -> None:
 
 
 @pytest.mark.parametrize(("stretch", "free"), [(1.0, USUAL), (1.007, (*USUAL, "b1"))])
-def test_a_camera_that_fits_as_well_is_not_told(stretch: float, free: tuple[str, ...]) -> None:
+def test_a_camera_that_fits_as_well_is_not_reported(stretch: float, free: tuple[str, ...]) -> None:
     both, result = compared(stretch, free)
     assert both.agree and both.better is None
     assert not of_kind(findings_of(result).verdict.remarks, "adjuster_fits_better")

@@ -204,7 +204,7 @@ def test_both_adjusters_end_at_the_same_optimum_in_a_model_of_colmap(model: str)
     assert found.comparison.cost[1] == pytest.approx(found.comparison.cost[0], rel=1e-9)
 
 
-def test_a_backend_that_stops_early_is_told_from_one_that_ends_elsewhere() -> None:
+def test_a_backend_that_stops_early_is_reported_from_one_that_ends_elsewhere() -> None:
     rng = seed_of("stops early")
     network, truth = make_network(rng, model="opencv")
     adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), sigma_px=0.1, reject="none")

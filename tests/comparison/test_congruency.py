@@ -90,7 +90,7 @@ def test_points_that_moved_are_found_and_no_others(datums: tuple[str, str]) -> N
     assert verdict_of_comparison(found).level == "bad"
 
 
-def test_a_bending_of_the_whole_is_told_from_points_that_move() -> None:
+def test_a_bending_of_the_whole_is_reported_from_points_that_move() -> None:
     xyz = scene()[1].points
     dome = np.zeros((60, 3))
     dome[:, 2] = 0.01 * (xyz[:, :2] ** 2).sum(axis=1)
@@ -103,7 +103,7 @@ def test_a_bending_of_the_whole_is_told_from_points_that_move() -> None:
     assert remarks(compared("free", "free")) == ()
 
 
-def test_another_interior_orientation_is_told() -> None:
+def test_another_interior_orientation_is_reported() -> None:
     first, second = epoch(4, "free"), epoch(5, "free", 0.01 * scene()[1].points[:, :1] ** 2 * [0.0, 0.0, 1.0])
     camera = second.estimate.cameras[0]
     other = camera.with_parameters(camera.parameters + 50.0 * camera.plays(Role.X0))

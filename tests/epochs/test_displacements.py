@@ -100,7 +100,7 @@ def test_more_than_a_third_of_the_points_moved_together() -> None:
     assert found.moved[:25].all() and found.moved[25:].sum() <= 1 and found.agreed
 
 
-def test_a_tilted_block_is_told_from_a_deformed_one() -> None:
+def test_a_tilted_block_is_reported_from_a_deformed_one() -> None:
     x = scene()[1].points
     block = np.arange(POINTS) < 15
     tilt = np.where(block[:, None], np.cross([0.0, 0.02, 0.0], x - x[block].mean(axis=0)), 0.0)

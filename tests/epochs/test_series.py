@@ -118,7 +118,7 @@ def held(one: Epoch, more: float = 0.0) -> Epoch:
     return replace(one, result=replace(one.result, estimate=estimate))
 
 
-def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
+def test_a_calibration_that_is_held_is_reported(tmp_path: Path) -> None:
     """Its error is in no covariance: what both epochs have of it cancels in part, what one has does not."""
     first, second, _ = epochs()
     (name,) = (camera.name for camera in first.result.estimate.cameras)
@@ -138,7 +138,7 @@ def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
         assert apart.kind == "held_apart" and apart.names("cameras") == (name,)
 
 
-def test_epochs_with_other_names_and_of_two_objects_are_told() -> None:
+def test_epochs_with_other_names_and_of_two_objects_are_reported() -> None:
     first, second, _ = epochs()
     rng = np.random.default_rng(1)
     estimate = second.result.estimate

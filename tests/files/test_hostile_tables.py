@@ -1,4 +1,4 @@
-"""Tables and texts from a stranger: formulas in cells, names that nobody can see, endless files."""
+"""Tables and texts from a stranger: formulas in cells, invisible names, endless files."""
 
 from __future__ import annotations
 

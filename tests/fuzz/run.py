@@ -2,7 +2,7 @@
 
 python -m tests.fuzz.run [--count 20000] [--seed 1] [--kinds surveys tables ...]
 
-Every kind runs in a process of its own, so that a crash of a library or a hang is seen and told like any
+Every kind runs in a separate process, so that a crash of a library or a hang is seen and reported like any
 other fault, with the case that repeats it: --kinds KIND --seed S --only CASE.
 
 Seconds are those of computing, which other work on the machine does not change.

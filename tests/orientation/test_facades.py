@@ -1,4 +1,4 @@
-"""Shallow façades, whose two solutions a start tolerance hardly tells apart, also beside a mirror."""
+"""Shallow façades, whose two solutions a start tolerance hardly separates, also beside a mirror."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -48,7 +48,7 @@ def test_channels_of_a_colour_photograph(tmp_path: Path) -> None:
         read_photograph(path, channel="infrared")
 
 
-def test_orientation_is_told_and_never_applied(tmp_path: Path) -> None:
+def test_orientation_is_reported_and_never_applied(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     exif[0x010F], exif[0x0110] = "Maker", "Model 1\0"

@@ -186,7 +186,7 @@ BEHIND = StationLimits(space=np.array([[-3.0, 1.0, 0.0], [3.0, 3.0, 2.0]]))
         (StationLimits(space=np.array([[1.0, -1, 0], [-1, 0, 1]])), "a side without length"),
     ],
 )
-def test_where_nobody_can_stand_is_said(allowed: StationLimits, message: str) -> None:
+def test_no_room_for_stations_is_reported(allowed: StationLimits, message: str) -> None:
     planned = shape_object("wall", (2.0, 1.0), 30)
     with pytest.raises(GeometryError, match=message):
         design_network(planned, CAMERA, allowed, SEEING, WantedPrecision(sigma=1e-4), count=20)

@@ -45,7 +45,7 @@ def test_a_held_camera_that_is_wrong_is_no_good_survey() -> None:
         assert name in held.names("parameters") and held.names("camera") == ("synthetic",)
 
 
-def test_a_principal_point_far_from_the_centre_is_told() -> None:
+def test_a_principal_point_far_from_the_centre_is_reported() -> None:
     network, truth = make_network(seed_of("far centre"), images=8, points=40)
     a = adjust(network, truth, datum=Datum("free"))
     assert verdict_of(a).level == "good"
@@ -72,7 +72,7 @@ def test_a_principal_point_that_no_camera_has_is_an_error(share: float, told: bo
 
 
 @pytest.mark.parametrize("name", ["b1", "b2"])
-def test_pixels_that_no_sensor_has_are_told(name: str) -> None:
+def test_pixels_that_no_sensor_has_are_reported(name: str) -> None:
     network, truth = make_network(seed_of("no such pixels"), images=8, points=40, free=("c", "b1", "b2"))
     a = adjust(network, truth, datum=Datum("free"))
     camera = a.estimate.cameras[0]
@@ -174,7 +174,7 @@ def test_imprecise_photographs_from_all_sides_calibrate_fairly(seed: int) -> Non
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_margin_without_image_points_is_told_from_photographs_from_the_front(seed: int) -> None:
+def test_a_margin_without_image_points_is_reported_from_photographs_from_the_front(seed: int) -> None:
     """Before, photographs tilted by all angles were to be tilted, and their points were in the middle."""
     rng = seed_of(f"margin {seed}")
     free = ("c", "x0", "y0", "K1", "K2")

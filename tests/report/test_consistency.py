@@ -27,7 +27,7 @@ def _solved(network: Network, truth: Estimate, reject: str) -> Adjustment:
     return adjust(network, truth, reject=reject, alpha=alpha)
 
 
-def test_photographs_of_other_noise_are_told() -> None:
+def test_photographs_of_other_noise_are_reported() -> None:
     rng = seed_of("blurred")
     network, truth = make_network(rng, images=12, points=50, free=("c",))
     seen = network.image_points

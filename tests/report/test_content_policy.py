@@ -1,4 +1,4 @@
-"""Every page that is written allows a browser what it holds, and nothing else."""
+"""Every page that is written allows a browser its content, and nothing else."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NOTHING = ["'none'"]
 
 @dataclass
 class Held(HTMLParser):
-    """What a page holds, and its policy."""
+    """The content of a page, and its policy."""
 
     policies: list[str] = field(default_factory=list)
     inline: dict[str, list[str]] = field(default_factory=lambda: {"style": [], "script": []})

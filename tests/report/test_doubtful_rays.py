@@ -1,4 +1,4 @@
-"""Points of three rays with one wrong: where the test blames another ray, the point is told as doubtful."""
+"""Points of three rays with one wrong: where the test blames another ray, the point is doubtful."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _with_wrong_rays(name: str) -> tuple[Network, Estimate, dict[int, int]]:
 
 
 def _blame(networks: int) -> Counter[str]:
-    """Count whom the test blames, and which of these points are told as doubtful."""
+    """Count whom the test blames, and which of these points are reported as doubtful."""
     count: Counter[str] = Counter()
     for k in range(networks):
         network, truth, wrong = _with_wrong_rays(f"three rays {k}")

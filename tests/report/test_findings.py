@@ -106,7 +106,9 @@ def test_a_result_written_twice_is_the_same(
     assert code == 0 and "the results are the same" in told, told
 
 
-def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path], compared: Compared) -> None:
+def test_a_number_that_differs_is_reported_with_its_place(
+    folders: tuple[Path, Path], compared: Compared
+) -> None:
     old, new = folders
     lines = (new / "points.csv").read_text().splitlines()
     cells = lines[3].split(",")
@@ -143,7 +145,7 @@ def test_words_may_differ_where_that_is_meant_but_numbers_may_not(
     assert compared(old, new, "--wording")[0] == wording
 
 
-def test_missing_files_and_other_folders_are_told(
+def test_missing_files_and_other_folders_are_reported(
     folders: tuple[Path, Path], compared: Compared, tmp_path: Path
 ) -> None:
     old, new = folders

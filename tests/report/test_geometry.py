@@ -137,7 +137,7 @@ def test_points_with_one_ray_each_have_no_angle() -> None:
     assert "not known" in html_of(findings_of(result))
 
 
-def test_many_numbers_of_rays_are_told_in_ranges() -> None:
+def test_many_numbers_of_rays_are_reported_in_ranges() -> None:
     rays = np.repeat(np.arange(2, 60), np.arange(2, 60))
     none = np.zeros(0)
     found = Geometry(rays, none, none, none, none, (), rays)

@@ -1,4 +1,4 @@
-"""Plots drawn by a process of their own."""
+"""Plots drawn by a separate process."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_where_no_thread_can_send_plots_are_drawn_here(
     assert process.plots() == draw_plots(shown)
 
 
-def test_what_cannot_be_drawn_is_told_by_this_process(shown: PlotData, process: PlotProcess) -> None:
+def test_what_cannot_be_drawn_is_reported_by_this_process(shown: PlotData, process: PlotProcess) -> None:
     process.begin(replace(shown, points=np.zeros((4, 7))))
     with pytest.raises(ValueError, match=r"shape|match"):
         process.plots()

@@ -122,7 +122,7 @@ def test_correlations_with_every_photograph_are_a_table(found: Findings, tmp_pat
     assert size == pytest.approx(abs(strongest.largest), rel=1e-9) and size < 1
 
 
-def test_the_first_and_the_last_error_are_told() -> None:
+def test_the_first_and_the_last_error_are_reported() -> None:
     """Points 5 mm off at the start, some 10 px in the photographs of 0.1 px."""
     rng = seed_of("first error")
     network, truth = make_network(rng, images=8, points=30, free=())

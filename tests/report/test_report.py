@@ -411,7 +411,7 @@ def test_pictures_are_cut_into_panels_that_show_something(result: SurveyResult) 
     assert all(len(found) == 3 and found[0] == found[1] + found[2] for found in width.values())
 
 
-def test_precision_is_told_as_one_sigma_and_as_what_95_of_100_are_within(
+def test_precision_is_reported_as_one_sigma_and_as_what_95_of_100_are_within(
     result: SurveyResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = findings_of(result)
@@ -445,7 +445,7 @@ def test_one_of_a_kind_is_no_plural() -> None:
     assert not by_hand, "sfm.display.counted writes numbers of things"
 
 
-def test_reasons_are_told_from_what_is_most_like_a_target(result: SurveyResult) -> None:
+def test_reasons_are_reported_from_what_is_most_like_a_target(result: SurveyResult) -> None:
     first = result.photographs[0]
     flag = np.array([Flag.TOO_SMALL.value, Flag.TOO_SMALL.value, Flag.POOR_FIT.value])
     found = findings_of(replace(result, photographs=(replace(first, rejected_flag=flag),)))

@@ -304,7 +304,7 @@ def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
 
 
 @pytest.mark.parametrize(("guess", "told"), [(1.0, False), (1.8, False), (2.2, True), (4.0, True)])
-def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
+def test_a_sigma_that_is_far_too_large_is_reported_with_what_it_would_be(
     synthetic: tuple[Network, Estimate], guess: float, told: bool
 ) -> None:
     network, truth = synthetic
@@ -328,7 +328,7 @@ def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
     ("bad", "guess", "told"),
     [(0, 1.0, False), (6, 1.0, True), (6, 5.0, True), (6, 0.5, True), (0, 0.5, False)],
 )
-def test_gross_errors_that_nobody_looked_for_are_counted(
+def test_gross_errors_that_were_not_looked_for_are_counted(
     synthetic: tuple[Network, Estimate], bad: int, guess: float, told: bool
 ) -> None:
     """Of 1 px; whatever standard deviation is stated."""
@@ -374,7 +374,7 @@ def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Ne
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 
 
-def test_control_that_contradicts_is_told_apart_from_the_image_points(
+def test_control_that_contradicts_is_separated_from_the_image_points(
     synthetic: tuple[Network, Estimate],
 ) -> None:
     network, truth = synthetic
@@ -641,7 +641,7 @@ def test_parameters_that_mean_nothing_are_named() -> None:
     assert [one["parameter"] for one in named] == ["b2"]
 
 
-def test_only_what_may_be_0_is_told_over_its_standard_deviation(
+def test_only_what_may_be_0_is_reported_over_its_standard_deviation(
     synthetic: tuple[Network, Estimate],
 ) -> None:
     network, truth = synthetic
@@ -654,7 +654,7 @@ def test_only_what_may_be_0_is_told_over_its_standard_deviation(
     }
 
 
-def test_circles_are_told(synthetic: tuple[Network, Estimate]) -> None:
+def test_circles_are_reported(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(network, truth, datum=Datum("free"))
     found = result_of(a, eccentricity=Eccentricity(0.1641, 0.0443, 0.0003), no_circles=("u007", "u<9"))
@@ -793,7 +793,7 @@ def test_tables_of_reliability_and_variance_components(
     assert [row["group"] for row in photographs] == list(a.network.images)
 
 
-def test_shared_parameters_are_told_once(synthetic: tuple[Network, Estimate]) -> None:
+def test_shared_parameters_are_reported_once(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     m = len(network.images)
     cameras = tuple(

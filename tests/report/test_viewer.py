@@ -1,4 +1,4 @@
-"""What the viewer holds: the script is that of its sources, budgets are kept, crops are in place."""
+"""The content of the viewer: the script is that of its sources, budgets are kept, crops are in place."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_residuals_of_a_stored_result_are_those_of_its_noise() -> None:
     assert np.sqrt(total) == pytest.approx(made.rms_px, rel=1e-12)
 
 
-def test_what_has_no_coordinates_is_left_out_and_told() -> None:
+def test_what_has_no_coordinates_is_left_out_and_reported() -> None:
     one = stored("partial")
     position, points = one.estimate.position.copy(), one.estimate.points.copy()
     position[2], points[7] = np.nan, np.nan
@@ -146,7 +146,7 @@ def test_crops_show_the_target_where_it_was_measured(tmp_path: Path) -> None:
         assert crop[int(row), int(column)] > 200
 
 
-def test_photographs_that_are_gone_are_told(tmp_path: Path, noisy_files: dict[str, Path]) -> None:
+def test_photographs_that_are_gone_are_reported(tmp_path: Path, noisy_files: dict[str, Path]) -> None:
     made = scene_of_stored(stored("gone"))
     found = cut_pictures(made, noisy_files | {"image 2": tmp_path / "none.png"})
     assert found.notes == ("1 of 6 photographs could not be read: they have no picture here.",)

@@ -36,7 +36,7 @@ class Recorded(Silent):
         self.steps.append((self.at, name, done, total))
 
 
-def test_steps_reach_whoever_watches_the_stage_and_nobody_else() -> None:
+def test_steps_reach_whoever_watches_the_stage_and_no_one_else() -> None:
     watching = Recorded()
     report_step("before")
     with StageClock(watching).stage("one"):

@@ -146,7 +146,7 @@ def test_both_cameras_see_the_plate_in_one_turn(
 
 
 @pytest.mark.parametrize(("moved", "apart"), [(0.0, ()), (1.0, (0, 2, 3, 4, 5))])
-def test_a_turn_that_nothing_decides_is_told(moved: float, apart: tuple[int, ...], tmp_path: Path) -> None:
+def test_an_undecided_turn_is_reported(moved: float, apart: tuple[int, ...], tmp_path: Path) -> None:
     """A plate that was not moved, and photographs most of which are not of one moment."""
     names = numbered("left", 6), numbered("right", 6)
     plate = PlateFamily("checkerboard", 7, 9)
@@ -155,7 +155,7 @@ def test_a_turn_that_nothing_decides_is_told(moved: float, apart: tuple[int, ...
     assert len(told.names("photographs")) == 12 and told.names("cameras") == ("left", "right")
 
 
-def test_a_pair_of_two_moments_is_told(tmp_path: Path) -> None:
+def test_a_pair_of_two_moments_is_reported(tmp_path: Path) -> None:
     names = numbered("left", 6), numbered("right", 6)
     plate = PlateFamily("checkerboard", 7, 9)
     measured, start, _ = measured_pairs(tmp_path, plate, *names, roll=2.8, apart=(3,))

@@ -73,7 +73,7 @@ def _with_a_wild_point(name: str) -> tuple[Network, Estimate]:
     return replace(network, image_points=replace(seen, xy=xy)), truth
 
 
-def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_told() -> None:
+def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_reported() -> None:
     network, truth = make_network(seed_of("wrong one"), images=8, points=40)
     rotation, position = truth.rotation.copy(), truth.position.copy()
     rotation[3], position[3] = rotation[6], position[6]

@@ -43,7 +43,7 @@ def test_all_that_is_missing_of_all_cameras_is_said_before_anything_is_measured(
         ({"pixel_mm": (0.0040, 0.0041)}, (0.0040, 0.0041), ("c",), False),  # stated: as on a line scanner
     ],
 )
-def test_nominal_sensor_sizes_that_make_odd_pixels_are_told(
+def test_nominal_sensor_sizes_that_make_odd_pixels_are_reported(
     settings: dict[str, tuple[float, float]], pixel: tuple[float, float], free: tuple[str, ...], told: bool
 ) -> None:
     camera = CameraSetup(name="a", images="*.png", free=free, **settings)

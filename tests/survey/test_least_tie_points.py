@@ -34,7 +34,7 @@ def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int
     assert list(found.dropped_images) == ([] if stays else told)
 
 
-def test_points_that_leave_with_a_photograph_are_told_so() -> None:
+def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
     """All their rays are accepted, and one is of a photograph that is not in the result."""
     network, truth = make_network(seed_of("leave with it"), images=10, points=60, free=("c",))
     seen = network.image_points

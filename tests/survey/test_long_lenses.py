@@ -48,7 +48,7 @@ def test_a_long_lens_converges(free: tuple[str, ...]) -> None:
     assert again.sigma0_px == pytest.approx(a.sigma0_px, rel=1e-6)
 
 
-def test_what_is_held_is_told() -> None:
+def test_what_is_held_is_reported() -> None:
     camera = camera_from_values("A", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, free=("c", "x0", "y0"))
     held = replace(camera, free=camera.free & ~np.isin(camera.names, ["x0", "y0"]))
     (one,) = held_to_converge((camera, camera), (held, held))

@@ -1,4 +1,4 @@
-"""Photographs that are lost are told in groups, with what would connect them, or with a wrong c."""
+"""Photographs that are lost are reported in groups, with what would connect them, or with a wrong c."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def orientation(network: Network, estimate: Estimate) -> Orientation:
     return Orientation(estimate, failures, (), None, "given", fits, 0.1, np.full(1, 4.0))
 
 
-def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -> None:
+def test_groups_that_are_not_connected_are_reported_with_what_would_connect_them() -> None:
     network, truth = split_network()
     estimate = partly(truth, np.arange(IMAGES) < 6)
     (group,) = lost_groups(network, estimate)
@@ -115,7 +115,7 @@ def test_photographs_that_are_connected_are_no_group_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("free", [True, False])
-def test_a_principal_distance_that_loses_photographs_is_told(free: bool) -> None:
+def test_a_principal_distance_that_loses_photographs_is_reported(free: bool) -> None:
     network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
     camera = truth.cameras[0]
     given = camera_from_values(

@@ -103,7 +103,7 @@ def test_a_survey_with_a_crop_goes_on(tmp_path: Path) -> None:
         ("a.dng", "a raw file"),
     ],
 )
-def test_what_must_be_converted_is_told_with_how(name: str, told: str, tmp_path: Path) -> None:
+def test_what_must_be_converted_is_reported_with_how(name: str, told: str, tmp_path: Path) -> None:
     """Raw files are TIFF files whose first picture is a small preview."""
     cv2.imwrite(str(tmp_path / "a.tif"), np.full((30, 40), 90, dtype=np.uint8))
     (tmp_path / "a.tif").rename(tmp_path / name)
@@ -139,7 +139,7 @@ def test_links_to_photographs_of_ones_own_are_read_in_a_folder_that_is_named(
             find_photographs(survey, images_dir=given if named else None)
 
 
-def test_tags_in_place_of_the_rings_that_were_asked_for_are_told(tmp_path: Path) -> None:
+def test_tags_in_place_of_the_rings_that_were_asked_for_are_reported(tmp_path: Path) -> None:
     path = write_photograph_survey(tmp_path / "s", "no rings", photographs=2)
     family = tag_family("aruco4x4_50")
     for k in (1, 2):

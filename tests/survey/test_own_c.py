@@ -1,4 +1,4 @@
-"""Texture whose photographs differ in c: each has its own, where the survey leaves to them what is free."""
+"""Texture whose photographs differ in c: each has another, where the survey leaves to them what is free."""
 
 from __future__ import annotations
 

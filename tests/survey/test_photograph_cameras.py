@@ -1,4 +1,4 @@
-"""Photographs that do not fit the others: zoomed ones get their own camera, strange ones are left out."""
+"""Photographs that do not fit: zoomed ones get per-photograph cameras, strange ones are left out."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool)
 
 @pytest.mark.parametrize("number", [215, 219])
 def test_a_photograph_with_the_names_of_other_points_is_left_out(number: int) -> None:
-    """A camera of its own left residuals of 200 px, and was believed; c was -106 %."""
+    """A per-photograph camera left residuals of 200 px, and was believed; c was -106 %."""
     one = planted("names shifted", number)
     camera = one.start.cameras[0]
     free = tuple(name for name, on in zip(camera.names, camera.free, strict=True) if on)

@@ -16,7 +16,7 @@ from tests.synthetic import make_network, seed_of
 
 
 @pytest.mark.parametrize("model", ["brown", "opencv"])
-def test_c_far_from_its_start_value_is_told(model: str) -> None:
+def test_c_far_from_its_start_value_is_reported(model: str) -> None:
     _, truth = make_network(seed_of("far c"), images=3, points=12, model=model)
     name = replace(truth.cameras[0], name="synthetic")
     estimate = replace(truth, cameras=(name,))

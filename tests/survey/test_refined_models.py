@@ -314,7 +314,7 @@ def test_a_model_that_is_not_dependable_says_so(
     assert "error: The adjustment did not converge in " in capsys.readouterr().out
 
 
-def test_an_rms_that_is_hardly_lower_is_told_unless_it_is_that_of_windows(tmp_path: Path) -> None:
+def test_an_rms_that_is_hardly_lower_is_reported_unless_it_is_that_of_windows(tmp_path: Path) -> None:
     _model(tmp_path)
     found = refine_model(*read_model(tmp_path / "model"), tmp_path)
     again = replace(found, readjusted=found.adjustment)  # a model that has been refined before
@@ -556,7 +556,7 @@ def test_control_gives_a_model_its_frame_and_what_is_wrong_of_it_is_taken_out(
     assert not (tmp_path / "again").exists()
 
 
-def test_photographs_of_another_object_are_told(tmp_path: Path) -> None:
+def test_photographs_of_another_object_are_reported(tmp_path: Path) -> None:
     scene = _model(tmp_path)
     grey = np.full(SIZE[::-1], 90, np.uint8)
     for i in range(PHOTOGRAPHS):

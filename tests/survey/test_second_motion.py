@@ -1,4 +1,4 @@
-"""Tie points of two rigid bodies that move against each other are told; errors by chance are not."""
+"""Tie points of two rigid bodies that move against each other are reported; errors by chance are not."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def orient_again(network: Network, start: Estimate) -> Orientation:
 
 
 @pytest.mark.parametrize("count", [60, MOTION_POINTS + 5])
-def test_points_that_walk_on_together_are_told_with_their_share(count: int) -> None:
+def test_points_that_walk_on_together_are_reported_with_their_share(count: int) -> None:
     network, truth = walked(count)
     (found,) = find_second_motion(network, oriented(network, truth), orient_again)
     assert found.kind == "second_motion" and found.severity == "error"

@@ -106,7 +106,7 @@ def test_a_photograph_with_three_codes_and_a_tenth_elsewhere_is_left_out(
     assert sorted(found.left_out) == ([5] if left_out else [])
 
 
-def test_a_code_that_moved_is_told_and_costs_no_photograph(folder: Path) -> None:
+def test_a_code_that_moved_is_reported_and_costs_no_photograph(folder: Path) -> None:
     result = surveyed(folder, ["a*", "c*"])
     assert result.failed == ()
     (moved,) = of_kind(result.remarks, "code_at_several_places", "code_rays_apart")

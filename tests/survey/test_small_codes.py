@@ -60,7 +60,7 @@ def test_a_folder_of_rings_is_recognised(name: str, tmp_path: Path) -> None:
     assert f'codes = "{name}"' in draft.text
 
 
-def test_small_codes_are_told_with_what_would_do() -> None:
+def test_small_codes_are_reported_with_what_would_do() -> None:
     small = [photographed(5.6) for _ in range(2)]
     (one,) = small_codes(small)
     assert one.kind == "codes_too_small"
@@ -68,7 +68,7 @@ def test_small_codes_are_told_with_what_would_do() -> None:
 
 
 @pytest.mark.parametrize("diameter_px", [9.0, 12.0])
-def test_the_size_that_is_told_does(diameter_px: float) -> None:
+def test_the_size_that_is_reported_does(diameter_px: float) -> None:
     found = photographed(diameter_px)
     assert (found.code >= 0).sum() >= ACROSS**2 - 1
     assert small_codes([found]) == () and small_codes([]) == ()

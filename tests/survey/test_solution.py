@@ -102,7 +102,7 @@ def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) 
     assert bars.passed
 
 
-def test_weights_that_do_not_converge_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_do_not_converge_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variance_components, "MAX_ROUNDS", 0)
     result = run_survey(read_survey(barred_survey(tmp_path / "barred")))
     assert of_kind(result.remarks, "weights_not_converged")

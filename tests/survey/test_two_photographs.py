@@ -1,4 +1,4 @@
-"""Surveys of two rendered photographs: the result, what a pair cannot tell, and the solutions of a plane."""
+"""Surveys of two rendered photographs: the result, what a pair cannot show, and the solutions of a plane."""
 
 from __future__ import annotations
 

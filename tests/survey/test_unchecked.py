@@ -225,7 +225,7 @@ def test_the_level_of_the_test_against_the_free_network() -> None:
     assert low <= 4  # 0.6 expected
 
 
-def test_two_ray_points_are_told() -> None:
+def test_two_ray_points_are_reported() -> None:
     rng = seed_of("two rays")
     network, truth = add_narrow_points(*make_network(rng, images=6, points=30), rng, 7)
     verdict = findings_of(run_survey(survey_of(network, truth))).verdict

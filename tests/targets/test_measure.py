@@ -144,7 +144,7 @@ def test_a_neighbour_is_left_out() -> None:
     np.testing.assert_allclose(result.xy[0], xy, atol=0.01)
 
 
-def test_a_target_at_the_border_and_an_empty_place_are_told() -> None:
+def test_a_target_at_the_border_and_an_empty_place_are_reported() -> None:
     xy, axes = np.array([4.0, 31.0]), np.array([6.0, 6.0])
     cut = fit(30 + 150 * coverage(xy, axes, 0, 0.7), xy, axes, 0, 1)
     assert cut.flag[0] & (Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC)

@@ -1,4 +1,4 @@
-"""Tags of 10 to 23 px: found as OpenCV finds them, no wrong id, corners at their own precision."""
+"""Tags of 10 to 23 px: found as OpenCV finds them, no wrong id, corners at their precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Square tags: corners at their own precision, no wrong id, a whole survey, sheets that are read back."""
+"""Square tags: corners at their precision, no wrong id, a whole survey, sheets that are read back."""
 
 from __future__ import annotations
 

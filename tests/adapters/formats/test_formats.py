@@ -469,7 +469,7 @@ def test_image_points_are_corrected_for_formats_without_distortion(name: str, tm
     np.testing.assert_allclose(reprojection(again, read)[b], expected[a], atol=1e-5)
 
 
-def test_what_was_written_is_told(tmp_path: Path) -> None:
+def test_what_was_written_is_reported(tmp_path: Path) -> None:
     network, truth = network_in("opencv")
     k = len(network.image_points)
     assert written("ply", network, truth) == "20 points"

@@ -78,7 +78,7 @@ def test_where_pixel_and_principal_distance_come_from() -> None:
     assert assumed and c / pixel == pytest.approx(1.2 * 2000) and pixel == 36 / 2000
 
 
-def test_resampled_and_turned_photographs_are_told() -> None:
+def test_resampled_and_turned_photographs_are_reported() -> None:
     small = replace(PHONE, taken_px=(8000, 6000))
     (found,) = group_photographs({"a.jpg": small, "b.jpg": replace(small, orientation=6)}).cameras
     resampled, turned = found.remarks
