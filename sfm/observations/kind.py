@@ -219,15 +219,13 @@ class TableKind(Kind):
 
     def mistakes(self) -> Mapping[str, Self]:
         """Return the observations in other units, and what a kind knows besides."""
-        is_angle = np.resize([name in self.angles for name in self.components], self.values.shape)
+        turned = np.array([name in self.angles for name in self.components])
+        units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048} if not turned.all() else {}
         found: dict[str, Self] = {}
-        if not is_angle.all():
-            units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048}
-            found |= {
-                name: self.with_values(self.values * np.where(is_angle, 1.0, f)) for name, f in units.items()
-            }
-        if is_angle.any():
-            found["gon"] = self.with_values(self.values * np.where(is_angle, 0.9, 1.0))
+        for name, factor in (units | ({"gon": 0.9} if turned.any() else {})).items():
+            by = np.where(turned == (name == "gon"), factor, 1.0)
+            values = self.values * np.resize(by, self.values.shape)
+            found[name] = self.with_values(values).with_sigma(self.sigma * np.resize(by, self.sigma.shape))
         return found
 
     @classmethod
