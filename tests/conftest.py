@@ -20,14 +20,18 @@ from tests.places import SHARED
 SHARED = SHARED / "data"
 
 os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long
-os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="kolinear-tests-")  # never that of the user
-atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
+CACHES = tempfile.mkdtemp(prefix="kolinear-tests-")
+os.environ["XDG_CACHE_HOME"] = CACHES  # never that of the user
+atexit.register(shutil.rmtree, CACHES, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache folder for each test, so that none finds what others have measured."""
-    folder = tmp_path_factory.mktemp("cache")
+def cache(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder for each test, so that none finds what others have measured.
+
+    Not numbered by pytest, which lists all the folders of earlier tests for each (20 s of the suite).
+    """
+    folder = Path(tempfile.mkdtemp(dir=CACHES))
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
     return folder
 

@@ -46,7 +46,25 @@ NAMED = {  # bad with the first kinds, fair with the others
 BAD = ("datum_contradicted", "scale_contradicted", "given_mirrored", "given_contradicted")
 
 
-@pytest.mark.parametrize("case", [one[0] for one in CASES if one[0] not in NEVER_FOUND])
+OF_STUDY = {  # each beside a quick one of the same kind
+    "control 2 mm",
+    "checking control 50 sigma",
+    "five control, X and Y exchanged",
+    "y upwards, four control",
+    "two names of a box",
+    "four of eight control, X and Y",
+    "fixed control turned by a row",
+}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=[pytest.mark.slow] if case in OF_STUDY else [])
+        for case, *_ in CASES
+        if case not in NEVER_FOUND
+    ],
+)
 def test_what_is_mistyped_is_found_and_named(case: str) -> None:
     found = mistyped(case, 100)
     assert not found.is_wrong_and_good

@@ -17,7 +17,7 @@ from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.synthetic import make_network, seed_of
 
-IMAGES, POINTS, ZOOMED = 9, 150, (3, 4, 7)
+IMAGES, POINTS, ZOOMED = 9, 60, (3, 4, 7)
 
 
 def zoomed(change: float) -> tuple[Network, Estimate]:

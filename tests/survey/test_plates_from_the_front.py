@@ -20,7 +20,7 @@ def test_no_camera_is_calibrated_from_the_front(tmp_path: Path) -> None:
     """Before, c was held 1 mm wrong and the survey worked."""
     rng, plates = seed_of("from the front"), Plates.side_by_side(1)
     result = run_plates(
-        plates_survey(tmp_path, 1, free="", c_mm=8.88), plates, about(plates, rng, 4, 0.0, 250.0), rng
+        plates_survey(tmp_path, 1, free="", c_mm=8.88), plates, about(plates, rng, 3, 0.0, 250.0), rng
     )
     findings = findings_of(result)
     (found,) = (one for one in findings.verdict.remarks if one.severity != "note")
