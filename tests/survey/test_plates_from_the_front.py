@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sfm.network import Estimate
 from sfm.remarks.remark import kinds_of
@@ -16,14 +17,16 @@ from tests.survey.seen_plates import FREE, Plates, about, plates_survey, run_pla
 from tests.synthetic import seed_of
 
 
-def test_no_camera_is_calibrated_from_the_front(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("count", "more"), [(2, ("calibrated_from_few",)), (3, ())])
+def test_no_camera_is_calibrated_from_the_front(tmp_path: Path, count: int, more: tuple[str, ...]) -> None:
     """Before, c was held 1 mm wrong and the survey worked."""
     rng, plates = seed_of("from the front"), Plates.side_by_side(1)
     result = run_plates(
-        plates_survey(tmp_path, 1, free="", c_mm=8.88), plates, about(plates, rng, 3, 0.0, 250.0), rng
+        plates_survey(tmp_path, 1, free="", c_mm=8.88), plates, about(plates, rng, count, 0.0, 250.0), rng
     )
     findings = findings_of(result)
-    (found,) = (one for one in findings.verdict.remarks if one.severity != "note")
+    found, *others = (one for one in findings.verdict.remarks if one.severity != "note")
+    assert kinds_of(others) == more
     assert (found.kind, found.severity, findings.calibrated) == ("calibration_failed", "error", ())
     assert found.number("held") == result.adjustment.estimate.cameras[0].parameters[0]
 
