@@ -64,20 +64,20 @@ def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Mea
     """Return the orientation of six photographs of points on the walls of a room, 0.1 px of noise."""
     (folder / "survey.toml").write_text(SURVEY.format(model=model), encoding="utf-8")
     survey, rng = read_survey(folder / "survey.toml"), seed_of("room")
-    on = rng.integers(0, 3, 300)
-    xyz = rng.uniform([-4.0, -1.5, -3.0], [4.0, 3.5, 1.0], (300, 3))
+    on = rng.integers(0, 3, 150)
+    xyz = rng.uniform([-4.0, -1.5, -3.0], [4.0, 3.5, 1.0], (150, 3))
     xyz[on == 0, 2] = -3.0
-    xyz[on == 1, 0] = np.where(rng.random(300) < 0.5, -4.0, 4.0)[on == 1]
-    xyz[on == 2, 1] = np.where(rng.random(300) < 0.5, -1.5, 3.5)[on == 2]
+    xyz[on == 1, 0] = np.where(rng.random(150) < 0.5, -4.0, 4.0)[on == 1]
+    xyz[on == 2, 1] = np.where(rng.random(150) < 0.5, -1.5, 3.5)[on == 2]
     position, rotation = stations(rng, 6)
     xy = np.stack([project(camera, *one, xyz) for one in zip(position, rotation, strict=True)])
     xy += rng.normal(0, 0.1, xy.shape)
     image, point = np.nonzero((np.isfinite(xy) & (xy > 0) & (xy < np.array(SIZE_PX) - 1)).all(axis=2))
     seen = ImagePoints(image, point, xy[image, point], np.tile(0.01 * np.eye(2), (len(image), 1, 1)))
     names = tuple(f"{i}.png" for i in range(6))
-    network = Network(names, np.zeros(6, dtype=np.int64), tuple(map(str, range(300))), seen)
+    network = Network(names, np.zeros(6, dtype=np.int64), tuple(map(str, range(150))), seen)
     cameras = start_cameras(survey.cameras, "room")
-    return orient_with_models(survey, Measurements(network, cameras, names, np.full(300, 3)))
+    return orient_with_models(survey, Measurements(network, cameras, names, np.full(150, 3)))
 
 
 @pytest.mark.parametrize(

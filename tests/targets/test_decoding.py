@@ -300,7 +300,7 @@ def cut_rings(count: int, family: CodeFamily, seed: int) -> Rings:
     )
 
 
-@pytest.mark.parametrize("name", ["ring12", "ring14"])
+@pytest.mark.parametrize("name", [pytest.param("ring12", marks=pytest.mark.slow), "ring14"])
 def test_rings_that_are_cut_on_two_sides_are_not_read_wrong(name: str) -> None:
     family = code_family(name)
     assert isinstance(family, CodeFamily)

@@ -249,7 +249,7 @@ def test_a_hot_pixel_is_no_mark() -> None:
     dot = 200 - 160 * cv2.GaussianBlur(ink, (0, 0), 0.8) + rng.normal(0, 1, ink.shape)
 
     def coherence(where: tuple[slice, slice], more: float) -> FloatArray:
-        picture = dot.copy()
+        picture = dot.astype(np.float32)  # as photographs; float64 would be compiled anew
         picture[where] += more
         start = np.array([[24.0, 24.0, 1 / 12, 0.0, 1 / 12]])
         whole = np.ones((1, RAYS), bool), np.array([math.inf])
