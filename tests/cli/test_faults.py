@@ -129,25 +129,25 @@ def test_batch_of_ten_survives_twenty_kills(tmp_path: Path) -> None:
     print(f"{killed} kills in {rounds} rounds")
 
 
-def test_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "left"),
+    [
+        (("adjust", "--out", "out/s"), set()),
+        pytest.param(("batch", "--jobs", 1, "--out", "out"), {"logs"}, marks=pytest.mark.slow),
+    ],
+)
+def test_full_disk_is_one_line_and_leaves_nothing(
+    tmp_path: Path, command: tuple[object, ...], left: set[str]
+) -> None:
     survey = write_observed_survey(tmp_path / "s", "s", backend="colmap")
-    run = kolinear("adjust", survey, "--out", tmp_path / "out" / "s", limit=SMALL_FILE_BYTES)
+    *options, out = command
+    run = kolinear(*options, tmp_path / str(out), survey, limit=SMALL_FILE_BYTES)
     assert run.returncode == 2, run.stderr
     assert re.fullmatch(r"kolinear: .*(cannot be written|File too large).*\n", run.stderr)
     assert run.stdout == ""
-    assert names_in(tmp_path / "out") == set()
-
-
-@pytest.mark.slow
-def test_full_disk_ends_a_batch_with_one_line(tmp_path: Path) -> None:
-    survey = write_observed_survey(tmp_path / "s", "s", backend="colmap")
-    run = kolinear("batch", survey, "--out", tmp_path / "out", "--jobs", 1, limit=SMALL_FILE_BYTES)
-    assert run.returncode == 2, run.stderr
-    assert re.fullmatch(r"kolinear: .*(cannot be written|File too large).*\n", run.stderr)
-    assert run.stdout == ""
-    assert names_in(tmp_path / "out") == {"logs"}
-    (log,) = (tmp_path / "out" / "logs").iterdir()
-    assert read_log(log)[-1]["event"] == "failed"
+    assert names_in(tmp_path / "out") == left
+    for log in (tmp_path / "out").glob("logs/*"):
+        assert read_log(log)[-1]["event"] == "failed"
 
 
 def test_read_only_folder_is_one_line(tmp_path: Path) -> None:

@@ -126,28 +126,27 @@ def test_finds_the_points_with_a_fifth_missing_and_a_fifth_false(scene, noise, t
     assert found.residual_px.max() <= tolerance
 
 
+def roughly_oriented(name, scene, tolerance):
+    """Return the targets of photographs, and precision, recall and doubles of their correspondences."""
+    rng, network = generator(name), convergent_network(21)
+    points = plane_grid(10) if scene == "grid" else rng.uniform(-0.4, 0.4, (100, 3))
+    targets, truth = measure(network, points, rng, noise_px=0.1)
+    start = disturbed(network, rng, shift=0.001, turn_deg=0.1)
+    found = match_targets(start, np.zeros(21, dtype=int), targets, tolerance_px=tolerance)
+    return targets, judge(found, truth)
+
+
 @pytest.mark.parametrize("scene", ["grid", "cloud"])
 def test_survives_a_rough_orientation(scene):
     """4 px RMS and 12 px at most of start error, as after a first bundle on a few coded targets."""
-    rng = generator(f"rough {scene}")
-    points = plane_grid(10) if scene == "grid" else rng.uniform(-0.4, 0.4, (100, 3))
-    network = convergent_network(21)
-    targets, truth = measure(network, points, rng, noise_px=0.1)
-    start = disturbed(network, rng, shift=0.001, turn_deg=0.1)
-    found = match_targets(start, np.zeros(21, dtype=int), targets, tolerance_px=14)
-    precision, recall, double = judge(found, truth)
+    targets, (precision, recall, double) = roughly_oriented(f"rough {scene}", scene, 14)
     assert precision > 0.995 - 2.5 * mistaken(targets, 14)
     assert recall > 0.95
     assert double == 0
 
 
 def test_an_orientation_beyond_the_tolerance_costs_points_but_makes_no_wrong_ones():
-    rng = generator("beyond")
-    network = convergent_network(21)
-    targets, truth = measure(network, plane_grid(10), rng, noise_px=0.1)
-    start = disturbed(network, rng, shift=0.001, turn_deg=0.1)
-    found = match_targets(start, np.zeros(21, dtype=int), targets, tolerance_px=4)
-    precision, recall, double = judge(found, truth)
+    _, (precision, recall, double) = roughly_oriented("beyond", "grid", 4)
     assert precision > 0.99
     assert 0.3 < recall < 0.95
     assert double <= 2

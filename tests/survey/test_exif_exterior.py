@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,14 +77,24 @@ def test_one_photograph_far_off_is_left_out(tmp_path: Path, off: float) -> None:
     assert np.abs(result.adjustment.estimate.position - truth).max() < 0.1
 
 
-def test_every_other_photograph_is_enough(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "missing", "used", "heights", "within"),
+    [
+        ("half of them", np.s_[::2], 4, 4, 0.1),
+        ("three heights", np.s_[3:, 2], 8, 3, 0.2),
+    ],
+)
+def test_positions_and_heights_may_be_missing(
+    tmp_path: Path, name: str, missing: Any, used: int, heights: int, within: float
+) -> None:
     def change(places: FloatArray) -> FloatArray:
-        places[::2] = np.nan
+        places[missing] = np.nan
         return places
 
-    result, truth = run_with(tmp_path, "half of them", change)
-    assert len(result.adjustment.network.exterior) == 4
-    assert np.abs(result.adjustment.estimate.position - truth).max() < 0.1
+    result, truth = run_with(tmp_path, name, change)
+    exterior = result.adjustment.network.exterior
+    assert len(exterior) == used and np.isfinite(exterior.covariance[:, 2, 2]).sum() == heights
+    assert np.abs(result.adjustment.estimate.position - truth).max() < within
 
 
 def test_positions_that_do_not_differ_give_no_datum(tmp_path: Path) -> None:
@@ -104,16 +115,6 @@ def test_positions_of_a_telephone_at_a_close_range_give_no_datum(tmp_path: Path)
     places = written(tmp_path, "same")[1].position
     extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[:2] / np.sqrt(len(places) * 50)
     np.testing.assert_allclose([float(one) for one in said.groups()], extents, atol=0.06)
-
-
-def test_heights_may_be_missing(tmp_path: Path) -> None:
-    def change(places: FloatArray) -> FloatArray:
-        places[3:, 2] = np.nan
-        return places
-
-    result, truth = run_with(tmp_path, "three heights", change)
-    assert np.isinf(result.adjustment.network.exterior.covariance[3:, 2, 2]).all()
-    assert np.abs(result.adjustment.estimate.position - truth).max() < 0.2
 
 
 def test_stated_standard_deviations_go_before_those_of_the_survey() -> None:

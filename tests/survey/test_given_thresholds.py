@@ -204,11 +204,17 @@ def test_contradicting_control_is_an_error_but_for_one_of_some_that_the_others_c
         assert (said.number("shift") < 5) == (kinds == "warning")
 
 
-def test_stretched_control_is_an_error() -> None:
-    network, truth = make_network(seed_of("stretched control"), images=8, points=30)
-    xyz = truth.points[:8] * (1, 0.99, 1)
+def said_of_control(name: str, factors: tuple[float, ...], fourth_off: float = 0.0) -> tuple[Remark, ...]:
+    """Return the remarks on eight control points multiplied by factors, the fourth off in Y, m."""
+    network, truth = make_network(seed_of(name), images=8, points=30)
+    xyz = truth.points[:8] * factors
+    xyz[3, 1] += fourth_off
     control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz, 2e-4)
-    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+    return remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+
+
+def test_stretched_control_is_an_error() -> None:
+    said = said_of_control("stretched control", (1, 0.99, 1))
     assert said[0].kind == "given_strained" and said[0].severity == "error"
     assert said[0].names("axis") == ("Y",) and said[0].number("elongation") == pytest.approx(-1, rel=0.1)
 
@@ -232,10 +238,6 @@ def test_fixed_control_that_shifts_the_result_is_an_error(error: float, severity
 
 
 def test_mirrored_control_names_what_does_not_fit_either() -> None:
-    network, truth = make_network(seed_of("mirrored and wrong"), images=8, points=30)
-    xyz = truth.points[:8] * (1, 1, -1)
-    xyz[3] += (0.0, 0.02, 0.0)
-    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz, 2e-4)
-    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+    said = said_of_control("mirrored and wrong", (1, 1, -1), fourth_off=0.02)
     assert said[0].kind == "given_mirrored" and said[0].names("given") == ("4",)
     assert said[0].number("mirrored") < 40 < said[0].number("chi2")  # 14 degrees of freedom

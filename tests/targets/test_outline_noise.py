@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from datasets.bridge import render
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.rendering.render import render_photographs
 from sfm.targets.candidates import find_duplicates
 from sfm.targets.detect import find_targets
@@ -294,18 +294,24 @@ def test_rings_are_measured_at_their_holes_and_stains_are_not() -> None:
         assert np.hypot(*(stained.xy[:, None] - np.array(GRID)[:, :2]).T).min(axis=0).max() < 0.1
 
 
-@pytest.mark.parametrize(("sigma", "duplicate"), [(0.01, False), (0.5, False), (0.95, True)])
-def test_a_hole_must_be_shown_to_be_concentric(sigma: float, duplicate: bool) -> None:
-    """Five of its sigmas are less than half its radius."""
-    radius, sigmas = np.array([14.0, 8.0, 14.0]), np.array([0.02, sigma, 0.02])
+def hole_in_a_dot(
+    radii: tuple[float, ...], off: tuple[float, float], sigma: float
+) -> tuple[BoolArray, FloatArray]:
+    """Return the judgement of a dot, a hole in it that is so far off, of this sigma, and another dot, px."""
+    radius, sigmas = np.array(radii), np.array([0.02, sigma, 0.02])
     fit = SimpleNamespace(
-        xy=np.array([(0.0, 0.0), (0.1, 0.1), (60.0, 0.0)]),
+        xy=np.array([(0.0, 0.0), off, (60.0, 0.0)]),
         shape=np.column_stack([1 / radius, 0 * radius, 1 / radius]),
         covariance=sigmas[:, None, None] ** 2 * np.eye(2),
     )
-    found, off_centre = find_duplicates(
-        cast(EllipseFit, fit), np.array([-1, 1, -1]), np.zeros(3, np.int64), np.zeros(3, bool)
-    )
+    polarity = np.array([-1, 1, -1])
+    return find_duplicates(cast(EllipseFit, fit), polarity, np.zeros(3, np.int64), np.zeros(3, bool))
+
+
+@pytest.mark.parametrize(("sigma", "duplicate"), [(0.01, False), (0.5, False), (0.95, True)])
+def test_a_hole_must_be_shown_to_be_concentric(sigma: float, duplicate: bool) -> None:
+    """Five of its sigmas are less than half its radius."""
+    found, off_centre = hole_in_a_dot((14.0, 8.0, 14.0), (0.1, 0.1), sigma)
     assert found.tolist() == [not duplicate, duplicate, False]
     beyond = 0.1 - 0.02 * 8 / math.sqrt(2)  # less than nothing: perspective alone may do it
     assert beyond < 0 and not off_centre.any()
@@ -313,15 +319,7 @@ def test_a_hole_must_be_shown_to_be_concentric(sigma: float, duplicate: bool) ->
 
 def test_a_hole_is_as_sure_as_it_is_concentric() -> None:
     """Stains that are not shown to be apart were measured to 0.014 px, 0.16 px off."""
-    radius = np.array([6.0, 2.0, 6.0])
-    fit = SimpleNamespace(
-        xy=np.array([(0.0, 0.0), (0.0, 0.14), (60.0, 0.0)]),
-        shape=np.column_stack([1 / radius, 0 * radius, 1 / radius]),
-        covariance=0.02**2 * np.tile(np.eye(2), (3, 1, 1)),
-    )
-    duplicate, off_centre = find_duplicates(
-        cast(EllipseFit, fit), np.array([-1, 1, -1]), np.zeros(3, np.int64), np.zeros(3, bool)
-    )
+    duplicate, off_centre = hole_in_a_dot((6.0, 2.0, 6.0), (0.0, 0.14), 0.02)
     assert duplicate.tolist() == [True, False, False]
     np.testing.assert_allclose(off_centre, [(0, 0), (0, 0.14 - 0.02 * 2.0), (0, 0)])
 

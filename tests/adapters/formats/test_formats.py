@@ -42,10 +42,8 @@ from sfm.comparison.undistortion import undistort
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.ply import write_ply
 from sfm.network import Estimate, Network, ObjectPoints
-from tests.places import ROOT, SHARED
+from tests.places import SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of
-
-FIGURES = ROOT / "datasets"
 
 
 def network_in(
