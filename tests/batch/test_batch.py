@@ -299,14 +299,17 @@ def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [("sigma0_px", float("nan")), ("verdict", "splendid"), ("points", "20"), ("survey", 3), ("seconds", "x")],
+    ("key", "value", "as_it_was"),
+    [
+        *(("sigma0_px", float("nan"), False), ("verdict", "splendid", False), ("points", "20", False)),
+        *(("survey", 3, False), ("seconds", "x", False), ("survey", "third", True)),
+    ],
 )
 def test_resume_runs_again_what_has_a_log_of_somebody_else(
-    surveys: tuple[Path, ...], tmp_path: Path, key: str, value: object
+    surveys: tuple[Path, ...], finished: Path, tmp_path: Path, key: str, value: object, as_it_was: bool
 ) -> None:
     out = tmp_path / "out"
-    run_batch([surveys[2]], out, HERE, ALONE, Notes())
+    shutil.copytree(finished / "third", out / "third")
     log = out / "third" / "log.jsonl"
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     lines[-1][key] = value
@@ -315,7 +318,7 @@ def test_resume_runs_again_what_has_a_log_of_somebody_else(
     note_finished(out / "third")
     again = Notes()
     run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
-    assert [(row.status, kept) for row, kept in again.finished_rows] == [("done", False)]
+    assert [(row.status, kept) for row, kept in again.finished_rows] == [("done", as_it_was)]
 
 
 def sign(folder: Path) -> None:
