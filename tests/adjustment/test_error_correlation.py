@@ -209,7 +209,7 @@ def test_surveys_of_texture_have_common_errors_in_their_covariance(scene: tuple[
     assert f"{significant(common)} px in common" in describe_neighbours(textured)
 
 
-@pytest.mark.parametrize("length_px", [150.0, 300.0])
+@pytest.mark.parametrize("length_px", [pytest.param(150.0, marks=pytest.mark.slow), 300.0])
 def test_common_errors_are_no_cause(scene: tuple[Network, Estimate], length_px: float) -> None:
     """Taken as independent, they look like a held parameter that is wrong, or like another camera."""
     network, truth = scene

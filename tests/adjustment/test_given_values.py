@@ -140,8 +140,7 @@ def pair_far_from_others(name: str) -> GivenPoints:
     return moved(figure(X, list(range(6)), name), 5, 9 * SIGMA * np.eye(3)[0])
 
 
-@pytest.mark.parametrize("factor", [0.99, 1.01, 1.5])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("factor", "axis"), [(0.99, 0), (1.01, 1), (1.5, 2), (0.99, 2)])
 def test_stretched_points_are_named(factor: float, axis: int) -> None:
     for n in (6, 12):
         one = points(n, f"stretched {n}")
@@ -199,7 +198,7 @@ def test_exchanged_names_are_identified() -> None:
 
 @pytest.mark.parametrize("count", [3, 8])
 def test_coordinates_of_the_next_row_are_reassigned(count: int) -> None:
-    for k in range(5):
+    for k in range(2):
         one = points(8, f"next rows {count} {k}")
         given = np.concatenate([np.roll(one.given[:count], 1, axis=0), one.given[count:]])
         found = judge_points(replace(one, given=given), LEVEL)
@@ -233,7 +232,7 @@ def figure(X: FloatArray, order: list[int], name: str) -> GivenPoints:
 
 def test_two_names_of_a_pyramid_may_be_exchanged_in_several_ways() -> None:
     """Three right names agree upon the base turned over; four orders place it as well."""
-    for k in range(8):
+    for k in range(3):
         found = judge_points(figure(PYRAMID, [1, 0, 2, 3, 4], f"pyramid {k}"), LEVEL)
         assert found is not None and not found.order and found.judgement.wrong == ()
         assert found.judgement.doubtful == found.exchangeable == (0, 1, 2, 3)
@@ -271,14 +270,14 @@ def test_points_most_of_which_are_wrong_diverge_to_no_infinite_scale() -> None:
 @pytest.mark.parametrize("n", [4, 5])
 def test_few_left_handed_points_are_mirrored(n: int) -> None:
     """Three that remain lie in a plane and fit either way."""
-    for k in range(20):
+    for k in range(5):
         one = points(n, f"left-handed {n} {k}")
         found = judge_points(replace(one, given=one.given[:, [1, 0, 2]]), LEVEL)
         assert found is not None and found.mirrored and found.judgement.fits
 
 
 def test_three_of_eight_points_are_identified() -> None:
-    for k in range(10):
+    for k in range(4):
         one = points(8, f"three of eight {k}")
         given = one.given.copy()
         given[[0, 3, 5]] += 0.3 * seed_of(f"three wrong {k}").standard_normal((3, 3))
@@ -334,7 +333,7 @@ def test_points_whose_similarity_does_not_converge_are_judged(monkeypatch: pytes
 
 
 def test_one_wrong_point_of_four_is_not_a_mirror() -> None:
-    for k in range(20):
+    for k in range(6):
         one = moved(points(4, f"four {k}"), 1, 50 * SIGMA * np.eye(3)[k % 3])
         found = judge_points(one, LEVEL)
         assert found is not None and not found.mirrored and not found.judgement.fits
