@@ -75,21 +75,48 @@ def test_lengths_are_those_at_the_temperature_of_the_survey(tmp_path: Path) -> N
     assert first.table.texts == (("cross",) * 3, ("3", "4", "5"))
     assert second.table.texts == (("cross 2",) * 3, ("11", "12", "13"))
     assert first.value[1] == pytest.approx([0.3 * 1.000115, 0, 0], abs=1e-12)
-    # 200 of 300 mm from the mean; six coordinates, four items
+    # 200 of 300 mm from the mean; six coordinates, four items; two places of one calibration
     common = 0.2 * 1.000115 * 11.5e-6 * 0.5 * 2 * np.sqrt(6)
-    assert first.sigma[1, 0] == pytest.approx(np.hypot(1e-5, common), rel=1e-6)
-    assert first.sigma[1, 2] == pytest.approx(1e-5)
+    assert first.sigma[1, 0] == pytest.approx(np.hypot(np.sqrt(2) * 1e-5, common), rel=1e-6)
+    assert first.sigma[1, 2] == pytest.approx(np.sqrt(2) * 1e-5)
 
 
-def test_common_error_of_temperature_is_that_of_the_scale_of_all_bars(tmp_path: Path) -> None:
-    """Ten placements of one bar know the scale no better than its temperature."""
-    rows = "".join(
-        f'[[equipment]]\nname = "steel"\npoints = ["{2 * k + 1}", "{2 * k + 2}"]\n' for k in range(10)
+def placements(name: str, points: range) -> str:
+    return "".join(
+        f'[[equipment]]\nname = "{name}"\npoints = ["{j}", "{j + 1}"]\n'
+        for j in range(points.start, points.stop, 2)
     )
-    equipment = EQUIPMENT.replace("sigma = 0.004", "sigma = 1e-6")
-    survey: Survey = read_survey(survey_of(tmp_path, used=rows, equipment=equipment))
-    of_mean = 1 / np.sqrt(sum(bar.sigma**-2 for bar in survey.scale_bars))
-    assert of_mean == pytest.approx(11.5e-6 * 0.5, rel=1e-3)
+
+
+def sigma_of_scale(survey: Survey) -> float:
+    """Relative, of all bars together."""
+    return float(1 / np.sqrt(sum((bar.length / bar.sigma) ** 2 for bar in survey.scale_bars)))
+
+
+@pytest.mark.parametrize(
+    ("sigma", "expansion_sigma", "temperature_sigma", "expected"),
+    [(0.05, 0.0, 1e-6, 5e-5), (1e-6, 4.0, 1e-6, 40e-6), (1e-6, 0.0, 0.5, 11.5e-6 * 0.5)],
+)
+def test_an_error_that_placements_have_in_common_is_that_of_their_scale(
+    sigma: float, expansion_sigma: float, temperature_sigma: float, expected: float, tmp_path: Path
+) -> None:
+    """Ten placements of one bar know the scale no better than its calibration, expansion or temperature."""
+    values = f"sigma = {sigma}\nexpansion = 11.5\nexpansion_sigma = {expansion_sigma}"
+    equipment = EQUIPMENT.replace("sigma = 0.004\nexpansion = 11.5", values)
+    head = HEAD.replace("sigma = 0.5", f"sigma = {temperature_sigma}")
+    rows = placements("steel", range(1, 21))
+    survey = read_survey(survey_of(tmp_path, used=rows, equipment=equipment, head=head))
+    assert sigma_of_scale(survey) == pytest.approx(expected, rel=1e-3)
+
+
+def test_errors_of_calibration_of_two_items_are_not_in_common(tmp_path: Path) -> None:
+    """Two bars with one error each, at five places each: the mean is better by sqrt(2)."""
+    equipment = EQUIPMENT.replace('name = "carbon"', 'name = "other"').replace("800.0", "1000.0")
+    equipment = equipment.replace("0.003", "0.004").replace("temperature = 22.0\n", "")
+    rows = placements("steel", range(1, 11)) + placements("other", range(11, 21))
+    head = HEAD.replace("30.0", "20.0").replace("sigma = 0.5", "sigma = 1e-6")
+    survey = read_survey(survey_of(tmp_path, used=rows, equipment=equipment, head=head))
+    assert sigma_of_scale(survey) == pytest.approx(4e-6 / np.sqrt(2), rel=1e-3)
 
 
 def test_a_survey_is_scaled_by_its_equipment(tmp_path: Path) -> None:
@@ -111,6 +138,14 @@ TOMORROW = date.today() + timedelta(days=1)
         ({"head": 'unit = "m"\n'}, "without survey.equipment"),
         ({"used": '[[equipment]]\nname = "carbon"\n'}, "'carbon': points = none, needed 2"),
         ({"used": '[[equipment]]\nname = "cross"\npoints = ["1", "2"]\n'}, "needed 3 different names"),
+        (
+            {"used": '[[equipment]]\nname = "steel"\n' + placements("steel", range(1, 3))},
+            "'steel' comes twice on the points 1, 2, needed",
+        ),
+        (
+            {"used": '[[equipment]]\nname = "cross"\n' * 2},
+            "'cross' comes twice on the points 3, 4, 5, needed",
+        ),
         ({"equipment": EQUIPMENT.replace("2025-03-01", str(TOMORROW), 1)}, f"calibrated = {TOMORROW}, which"),
         ({"equipment": EQUIPMENT.replace("11.5", "1.15e-5", 1)}, "needed in 1e-6 per K, such as 11.5"),
         ({"equipment": EQUIPMENT.replace('unit = "mm"', "")}, "equipment.toml: unit is missing"),

@@ -4,15 +4,17 @@ Lengths are corrected from the temperature of their calibration to that of the s
 
     l = l0 (1 + alpha (T - T0)),
 
-and what is not known of T and alpha is part of their standard deviations. An error of T is common to all
-lengths: it is taken with each of N of them as sqrt(N) times as large, so that it is what it is in the scale
-that they give together.
+and what is not known of T and alpha is part of their standard deviations. An error that N placements have in
+common is taken with each of them as sqrt(N) times as large, so that it is what it is in the scale that they
+give together. Placements of one item have the error of its calibration in common, those of items of one
+expansion (a material) the error of the coefficient, and all of them that of T.
 
 Source: ISO 1 (reference temperature of 20 deg C); JCGM 100 (GUM), sec. 5.1 and annex H.1 (end gauges).
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import date
@@ -67,10 +69,10 @@ class CalibratedEquipment(Section):
         """Return by what lengths are multiplied at a temperature, deg C."""
         return 1 + PPM * self.expansion * (temperature - self.temperature)
 
-    def relative_sigma(self, temperature: float, temperature_sigma: float) -> float:
-        """Return the standard deviation of the factor."""
-        away = temperature - self.temperature
-        return PPM * float(np.hypot(self.expansion * temperature_sigma, away * self.expansion_sigma))
+    @property
+    def material(self) -> tuple[float, float]:
+        """Expansion and its standard deviation, which items of one material have in common."""
+        return self.expansion, self.expansion_sigma
 
 
 class Bar(CalibratedEquipment):
@@ -154,7 +156,8 @@ def given_by(
         temperature_sigma: its standard deviation, K.
 
     Raises:
-        SurveyFileError: no temperature, an unknown name, or another number of points.
+        SurveyFileError: no temperature, an unknown name, another number of points, or an item that comes
+            twice on the same points.
     """
     used = tuple(used)
     if used and temperature is None:
@@ -163,27 +166,39 @@ def given_by(
         )
     known = {one.name: one for one in (*equipment.content.bars, *equipment.content.frames)}
     scale = METRES[equipment.content.unit] / METRES[unit]
-    spread = temperature_sigma * len(used) ** 0.5
-    bars, frames, placed = [], [], dict[str, int]()
     for one in used:
         if one.name not in known:
             some = listed(list(known)) or "none"
             raise SurveyFileError(
                 f"{where}: unknown equipment '{one.name}', {equipment.path.name} has {some}"
             )
-        item = known[one.name]
+    items = [known[one.name] for one in used]
+    of_item, of_material = Counter(one.name for one in items), Counter(one.material for one in items)
+    bars, frames, placed = [], [], dict[str, list[frozenset[str]]]()
+    for one, item in zip(used, items, strict=True):
         assert temperature is not None
-        factor, relative = scale * item.factor(temperature), item.relative_sigma(temperature, spread)
+        own = item.points if isinstance(item, Bar) else equipment.tables[one.name].texts[0]
+        points = _points(one, own, 2 if isinstance(item, Bar) else len(own), where)
+        places = placed.setdefault(one.name, [])
+        if frozenset(points) in places:
+            raise SurveyFileError(
+                f"{where}: equipment '{one.name}' comes twice on the points {listed(sorted(points))}, needed "
+                "once for each place, with other points"
+            )
+        places.append(frozenset(points))
+        factor, calibration = scale * item.factor(temperature), scale * of_item[one.name] ** 0.5
+        relative = PPM * float(
+            np.hypot(
+                item.expansion * temperature_sigma * len(used) ** 0.5,
+                (temperature - item.temperature) * item.expansion_sigma * of_material[item.material] ** 0.5,
+            )
+        )
         if isinstance(item, Bar):
-            start, end = _points(one, item.points, 2, where)
-            sigma = float(np.hypot(scale * item.sigma, factor * item.length * relative))
-            bars.append(ScaleBar(start, end, factor * item.length, sigma))
+            sigma = float(np.hypot(calibration * item.sigma, factor * item.length * relative))
+            bars.append(ScaleBar(points[0], points[1], factor * item.length, sigma))
             continue
-        table = equipment.tables[one.name]
-        points = _points(one, table.texts[0], len(table.texts[0]), where)
-        placed[one.name] = placed.get(one.name, 0) + 1
-        group = one.name if placed[one.name] == 1 else f"{one.name} {placed[one.name]}"
-        frames.append(_frame(group, points, table, scale, factor, relative))
+        group = one.name if len(places) == 1 else f"{one.name} {len(places)}"
+        frames.append(_frame(group, points, equipment.tables[one.name], factor, calibration, relative))
     return tuple(bars), tuple(frames)
 
 
@@ -199,13 +214,22 @@ def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Nam
 
 
 def _frame(
-    group: str, points: Names, table: CsvTable, scale: float, factor: float, relative: float
+    group: str, points: Names, table: CsvTable, factor: float, calibration: float, relative: float
 ) -> ObservationTable:
-    """Return a frame at its place, coordinates at the temperature of the survey."""
+    """Return a frame at its place, coordinates at the temperature of the survey.
+
+    Args:
+        group: name of the frame at this place.
+        points: what the survey calls its points, (n,).
+        table: of the frame.
+        factor: by which coordinates are multiplied.
+        calibration: by which their standard deviations are.
+        relative: standard deviation of the factor over it.
+    """
     xyz, sigma = np.split(table.values, [3], axis=1)
     away: FloatArray = factor * np.abs(xyz - xyz.mean(axis=0))
     common = relative * np.sqrt((away > 0).sum()) * away  # of one scale, as in the source of this module
-    values = np.hstack([factor * xyz, np.hypot(scale * sigma, common)])
+    values = np.hstack([factor * xyz, np.hypot(calibration * sigma, common)])
     columns = dict(zip(COORDINATES, values.T, strict=True))
     return observation_table(
         FRAME, array_table(str(table.path), {"group": [group] * len(points), "point": points}, columns)
