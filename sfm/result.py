@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from datetime import date
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -118,6 +119,21 @@ class SeenPlate:
     sigma: float  # standard deviation of its coordinates, object unit
 
 
+@dataclass(frozen=True)
+class PlacedEquipment:
+    """A bar or frame of the equipment file at a place where it was photographed."""
+
+    name: str  # in the equipment file
+    given_as: str  # scale bar | rigid frame, with its name among the given values
+    calibrated: date
+    calibration_temperature: float  # deg C
+    expansion: float  # coefficient, 1e-6 per K
+    expansion_sigma: float  # standard deviation of it, 1e-6 per K
+    temperature: float  # in the survey, deg C
+    temperature_sigma: float  # standard deviation of it, K
+    correction: float  # of its lengths from calibration to survey, 1e-6
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class SurveyResult:
     """Result of a survey: the adjustment and what a person must know to judge it.
@@ -148,6 +164,7 @@ class SurveyResult:
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     plates: tuple[SeenPlate, ...] = ()  # whose points are known to one another
     check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
+    equipment: tuple[PlacedEquipment, ...] = ()  # calibrated, each as often as it was placed
     balance_radius_mm: tuple[tuple[str, float], ...] = ()  # R0 of the cameras given in AICON's form
     exterior_correlations: ExteriorCorrelations | None = None  # of camera parameters, all of them
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from sfm.report.page import (
     columns_of,
 )
 from sfm.report.phrases import describe_check
-from sfm.result import ControlCheck
+from sfm.result import ControlCheck, PlacedEquipment
 
 HEADINGS = {
     "control point": "Control",
@@ -42,7 +42,11 @@ MAX_OPEN = 90  # values that are shown without a click
 
 
 def given_parts(
-    given: Given, adjustment: Adjustment, unit: str, check: ControlCheck | None = None
+    given: Given,
+    adjustment: Adjustment,
+    unit: str,
+    check: ControlCheck | None = None,
+    equipment: Sequence[PlacedEquipment] = (),
 ) -> tuple[Part, ...]:
     """Return how the given values fit.
 
@@ -51,6 +55,7 @@ def given_parts(
         adjustment: in which they took part.
         unit: object unit.
         check: control that took no part, if there is any.
+        equipment: that scale bars and frames are of.
     """
     parts = list(_check(check, adjustment, unit)) if check is not None else []
     for kind in given.kinds:
@@ -65,7 +70,35 @@ def given_parts(
         ]
         heads = columns("of", "parameter", ">value", ">sigma", "unit")
         parts += [Heading("Parameters of survey observations"), Table(heads, rows, all_in="summary.json")]
-    return tuple(parts)
+    return *parts, *_equipment(equipment)
+
+
+def _equipment(placed: Sequence[PlacedEquipment]) -> tuple[Part, ...]:
+    """Return which calibrated bars and frames were used, and at what temperature."""
+    if not placed:
+        return ()
+    heads = (
+        *columns("equipment", "given as", "calibrated"),
+        Column("calibrated at", unit="deg C", format=".4g"),
+        Column("expansion", unit="1e-6 per K", format=".4g"),
+        Column("sigma", unit="1e-6 per K", format=".3g"),
+        Column("surveyed at", unit="deg C", format=".4g"),
+        Column("sigma", unit="K", format=".3g"),
+        Column("correction", unit="1e-6", format="+.1f"),
+    )
+    rows = [
+        (
+            *(one.name, one.given_as, one.calibrated.isoformat(), one.calibration_temperature),
+            *(one.expansion, one.expansion_sigma, one.temperature, one.temperature_sigma, one.correction),
+        )
+        for one in placed
+    ]
+    note = Note(
+        "Lengths are corrected to the temperature of the survey. Their standard deviations contain "
+        "calibration, expansion and temperature; an error that N placements have in common is taken as "
+        "sqrt(N) times as large with each."
+    )
+    return Heading("Equipment"), note, Table(heads, rows, all_in="summary.json")
 
 
 def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part, ...]:

@@ -178,7 +178,8 @@ def _covered(one: Coverage) -> str:
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:
     """Return how the given values fit."""
-    return given_parts(f.given, f.result.adjustment, f.result.length_unit, f.result.control_check)
+    r = f.result
+    return given_parts(f.given, r.adjustment, r.length_unit, r.control_check, r.equipment)
 
 
 def image_point_parts(f: Findings) -> Iterator[Part]:

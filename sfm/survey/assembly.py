@@ -74,6 +74,7 @@ def assemble_result(
         weights=survey.adjust.weights,
         plates=_plates(survey, code),
         check_points=_check_points(survey),
+        equipment=survey.equipment,
         balance_radius_mm=tuple(
             (one.name, dict(one.balanced)["R0"]) for one in survey.cameras if one.balanced
         ),

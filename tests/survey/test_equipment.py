@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sfm
 from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.survey import Survey, read_survey
@@ -125,6 +127,26 @@ def test_a_survey_is_scaled_by_its_equipment(tmp_path: Path) -> None:
     i, j = (a.network.point_index(name) for name in ("1", "2"))
     assert a.expected_defect == 6
     assert np.linalg.norm(a.estimate.points[j] - a.estimate.points[i]) == pytest.approx(1.000115, abs=1e-9)
+
+
+def test_report_and_summary_trace_the_scale_to_its_equipment(tmp_path: Path) -> None:
+    result = sfm.run_survey(survey_of(tmp_path), compare_with="none")
+    result.write(tmp_path / "out")
+    steel, carbon, cross, again = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))[
+        "equipment"
+    ]
+    assert (steel["name"], steel["given_as"], steel["calibrated"]) == (
+        "steel",
+        "scale bar 1 - 2",
+        "2025-03-01",
+    )
+    assert (carbon["calibration_temperature"], carbon["expansion"]) == (22.0, -0.5)
+    assert (carbon["expansion_sigma"], carbon["temperature"], carbon["temperature_sigma"]) == (0.2, 30.0, 0.5)
+    assert carbon["correction"] == pytest.approx(-4.0) and steel["correction"] == pytest.approx(115.0)
+    assert (cross["given_as"], again["given_as"]) == ("rigid frame cross", "rigid frame cross 2")
+    for page in ("report.txt", "report.html"):
+        text = (tmp_path / "out" / page).read_text("utf-8")
+        assert "surveyed at" in text and "rigid frame cross 2" in text and "2024-11-30" in text
 
 
 TOMORROW = date.today() + timedelta(days=1)

@@ -114,6 +114,15 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "geometry": _geometry(findings),
         "control": _control(findings),
         "scale_bars": _scale_bars(findings),
+        "equipment": [
+            values_of(one, "name given_as")
+            | {"calibrated": one.calibrated.isoformat()}
+            | values_of(
+                one,
+                "calibration_temperature expansion expansion_sigma temperature temperature_sigma correction",
+            )
+            for one in result.equipment
+        ],
         "weighted_interior": _given_values(given.interior, "parameter"),
         "observed_exterior": [
             one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")

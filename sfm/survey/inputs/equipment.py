@@ -29,6 +29,7 @@ from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
 from sfm.files.toml_files import read_toml
+from sfm.result import PlacedEquipment
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
@@ -106,6 +107,15 @@ class Equipment:
     tables: dict[str, CsvTable]  # of frames, by their names
 
 
+@dataclass(frozen=True)
+class GivenEquipment:
+    """Observations of a survey by its equipment."""
+
+    bars: tuple[ScaleBar, ...] = ()
+    frames: tuple[ObservationTable, ...] = ()
+    placed: tuple[PlacedEquipment, ...] = ()  # what they are of
+
+
 def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
     """Read an equipment file and the tables that it names.
 
@@ -144,7 +154,7 @@ def given_by(
     unit: str,
     temperature: float | None,
     temperature_sigma: float,
-) -> tuple[tuple[ScaleBar, ...], tuple[ObservationTable, ...]]:
+) -> GivenEquipment:
     """Return the scale bars and rigid frames of a survey by what equipment was photographed.
 
     Args:
@@ -174,12 +184,12 @@ def given_by(
             )
     items = [known[one.name] for one in used]
     of_item, of_material = Counter(one.name for one in items), Counter(one.material for one in items)
-    bars, frames, placed = [], [], dict[str, list[frozenset[str]]]()
+    bars, frames, placed, places_of = [], [], [], dict[str, list[frozenset[str]]]()
     for one, item in zip(used, items, strict=True):
         assert temperature is not None
         own = item.points if isinstance(item, Bar) else equipment.tables[one.name].texts[0]
         points = _points(one, own, 2 if isinstance(item, Bar) else len(own), where)
-        places = placed.setdefault(one.name, [])
+        places = places_of.setdefault(one.name, [])
         if frozenset(points) in places:
             raise SurveyFileError(
                 f"{where}: equipment '{one.name}' comes twice on the points {listed(sorted(points))}, needed "
@@ -196,10 +206,18 @@ def given_by(
         if isinstance(item, Bar):
             sigma = float(np.hypot(calibration * item.sigma, factor * item.length * relative))
             bars.append(ScaleBar(points[0], points[1], factor * item.length, sigma))
-            continue
-        group = one.name if len(places) == 1 else f"{one.name} {len(places)}"
-        frames.append(_frame(group, points, equipment.tables[one.name], factor, calibration, relative))
-    return tuple(bars), tuple(frames)
+            given_as = f"scale bar {points[0]} - {points[1]}"
+        else:
+            group = one.name if len(places) == 1 else f"{one.name} {len(places)}"
+            frames.append(_frame(group, points, equipment.tables[one.name], factor, calibration, relative))
+            given_as = f"{FRAME} {group}"
+        placed.append(
+            PlacedEquipment(
+                *(one.name, given_as, item.calibrated, item.temperature, *item.material),
+                *(temperature, temperature_sigma, (item.factor(temperature) - 1) / PPM),
+            )
+        )
+    return GivenEquipment(tuple(bars), tuple(frames), tuple(placed))
 
 
 def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Names:

@@ -17,10 +17,11 @@ from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 from sfm.files.rig_tables import read_moments
 from sfm.observations.mounts import MountObservations
+from sfm.result import PlacedEquipment
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
-from sfm.survey.inputs.equipment import given_by, read_equipment
+from sfm.survey.inputs.equipment import GivenEquipment, given_by, read_equipment
 from sfm.survey.inputs.exterior_table import ObservedExterior, mount_observations, read_observed_exterior
 from sfm.survey.inputs.given import (
     Diameters,
@@ -115,6 +116,7 @@ class Survey:
     moments: Mapping[str, str] = field(default_factory=dict)  # of photographs, where tables name them
     scale_bars: tuple[ScaleBar, ...] = ()
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
+    equipment: tuple[PlacedEquipment, ...] = ()  # that scale bars and tables are of, for the report
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
@@ -257,7 +259,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     def read(reader: Callable[[Path], T], name: str | None) -> T | None:
         return None if name is None else reader(file.beside(name))
 
-    bars, frames = _given_by_equipment(file)
+    equipment = _given_by_equipment(file)
     return Survey(
         name=file.name,
         unit=file.unit,
@@ -287,11 +289,12 @@ def survey_of_file(file: SurveyFile) -> Survey:
                 read_observation_table(one.kind, file.beside(one.file), file.source)
                 for one in file.observation_tables
             ),
-            *frames,
+            *equipment.frames,
         ),
+        equipment=equipment.placed,
         scale_bars=(
             *(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
-            *bars,
+            *equipment.bars,
         ),
         observations=read(read_image_points, file.observations.file if file.observations else None),
         diameters=read(read_diameters, file.targets.diameters),
@@ -304,7 +307,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     )
 
 
-def _given_by_equipment(file: SurveyFile) -> tuple[tuple[ScaleBar, ...], tuple[ObservationTable, ...]]:
+def _given_by_equipment(file: SurveyFile) -> GivenEquipment:
     """Return the scale bars and frames of the equipment that a survey file names.
 
     Raises:
@@ -315,7 +318,7 @@ def _given_by_equipment(file: SurveyFile) -> tuple[tuple[ScaleBar, ...], tuple[O
             raise SurveyFileError(
                 f"{file.source}: [[equipment]] without survey.equipment; needed the file that describes it"
             )
-        return (), ()
+        return GivenEquipment()
     path = file.beside(file.head.equipment)
     return given_by(
         *(read_equipment(path, allow_outside=file.allow_outside), file.equipment, file.source, file.unit),
