@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
@@ -16,6 +18,8 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate
 
 MIN_DEPTH_RATIO = 0.05  # extent over the longest one below which points have no depth
+OPEN = 1e-6  # share of a rotation or scale in motions that are open; it is of their order or rounding
+MAX_STEPS = 50  # of a fit of some motions, which ends after about 5
 MAX_COLLINEAR_RATIO = 1e-9  # second singular value over the first below which points lie on a line
 
 
@@ -140,6 +144,58 @@ def _fitted(
     return found
 
 
+def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> Similarity:
+    """Return the similarity of some motions alone that brings source points onto target points.
+
+    With least squares; of a levelled network it is composed of shifts and a rotation about the vertical.
+
+    Args:
+        source: points in the source frame, (n, 3).
+        target: the same points in the target frame, (n, 3).
+        motions: how the source points move with each motion that is open, (n, 3, d).
+
+    Raises:
+        GeometryError: as `fit_similarity`.
+    """
+    if not motions.shape[2]:
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    centre, size = source.mean(axis=0), float(np.ptp(source, axis=0).max())
+    along = motions_along(source, motions, centre=centre, size=size)
+    whole = fit_similarity(source, target)
+    axes = _space(along[3:6])
+    turn = Rotation.from_matrix(whole.rotation)
+    if axes.shape[1] == 1:
+        *v, q = turn.as_quat()
+        w = 2 * np.arctan2(v @ axes[:, 0], q) * axes[:, 0]
+    else:
+        w = axes @ axes.T @ turn.as_rotvec()
+    towards = size * np.append(w, np.log(whole.scale))
+    step, A = np.linalg.lstsq(along[3:], towards, rcond=OPEN)[0], np.eye(4)
+    for _ in range(MAX_STEPS):
+        A = _finite_motion(along @ step, centre, size) @ A
+        x = source @ A[:3, :3].T + A[:3, 3]
+        J = similarity_motions(x, centre=centre, size=size).reshape(-1, 7) @ along
+        step = np.linalg.lstsq(J, (target - x).ravel(), rcond=None)[0]
+        if np.linalg.norm(step) < 1e-12 * size:
+            break
+    scale = float(np.cbrt(np.linalg.det(A[:3, :3])))
+    return Similarity(scale, A[:3, :3] / scale, A[:3, 3])
+
+
+def _finite_motion(motion: FloatArray, centre: FloatArray, size: float) -> FloatArray:
+    """Return a motion of `similarity_motions` that is not small, homogeneous, (4, 4)."""
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = (skew(motion[3:6]) + motion[6] * np.eye(3)) / size
+    generator[:3, 3] = motion[:3] - generator[:3, :3] @ centre
+    return np.asarray(expm(generator))
+
+
+def _space(directions: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the space of some directions, (k, rank)."""
+    U, d, _ = np.linalg.svd(directions)
+    return U[:, : int((d > OPEN).sum())]
+
+
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
     """Return the rotation R with the largest trace of R' M, (3, 3): of M = sum b a', the best for b = R a.
 
@@ -162,6 +218,19 @@ def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0
     x = xyz - centre
     shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
     return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)
+
+
+def motions_along(xyz: FloatArray, motions: FloatArray, *, centre: FloatArray, size: float) -> FloatArray:
+    """Return motions of points as combinations of those of `similarity_motions`, orthonormal, (7, d).
+
+    Args:
+        xyz: points, (n, 3).
+        motions: how they move, (n, 3, d).
+        centre: as of `similarity_motions`.
+        size: as of `similarity_motions`.
+    """
+    G = similarity_motions(xyz, centre=centre, size=size).reshape(-1, 7)
+    return np.linalg.qr(np.linalg.lstsq(G, motions.reshape(len(G), -1), rcond=None)[0])[0]
 
 
 def without_motions(xyz: FloatArray, away: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, fit_similarities, fit_similarity
+from sfm.similarity import Similarity, fit_motions, fit_similarities, fit_similarity, similarity_motions
 from tests.synthetic import make_network, seed_of
 
 TRUE = Similarity(2.5, rotation_from_angles(0.3, -1.1, 2.9), np.array([10.0, -4.0, 7.0]))
@@ -81,3 +81,31 @@ def test_many_sets_of_points_have_the_similarities_of_each() -> None:
         one, alone = found[k], fit_similarity(source[k], target[k])
         assert one is not None
         np.testing.assert_allclose(one.apply(source[k]), alone.apply(source[k]), atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [0.1, 100.0, 179.0])
+def test_only_motions_that_are_open_are_fitted(degrees: float) -> None:
+    """Of a levelled network with a scale: shifts and the turn about the vertical; other errors remain."""
+    rng = seed_of("levelled")
+    target = rng.normal(size=(20, 3))
+    G = similarity_motions(target, centre=target.mean(axis=0)).reshape(-1, 7)
+    small = 1e-6 * rng.normal(size=7) + 1e-3 * np.eye(7)[6] + 1e-3 * np.eye(7)[3]  # scale, and a tilt
+    error = (G @ small).reshape(-1, 3)
+    moved = Similarity(1.0, rotation_from_angles(0, 0, np.radians(degrees)), np.array([5.0, -3.0, 2.0]))
+    source = moved.apply(target + error)
+    open_ = similarity_motions(source, centre=np.zeros(3))[:, :, [0, 1, 2, 5]]
+    found = fit_motions(source, target, open_)
+    H = np.linalg.qr(G[:, [0, 1, 2, 5]])[0]
+    left = error.ravel() - H @ (H.T @ error.ravel())
+    np.testing.assert_allclose((found.apply(source) - target).ravel(), left, atol=1e-5)
+    assert found.scale == pytest.approx(1.0, abs=1e-12) and np.abs(left).max() > 5e-4
+
+
+def test_all_seven_motions_are_the_similarity_and_none_is_none() -> None:
+    rng = seed_of("all or none")
+    source = rng.normal(size=(12, 3))
+    target = TRUE.apply(source) + rng.normal(0, 0.05, (12, 3))
+    motions = similarity_motions(source, centre=np.zeros(3))
+    found, whole = fit_motions(source, target, motions), fit_similarity(source, target)
+    np.testing.assert_allclose(found.apply(source), whole.apply(source), atol=1e-9)
+    np.testing.assert_array_equal(fit_motions(source, target, motions[:, :, :0]).apply(source), source)

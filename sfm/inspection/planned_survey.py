@@ -24,10 +24,12 @@ from sfm.files.rig_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
 from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
 from sfm.observations import TABLES
 from sfm.observations.mounts import MountObservations
+from sfm.planning.contributions import open_motions
 from sfm.planning.stations import Stations
 from sfm.rendering.planned_targets import INK, PAPER, write_planned_photographs
 from sfm.rendering.scene import UNCODED, Optics
-from sfm.similarity import fit_similarity
+from sfm.result import SurveyResult
+from sfm.similarity import fit_motions, fit_similarity
 from sfm.simulated_network import simulate_network
 from sfm.solution import Solution
 from sfm.survey.observation_tables import ObservationTable, observation_table, with_tables
@@ -126,7 +128,7 @@ class AchievedPrecision:
     points: int  # planned points that were measured
     planned: int
     ratio: float  # median of a posteriori over predicted sigmas of points
-    error: float  # RMS error against the truth over the predicted RMS sigma, after a similarity
+    error: float  # RMS error against the truth over the predicted RMS sigma, in the datum of the prediction
     sigma_px: float  # a posteriori, of an image coordinate
     predicted_px: float
     mounts: float | None = None  # RMS true error of mounts over their a posteriori sigmas; None without any
@@ -427,15 +429,17 @@ def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
 
 
 def achieved(
-    plan: PlannedSurvey, codes: str | None, result: Solution, sigma_px: float, *, seed: int = 0
+    plan: PlannedSurvey, codes: str | None, result: SurveyResult, *, seed: int = 0
 ) -> AchievedPrecision:
     """Return what a simulated survey achieved against its plan.
+
+    True errors are those of the datum of the prediction: the result is moved onto the truth by the motions
+    that no observation gives. An error of a scale that a bar gives is one of the points.
 
     Args:
         plan: the plan.
         codes: as of `write_simulation`.
         result: of the survey.
-        sigma_px: of an image coordinate, a posteriori, px.
         seed: as of `write_simulation`.
 
     Raises:
@@ -458,20 +462,21 @@ def achieved(
         plan.sigma[:, 0]
     )
     j, k = nearest[found], np.flatnonzero(found)
-    motion = fit_similarity(xyz[j], true[k])
+    a, Q = result.adjustment, result.solution.point_covariance
+    motion = fit_motions(xyz[j], true[k], open_motions(a, j))
     error = motion.apply(xyz[j]) - true[k]
     predicted = np.sqrt((plan.sigma[k] ** 2).mean(axis=1))
-    if result.point_covariance is None:
+    if Q is None:
         raise SurveyFileError("simulation: the result has no standard deviations")
-    sigma = motion.scale * np.sqrt(np.trace(result.point_covariance[j], axis1=1, axis2=2) / 3)
+    sigma = motion.scale * np.sqrt(np.trace(Q[j], axis1=1, axis2=2) / 3)
     return AchievedPrecision(
         int(found.sum()),
         len(plan.points),
         float(np.median(sigma / predicted)),
         float(np.sqrt((error**2).mean() / (predicted**2).mean())),
-        sigma_px,
+        a.sigma0_px,
         plan.sigma_px,
-        _mount_error(plan, result, motion.scale),
+        _mount_error(plan, result.solution, motion.scale),
     )
 
 

@@ -16,17 +16,16 @@ import numpy as np
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
-from sfm.conventions import BoolArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
 from sfm.observations.mounts import MountObservations
 from sfm.planning.prediction import Prediction, spread_evenly, usable
 from sfm.reduced_network import reduce_network
-from sfm.similarity import similarity_motions
+from sfm.similarity import OPEN, motions_along, similarity_motions
 
 RIG = "rig"
 MIN_SHAPE = 3  # points that have one
-MIN_OPEN_SHARE = 1e-6  # share of a rotation or scale in open motions; it is of their order or rounding
 
 
 @dataclass(frozen=True)
@@ -129,10 +128,16 @@ def shape(adjustment: Adjustment, points: IntArray) -> tuple[float, IntArray]:
     m = marginal_of(adjustment)
     X = adjustment.estimate.points[points]
     Q = m.joint(np.zeros(0, dtype=np.int64), points)
-    motions = similarity_motions(X, centre=X.mean(axis=0), size=float(np.ptp(X, axis=0).max()))
+    centre, size = X.mean(axis=0), float(np.ptp(X, axis=0).max())
+    motions = similarity_motions(X, centre=centre, size=size)
     H = np.linalg.qr(motions.reshape(-1, 7))[0]
     sigma = float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))
-    free = m.optimum.motions.points[points].reshape(len(Q), -1)[:, : adjustment.expected_defect]
-    along = np.linalg.lstsq(motions.reshape(-1, 7), free, rcond=None)[0]  # of the seven, (7, d)
-    turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=MIN_OPEN_SHARE)) for k in (3, 6))
+    along = motions_along(X, open_motions(adjustment, points), centre=centre, size=size)
+    turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=OPEN)) for k in (3, 6))
     return sigma, np.array([adjustment.expected_defect - turned, turned - scaled, scaled])
+
+
+def open_motions(adjustment: Adjustment, points: IntArray) -> FloatArray:
+    """Return how points move with each motion of the network that is open, (n, 3, d)."""
+    motions = marginal_of(adjustment).optimum.motions.points[points]
+    return motions.reshape(len(points), 3, -1)[:, :, : adjustment.expected_defect]

@@ -13,6 +13,7 @@ import sfm
 from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation
+from sfm.distributions import chi2_ppf
 from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
@@ -225,6 +226,24 @@ def test_image_points_of_a_planned_rig_give_its_mounts_within_their_standard_dev
     assert result["rigs"][0]["moments"] == 8
 
 
+def test_true_errors_are_those_predicted_in_the_mean(tmp_path: Path) -> None:
+    """A bar that is known badly: most of the error of points is that of the scale, which is no datum."""
+    camera = camera_from_values("small", "brown", (900, 700), (0.005, 0.005), c_mm=6.0, free=())
+    plate = shape_object("plate", (500.0, 380.0), 12)
+    stations = arrangement("ring:4", plate, camera)
+    bar = ScaleBarPlan(plate.names[0], plate.names[11], 1.0)
+    found = plan_of("plate", "mm", plate, camera, stations, Seeing(sigma_px=0.1), wanted=Wanted(), bars=[bar])
+    write_page(found, tmp_path / "plan")
+    read, squares = read_plan(tmp_path / "plan"), []
+    for seed in range(10):
+        (tmp_path / str(seed)).mkdir()
+        survey = write_simulation(read, tmp_path / str(seed), codes=None, seed=seed)
+        result = sfm.run_survey(survey, compare_with="none")
+        squares.append(achieved(read, None, result, seed=seed).error ** 2)
+    low, high = chi2_ppf(0.001, 10) / 10, chi2_ppf(0.999, 10) / 10  # of the bar alone
+    assert low < np.mean(squares) < high
+
+
 def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) -> None:
     """Mounts to be found, a scale bar: codes name its ends, and the mounts are found within their sigmas."""
     _, truth = make_rig(seed_of("rendered"))
@@ -242,7 +261,7 @@ def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) 
     assert read.coded[[3, 16]].all()
     result = sfm.run_survey(write_simulation(read, tmp_path), compare_with="none")
     assert result.adjustment.expected_defect == 6 and len(result.adjustment.network.images) == 10
-    reached = achieved(read, "ring14", result.solution, result.adjustment.sigma0_px)
+    reached = achieved(read, "ring14", result)
     assert reached.points == reached.planned == 20
     assert reached.mounts is not None and reached.mounts < 2.0
     assert reached.ratio == pytest.approx(1.0, abs=0.25)

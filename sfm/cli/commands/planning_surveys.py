@@ -47,7 +47,7 @@ def simulate_command(
                 result = run_survey(survey, compare_with="none", progress=True)
                 result.write(part / "result")
                 (part / ".result.lock").unlink(missing_ok=True)
-                found = achieved(planned, family, result.solution, result.adjustment.sigma0_px, seed=seed)
+                found = achieved(planned, family, result, seed=seed)
                 text = json.dumps(asdict(found), indent=2, allow_nan=False)
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
     print(f"{found.points} of {found.planned} planned points measured")
