@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.observations.groups import Fit, Group
+from sfm.observations.kind import Values
 
 if TYPE_CHECKING:
     from sfm.network import Network
@@ -42,6 +43,17 @@ class OffsetDistances(Group):
         Jx[row, 0, self.ends[:, 0]] = -d / length[:, None]
         constant = -(w * away).sum() / w.sum()
         return Fit((away + constant)[:, None], Jx, np.ones((len(d), 1, 1)), np.array([constant]))
+
+    def simulated(self, values: Values, rng: np.random.Generator | None = None) -> Self:
+        """Return the distances of an instrument with the constant that these have; 0 where they are all 0.
+
+        Distances of a plan are not measured yet: zeros do not state that the constant takes off the lengths.
+        """
+        one = self
+        if not self.value.any():
+            start, end = values.points[self.point[self.ends]].swapaxes(0, 1)
+            one = replace(self, value=np.linalg.norm(end - start, axis=1)[:, None])
+        return super(OffsetDistances, one).simulated(values, rng)
 
     def row_points(self, network: Network) -> list[tuple[str, ...]]:
         """Return the names of both points of each distance, (r,)."""

@@ -421,6 +421,19 @@ def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
     assert sets[1].group == f"{sets[0].group} (2)"
 
 
+@pytest.mark.parametrize(("stated", "constant"), [(0.1, 0.1), (None, 0.0)])
+def test_the_constant_of_simulated_distances_is_that_of_the_table(
+    stated: float | None, constant: float
+) -> None:
+    """Zeros, of a plan, state none."""
+    _, truth = network_of("planned constant", ())
+    ends, X = np.array([[0, 1], [1, 2], [2, 3]]), truth.points
+    length = np.linalg.norm(X[ends[:, 1]] - X[ends[:, 0]], axis=1)[:, None]
+    value = np.zeros((3, 1)) if stated is None else length + stated
+    one = OffsetDistances("tape", np.arange(4), value, np.full((3, 1), 1e-3), ends)
+    np.testing.assert_allclose(one.simulated(values_of(truth)).value, length + constant, atol=1e-12)
+
+
 def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path) -> None:
     """A constant of 0.1 m; one distance that is misread leaves."""
     network, truth = network_of("constant", ("distance with additive constant",))
