@@ -1,7 +1,8 @@
 """Contributions of the rig and of each kind of observation beside image points to a planned network.
 
-Precision is that of the shape of the object: its standard deviations with inner constraints for position,
-attitude and scale, in which networks with different datum can be compared.
+Precision without and with a kind is compared in the datum of the network without it: with inner constraints
+for the motions that it leaves open. It is the datum of the plan unless the kind alone gives a motion, as the
+only scale bars do.
 
 Source: Baarda (1973), S-transformations and criterion matrices.
 """
@@ -22,7 +23,7 @@ from sfm.network import Estimate, Network, ScaleBars
 from sfm.observations.mounts import MountObservations
 from sfm.planning.prediction import Prediction, spread_evenly, usable
 from sfm.reduced_network import reduce_network
-from sfm.similarity import OPEN, motions_along, similarity_motions
+from sfm.similarity import OPEN, motions_along
 
 RIG = "rig"
 MIN_SHAPE = 3  # points that have one
@@ -38,8 +39,8 @@ class Contribution:
     rotations: int  # likewise
     scale: bool  # whether nothing else gives it
     points: int  # that nothing else determines
-    sigma_without: float  # of the shape of the other points, RMS of a coordinate, object unit; infinite where
-    # nothing is determined without it
+    sigma_without: float  # of the other points, RMS of a coordinate, object unit; infinite where nothing is
+    # determined without it
     sigma_with: float
 
     @property
@@ -73,11 +74,13 @@ def _contribution(a: Adjustment, name: str, count: int, network: Network, estima
     place = {point: j for j, point in enumerate(names) if left[j]}
     both = [(j, place[point]) for j, point in enumerate(a.network.points) if known[j] and point in place]
     if less is None or len(both) < MIN_SHAPE:
-        sigma, _ = shape(a, spread_evenly(np.flatnonzero(known)))
+        every = spread_evenly(np.flatnonzero(known))
+        sigma = sigma_beside(a, every, open_motions(a, every))
         return Contribution(name, count, 0, 0, False, int(known.sum()), np.inf, sigma)
     whole, part = spread_evenly(np.array(both, dtype=np.int64)).T
-    (before, open_before), (after, open_after) = shape(less, part), shape(a, whole)
-    shifts, rotations, scale = open_before - open_after
+    motions = open_motions(less, part)
+    before, after = sigma_beside(less, part, motions), sigma_beside(a, whole, motions)
+    shifts, rotations, scale = open_counts(less, part) - open_counts(a, whole)
     points = int(known.sum()) - len(both)
     return Contribution(name, count, int(shifts), int(rotations), bool(scale), points, before, after)
 
@@ -114,27 +117,34 @@ def _determined(a: Adjustment) -> BoolArray:
     return np.asarray(np.isfinite(trace) & (trace > 0))
 
 
-def shape(adjustment: Adjustment, points: IntArray) -> tuple[float, IntArray]:
-    """Return the standard deviation of the shape of points, and the motions of the network that are open.
+def open_counts(adjustment: Adjustment, points: IntArray) -> IntArray:
+    """Return how many shifts, rotations and scales of the network are open, (3,).
 
     Args:
         adjustment: of the network.
-        points: index of each, MIN_SHAPE or more, (n,).
-
-    Returns:
-        RMS of a coordinate with inner constraints on the points, object unit; how many shifts, rotations and
-        scales are open, (3,).
+        points: index of those by which it is seen, MIN_SHAPE or more, (n,).
     """
-    m = marginal_of(adjustment)
     X = adjustment.estimate.points[points]
-    Q = m.joint(np.zeros(0, dtype=np.int64), points)
     centre, size = X.mean(axis=0), float(np.ptp(X, axis=0).max())
-    motions = similarity_motions(X, centre=centre, size=size)
-    H = np.linalg.qr(motions.reshape(-1, 7))[0]
-    sigma = float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / Q.shape[0]))
     along = motions_along(X, open_motions(adjustment, points), centre=centre, size=size)
     turned, scaled = (int(np.linalg.matrix_rank(along[k:], tol=OPEN)) for k in (3, 6))
-    return sigma, np.array([adjustment.expected_defect - turned, turned - scaled, scaled])
+    return np.array([adjustment.expected_defect - turned, turned - scaled, scaled])
+
+
+def sigma_beside(adjustment: Adjustment, points: IntArray, motions: FloatArray) -> float:
+    """Return the standard deviation of points with inner constraints for some motions.
+
+    Args:
+        adjustment: of the network.
+        points: index of each, (n,).
+        motions: how they move, those that are open among them, (n, 3, d).
+
+    Returns:
+        RMS of a coordinate, object unit.
+    """
+    Q = marginal_of(adjustment).joint(np.zeros(0, dtype=np.int64), points)
+    H = np.linalg.qr(motions.reshape(len(Q), -1))[0]
+    return float(np.sqrt((np.trace(Q) - np.trace(H.T @ Q @ H)) / len(Q)))
 
 
 def open_motions(adjustment: Adjustment, points: IntArray) -> FloatArray:

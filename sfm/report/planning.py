@@ -252,9 +252,10 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
         for o in plan.contributions
     ]
     note = Note(
-        "Gain: standard deviation of points without it over that with it, RMS of a coordinate, with inner "
-        "constraints for position, attitude and scale in both. Gives: shifts, rotations and scale of the "
-        "network, and points, that nothing else gives."
+        "Gain: standard deviation of points without it over that with it, RMS of a coordinate, all else "
+        "kept. Gives: shifts, rotations and scale of the network, and points, that nothing else gives; "
+        "both standard deviations are then those with inner constraints for these. Where two kinds give "
+        "the same, the gain of each is that beside the other."
     )
     return Table(columns, rows, "gain"), note
 
@@ -311,9 +312,12 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _gain_in_words(one: Contribution) -> str:
-    """Return what a kind of observations adds: points 1.30 times as precise, gives the scale."""
+    """Return what a kind of observations adds: gives the scale; beside it points 1.30 times as precise."""
     precise = f"points {one.gain:.2f} times as precise" if np.isfinite(one.gain) else "nothing without it"
-    return ", gives ".join((precise, " and ".join(_given(one)))) if _given(one) else precise
+    if not _given(one):
+        return precise
+    beside = "beside that " if one.shifts or one.rotations or one.scale else ""
+    return f"alone gives {' and '.join(_given(one))}; {beside}{precise}"
 
 
 def _given(one: Contribution) -> list[str]:

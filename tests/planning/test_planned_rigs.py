@@ -19,7 +19,8 @@ from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.kind import PHOTOGRAPH, TableKind
-from sfm.planning.contributions import contributions, shape
+from sfm.observations.rigid_frames import RigidFrames
+from sfm.planning.contributions import contributions, open_counts
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import ScaleBarPlan, predict_network
@@ -105,6 +106,29 @@ def test_the_rig_condition_has_a_gain() -> None:
     assert rig.sigma_with == pytest.approx(prediction.rms_sigma)  # both with inner constraints on all points
 
 
+def test_gain_is_that_of_the_plan_where_two_kinds_give_the_scale() -> None:
+    """A bad bar and a good frame: without the frame the plan is as bad as it says, without the bar as good."""
+    plate = shape_object("plate", (1.0, 0.7), 30)
+    _, truth = make_rig(seed_of("motions"))
+    camera = truth.cameras[0]
+    stations = arrangement("ring:6", plate, camera)
+    ends = plate.names[0], plate.names[-1]
+
+    def framed(network: Network) -> Network:
+        frame = RigidFrames.of_group("frame", np.arange(4)[:, None], plate.xyz[:4], np.full((4, 3), 1e-5), {})
+        return replace(network, observations=(*network.observations, frame))
+
+    seeing, bars = Seeing(sigma_px=0.1), [ScaleBarPlan(*ends, 5e-3)]
+    without = predict_network(plate, camera, stations, seeing, bars=bars)
+    found = predict_network(plate, camera, stations, seeing, bars=bars, given=framed)
+    bar, frame = contributions(found)
+    assert frame.gain == pytest.approx(without.rms_sigma / found.rms_sigma, rel=1e-6) and frame.gain > 2
+    assert 1.0 <= bar.gain < 1.01
+    assert not (frame.scale or bar.scale)
+    (alone,) = contributions(without)
+    assert alone.scale and alone.gain == pytest.approx(1.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("kind", "given"),
     [
@@ -120,8 +144,8 @@ def test_what_only_one_kind_gives_is_named(kind: str, given: tuple[int, int, boo
     one = observed(kind, truth, seed_of(kind))
     a = predict(replace(network, observations=(one,)), truth)
     every = np.arange(len(truth.points))
-    assert shape(predict(network, truth), every)[1].tolist() == [3, 3, 1]
-    fixed = np.array([3, 3, 1]) - shape(a, every)[1]
+    assert open_counts(predict(network, truth), every).tolist() == [3, 3, 1]
+    fixed = np.array([3, 3, 1]) - open_counts(a, every)
     assert tuple(fixed) == given
 
 
