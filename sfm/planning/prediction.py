@@ -24,7 +24,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of, values_of
+from sfm.observations.groups import Group
 from sfm.orientation.ray_angles import ray_angles
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.visibility import Seeing, Sight, sight_of
@@ -32,6 +33,7 @@ from sfm.planning.stations import Stations
 from sfm.simulated_network import simulate_network
 
 MIN_POINTS = 4  # that a photograph must show to be oriented
+MAX_OFF_SIGMAS = 5.0  # of what is planned from what its observations state, as of points from a line
 MAX_JOINT = 1000  # points of whose joint covariance lengths are predicted; evenly spread ones of more
 
 
@@ -165,8 +167,8 @@ def predict_network(
         sight: of these stations, where it is known already.
 
     Raises:
-        GeometryError: no photograph or no point that can be determined, as from one place, or an unknown
-            point of a bar.
+        GeometryError: no photograph or no point that can be determined, as from one place, an unknown
+            point of a bar, or points that are not on the line that is observed of them.
 
     Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
     """
@@ -199,6 +201,7 @@ def predict_network(
     )
     if given is not None:
         network, _ = simulate_network(given(network), estimate)
+        _refuse_contradictions(network, estimate)
     photograph = np.full(len(stations), -1, dtype=np.int64)
     photograph[photographs] = np.arange(len(photographs))
     found = Prediction(planned, stations, sight, predict(network, estimate), place, photograph)
@@ -209,6 +212,25 @@ def predict_network(
             f" places, there are {stations.of(photographs).places}"
         )
     return found
+
+
+def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
+    """Refuse observations without values, as of lines, that the planned points contradict.
+
+    Raises:
+        GeometryError: points more than MAX_OFF_SIGMAS off.
+    """
+    for kind in (kind for kind in network.observations if isinstance(kind, Group) and len(kind)):
+        off = np.abs(kind.linearise(values_of(estimate)).difference.ravel())
+        beyond = off / kind.sigma.ravel()
+        worst = int(beyond.argmax())
+        if beyond[worst] > MAX_OFF_SIGMAS:
+            at = kind.rows(network)[worst // kind.sigma.shape[1]]
+            raise GeometryError(
+                f"plan: {kind.single} {kind.group}: point {at} is {off[worst]:.4g} off it, in the unit of the "
+                f"object, with sigma {kind.sigma.ravel()[worst]:.4g}; needed points on it, within "
+                f"{MAX_OFF_SIGMAS:g} sigma"
+            )
 
 
 def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations, seeing: Seeing) -> Sight:

@@ -14,6 +14,7 @@ from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation
 from sfm.distributions import chi2_ppf
+from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
@@ -107,7 +108,7 @@ def test_the_rig_condition_has_a_gain() -> None:
 
 
 def test_gain_is_that_of_the_plan_where_two_kinds_give_the_scale() -> None:
-    """A bad bar and a good frame: without the frame the plan is as bad as it says, without the bar as good."""
+    """A bad bar and a good frame: only what is lost without one of them is its gain."""
     plate = shape_object("plate", (1.0, 0.7), 30)
     _, truth = make_rig(seed_of("motions"))
     camera = truth.cameras[0]
@@ -147,6 +148,20 @@ def test_what_only_one_kind_gives_is_named(kind: str, given: tuple[int, int, boo
     assert open_counts(predict(network, truth), every).tolist() == [3, 3, 1]
     fixed = np.array([3, 3, 1]) - open_counts(a, every)
     assert tuple(fixed) == given
+
+
+def test_points_off_their_planned_line_are_refused() -> None:
+    plate = shape_object("plate", (1.0, 0.7), 30)
+    _, truth = make_rig(seed_of("motions"))
+    stations = arrangement("ring:6", plate, truth.cameras[0])
+    points = np.arange(3)
+
+    def on_line(network: Network) -> Network:
+        wire = TABLES["line"].of_group("wire", points[:, None], np.zeros((3, 0)), np.full((3, 1), 1e-4), {})
+        return replace(network, observations=(wire,))
+
+    with pytest.raises(GeometryError, match=r"plan: line wire: point \S+ is 0\.\d+ off it.* sigma 0\.0001"):
+        predict_network(plate, truth.cameras[0], stations, Seeing(sigma_px=0.1), given=on_line)
 
 
 def test_a_rig_without_which_nothing_is_determined_gives_all_points() -> None:
