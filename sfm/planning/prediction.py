@@ -30,6 +30,7 @@ from sfm.orientation.ray_angles import ray_angles
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations
+from sfm.similarity import similarity_motions
 from sfm.simulated_network import simulate_network
 
 MIN_POINTS = 4  # that a photograph must show to be oriented
@@ -132,6 +133,24 @@ class Prediction:
         """Fraser's design factor: q = sigma sqrt(k) / (S sigma_image)."""
         k = self.photographs_per_station
         return self.rms_sigma * float(np.sqrt(k)) / (self.scale_number * self.sigma_px)
+
+    @cached_property
+    def motion_variance(self) -> FloatArray:
+        """Of a coordinate of each point by position, attitude and scale of all of them together, (n, 3).
+
+        0 by what is datum: that of inner constraints; object unit^2.
+        """
+        a = self.adjustment
+        some = spread_evenly(self.point[self.determined])
+        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
+        X = a.estimate.points[some]
+        centre, size = X.mean(axis=0), float(np.ptp(X, axis=0).max())
+        to_motions = np.linalg.pinv(similarity_motions(X, centre=centre, size=size).reshape(-1, 7))
+        C = to_motions @ Q @ to_motions.T
+        J = similarity_motions(self.planned.xyz, centre=centre, size=size)
+        parts = (slice(0, 3), slice(3, 6), slice(6, 7))
+        by = [np.einsum("jia,ab,jib->j", J[:, :, on], C[on, on], J[:, :, on]) / 3 for on in parts]
+        return np.stack(by, axis=1)
 
     @cached_property
     def length_sigma(self) -> float:

@@ -26,6 +26,7 @@ MIN_RAYS = 4  # with fewer a gross error is hardly found, and hardly ever attrib
 FLAT_DEG = 40.0  # largest angle of rays below which depth is much weaker than the rest
 ROLLED_DEG = 45.0  # from the others, from which a photograph counts as rolled
 MIN_DEPTH = 0.1  # of the object over its distance, below which it is flat to the camera
+MOTIONS = ("position", "attitude", "scale")  # of a network
 MAX_PLACES = 500  # image points at which the calibration is judged
 
 
@@ -98,6 +99,10 @@ def reason_of(prediction: Prediction, j: int) -> str:
         seen_by_few = int(((why == Why.SEEN) & (prediction.photograph < 0)).sum())
         counts.append((seen_by_few, f"in photographs that share fewer than {MIN_POINTS} points with others"))
         words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
+    elif (by := prediction.motion_variance[j]).sum() > prediction.sigma[j] ** 2 / 2:
+        words.append(
+            f"mostly by the {MOTIONS[int(by.argmax())]} of the whole network as observations give it"
+        )
     elif angle >= FLAT_DEG:
         words.append(
             f"far from the stations or seen by few (median of points: "

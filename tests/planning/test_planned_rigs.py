@@ -29,6 +29,7 @@ from sfm.planning.sight.image_precision import TargetImage
 from sfm.planning.sight.visibility import Seeing, Why
 from sfm.planning.stations import arrangement
 from sfm.planning.wanted import WantedPrecision
+from sfm.planning.weakness import reason_of
 from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan, rows
 from tests.rigs import make_rig
@@ -162,6 +163,31 @@ def test_points_off_their_planned_line_are_refused() -> None:
 
     with pytest.raises(GeometryError, match=r"plan: line wire: point \S+ is 0\.\d+ off it.* sigma 0\.0001"):
         predict_network(plate, truth.cameras[0], stations, Seeing(sigma_px=0.1), given=on_line)
+
+
+@pytest.mark.parametrize(("kind", "cause"), [("height difference", "attitude"), ("bar", "scale")])
+def test_points_are_weak_by_what_an_observation_gives_badly(kind: str, cause: str) -> None:
+    plate = shape_object("plate", (1.0, 0.7), 30)
+    _, truth = make_rig(seed_of("motions"))
+    stations = arrangement("ring:6", plate, truth.cameras[0])
+    ends = np.arange(4)
+
+    def levelled(network: Network) -> Network:
+        level = TABLES[
+            kind
+        ].of_table(  # type: ignore[attr-defined]
+            (ends[:-1], ends[1:]), np.zeros((3, 1)), np.full((3, 1), 0.05)
+        )
+        return replace(network, observations=(level,))
+
+    bars = [ScaleBarPlan(plate.names[0], plate.names[5], 0.05)] if kind == "bar" else []
+    given = None if bars else levelled
+    seeing = Seeing(sigma_px=0.1)
+    found = predict_network(plate, truth.cameras[0], stations, seeing, bars=bars, given=given)
+    far = int(np.linalg.norm(plate.xyz, axis=1).argmax())
+    assert f"mostly by the {cause} of the whole network" in reason_of(found, far)
+    free = predict_network(plate, truth.cameras[0], stations, seeing)
+    assert "whole network" not in reason_of(free, far)
 
 
 def test_a_rig_without_which_nothing_is_determined_gives_all_points() -> None:
