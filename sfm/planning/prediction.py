@@ -246,8 +246,8 @@ def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
         if beyond[worst] > MAX_OFF_SIGMAS:
             at = kind.rows(network)[worst // kind.sigma.shape[1]]
             raise GeometryError(
-                f"plan: {kind.single} {kind.group}: point {at} is {off[worst]:.4g} off it, in the unit of the "
-                f"object, with sigma {kind.sigma.ravel()[worst]:.4g}; needed points on it, within "
+                f"plan: {kind.single} {kind.group}: point {at} is {off[worst]:.4g} off it, in the unit of "
+                f"the object, with sigma {kind.sigma.ravel()[worst]:.4g}; needed points on it, within "
                 f"{MAX_OFF_SIGMAS:g} sigma"
             )
 

@@ -100,9 +100,8 @@ def reason_of(prediction: Prediction, j: int) -> str:
         counts.append((seen_by_few, f"in photographs that share fewer than {MIN_POINTS} points with others"))
         words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
     elif (by := prediction.motion_variance[j]).sum() > prediction.sigma[j] ** 2 / 2:
-        words.append(
-            f"mostly by the {MOTIONS[int(by.argmax())]} of the whole network as observations give it"
-        )
+        motion = MOTIONS[int(by.argmax())]
+        words.append(f"mostly from the {motion} of the whole network, which its observations give weakly")
     elif angle >= FLAT_DEG:
         words.append(
             f"far from the stations or seen by few (median of points: "

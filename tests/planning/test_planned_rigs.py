@@ -185,7 +185,7 @@ def test_points_are_weak_by_what_an_observation_gives_badly(kind: str, cause: st
     seeing = Seeing(sigma_px=0.1)
     found = predict_network(plate, truth.cameras[0], stations, seeing, bars=bars, given=given)
     far = int(np.linalg.norm(plate.xyz, axis=1).argmax())
-    assert f"mostly by the {cause} of the whole network" in reason_of(found, far)
+    assert f"mostly from the {cause} of the whole network" in reason_of(found, far)
     free = predict_network(plate, truth.cameras[0], stations, seeing)
     assert "whole network" not in reason_of(free, far)
 
