@@ -27,6 +27,10 @@ def page(found: Further, *, result: Solution) -> Page:
         found: the photographs.
         result: of the survey.
     """
+    lines: tuple[Line, ...] = (HIDDEN,)
+    if result.network.moment is not None:
+        single = f"They are single photographs by camera {found.camera}, without the others of its rig."
+        lines = (Line("note", single), HIDDEN)
     size = float(np.abs([one.position for one in found.shots]).max(initial=0.0))
     columns = shot_columns(result.unit or "object units", size, planned=False)
     scene = scene_of_stored(replace(found.adjustment.solution, name=result.name, unit=result.unit))
@@ -46,7 +50,7 @@ def page(found: Further, *, result: Solution) -> Page:
         "more",
         "Photographs to add",
         result.name,
-        Banner(level, headline(found, result), (HIDDEN,)),
+        Banner(level, headline(found, result), lines),
         (
             Section("Photographs", Table(columns, shot_rows(found.shots)), stations),
             Section("Weakest points", Table(weak, weakest(found, result)), sigma),

@@ -15,6 +15,7 @@ from sfm.display import counted
 from sfm.files.rig_tables import IN_FILES
 from sfm.observations import TABLES
 from sfm.observations.mounts import MountObservations
+from sfm.observations.scale_bars import ScaleBars
 from sfm.planning.contributions import Contribution
 from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
@@ -255,7 +256,7 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
         "Gain: standard deviation of points without it over that with it, RMS of a coordinate, all else "
         "kept. Gives: shifts, rotations and scale of the network, and points, that nothing else gives; "
         "both standard deviations are then those with inner constraints for these. Where two kinds give "
-        "the same, the gain of each is that beside the other."
+        "the same, the gain of each is that beside the other. Scale bars: distances of tables among them."
     )
     return Table(columns, rows, "gain"), note
 
@@ -305,7 +306,9 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ),
     ]
     rows += describe_rigs(rigs_of(a), plan.unit)
-    rows += [(f"gain by {one.name}", _gain_in_words(one)) for one in plan.contributions]
+    for one in plan.contributions:
+        name = "scale bars and distances" if one.name == ScaleBars.name else one.name  # both are bars
+        rows.append((f"gain by {name}", _gain_in_words(one)))
     if a.undetermined:
         rows.append(("not determined", _first(a.undetermined)))
     return rows

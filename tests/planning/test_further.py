@@ -26,7 +26,8 @@ from sfm.planning.wanted import WantedPrecision
 from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest
-from sfm.report.pages import write_page
+from sfm.report.page import Banner
+from sfm.report.pages import page_of, write_page
 from sfm.solution import Solution
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
@@ -71,6 +72,9 @@ def test_further_photographs_of_a_rig_are_single_ones() -> None:
     assert found.camera == "camera 1" and (found.after < found.before).all()
     moment = found.adjustment.network.moment
     assert moment is not None and moment.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 5]
+    single = "They are single photographs by camera camera 1, without the others of its rig."
+    stated = page_of(found, result=Solution("rig", network, truth, unit="m")).verdict
+    assert isinstance(stated, Banner) and single in [line.text for line in stated.lines]
 
 
 def test_what_cannot_be_helped_is_said() -> None:
