@@ -297,7 +297,9 @@ def test_true_errors_are_those_predicted_in_the_mean(tmp_path: Path) -> None:
     plate = shape_object("plate", (500.0, 380.0), 12)
     stations = arrangement("ring:4", plate, camera)
     bar = ScaleBarPlan(plate.names[0], plate.names[11], 1.0)
-    found = plan_of("plate", "mm", plate, camera, stations, Seeing(sigma_px=0.1), wanted=Wanted(), bars=[bar])
+    found = plan_of(
+        "plate", "mm", plate, camera, stations, Seeing(sigma_px=0.1), wanted=WantedPrecision(), bars=[bar]
+    )
     write_page(found, tmp_path / "plan")
     read, squares = read_plan(tmp_path / "plan"), []
     for seed in range(10):
