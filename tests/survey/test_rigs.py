@@ -98,6 +98,7 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
         (RIG.replace("moment ([0-9]+)", "(camera)"), "of camera camera 1 are of one moment, 'camera'"),
         (RIG.replace("moment ([0-9]+)", "(.+)"), "no moment has photographs of two cameras"),
         (RIG + RIG.replace("stereo", "other"), "camera camera 1 is on rig stereo already"),
+        (RIG + "tolerance_s = 2.0\n", "tolerance_s is given, moment = \"exif\" is needed with it"),
     ],
 )
 def test_wrong_rigs_are_refused_in_one_line(rig: str, said: str, tmp_path: Path) -> None:
@@ -170,6 +171,7 @@ def test_given_mounts_give_the_scale(sigma: float, tmp_path: Path) -> None:
         ("camera 1,1,0,0,0,0,0,0,0,0,0,0,0", "camera 'camera 1' is on no rig, or its reference"),
         ("camera 2,1,0,0,0,0,0,0,0,0,1,1,1", "needed all six values, held fixed .sigma 0. together"),
         ("camera 2,1,0,0,1,1,1,,,,,,", "needed all six values"),
+        ("\n".join(["camera 2,1,0,0,1,1,1,0,0,0,1,1,1"] * 2), "camera 'camera 2' is on line 2 already"),
     ],
 )
 def test_wrong_mounts_are_refused(row: str, said: str, tmp_path: Path) -> None:

@@ -113,16 +113,20 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
             )
             _refuse_halves(table, given, deviation, name, sigmas[k] if sigmas else "")
             value[:, place + k], sigma[:, place + k] = given, deviation
-    return _observed_exterior(table, value, sigma)
+    return _observed_exterior(table, value, sigma, of)
 
 
-def _observed_exterior(table: CsvTable, value: FloatArray, sigma: FloatArray) -> ObservedExterior:
+def _observed_exterior(
+    table: CsvTable, value: FloatArray, sigma: FloatArray, of: str = "image"
+) -> ObservedExterior:
     """Return observed orientations, (e, 6) in degrees with NaN where not observed, as they are adjusted."""
     sigma = np.where(np.isnan(sigma), np.inf, sigma)
     _refuse_impossible(table, value, sigma)
+    names = table.texts[table.names.index("image")]
+    table.refuse_duplicates(names, (of,))
     value, sigma = value.copy(), sigma.copy()
     value[:, 3:], sigma[:, 3:] = np.radians(value[:, 3:]), np.radians(sigma[:, 3:])
-    return ObservedExterior(table.keys("image"), value, sigma, table)
+    return ObservedExterior(names, value, sigma, table)
 
 
 def mount_observations(

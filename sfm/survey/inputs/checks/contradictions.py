@@ -273,6 +273,10 @@ def _refuse_contradictions_of_rigs(
             owner[name] = rig.name
         if rig.blocks and rig.mounts is not None:
             raise SurveyFileError(f"{here}: mounts and blocks, of which one is needed: blocks find theirs")
+        if "tolerance_s" in rig.model_fields_set and rig.moment != "exif":
+            raise SurveyFileError(
+                f"{here}: tolerance_s is given, moment = \"exif\" is needed with it; moment is '{rig.moment}'"
+            )
         if rig.moment != "order" and not rig.named:
             _refuse_pattern(rig.moment, here)
     for camera in cameras if rigs else ():
