@@ -49,6 +49,10 @@ NOUNS = {  # what a remark may be of, by the names in its data
     "mirrored": "coordinates are those of a mirrored system",
     "thousandfold": "lengths are divided by 1000, as from mm to m",
     "thousandth": "lengths are multiplied by 1000, as from m to mm",
+    # mistakes in tables of mounts
+    "inverse pose": "it is the inverse pose, of the reference camera in the axes of this one",
+    "inverse rotation": "its rotation is the inverse, from the axes of the rig to those of the image",
+    "opposite base": "the signs of X, Y and Z are changed",
 }
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)

@@ -22,6 +22,7 @@ from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
+from sfm.observations.mounts import MountObservations
 from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import Survey
@@ -149,18 +150,29 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
         placed = place_by_rigs(*split_blocks(survey, network, estimate))
         return replace(estimate, position=placed.position, rotation=placed.rotation)
     mounts = mounts_of(_rigs_of(survey), network, estimate)
-    given = survey.given_mounts
-    if len(given):
-        a = given.camera
-        base, scale = np.linalg.norm(mounts.position[a], axis=1), 1.0
-        if survey.datum.kind != "control":  # which has a scale by itself
-            scale = float(np.median(np.linalg.norm(given.position, axis=1) / np.maximum(base, TINY)))
-        estimate = Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
-        position, rotation, free = scale * mounts.position, mounts.rotation.copy(), mounts.free.copy()
-        position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
-        rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
-        mounts = replace(mounts, position=position, rotation=rotation, free=free)
     return place_by_rigs(network, replace(estimate, mounts=mounts))
+
+
+def hold_mounts(estimate: Estimate, given: MountObservations, *, scaled: bool) -> Estimate:
+    """Return the estimate with given mounts, those without standard deviations held fixed.
+
+    Args:
+        estimate: with mounts.
+        given: confirmed by its photographs but for their common scale.
+        scaled: whether something else gives its scale; else the given bases do.
+    """
+    mounts, a = estimate.mounts, given.camera
+    if mounts is None or not len(given):
+        return estimate
+    if not scaled:
+        base = np.maximum(np.linalg.norm(mounts.position[a], axis=1), TINY)
+        scale = float(np.median(np.linalg.norm(given.position, axis=1) / base))
+        estimate = Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
+        mounts = replace(mounts, position=scale * mounts.position)  # all of them free
+    position, rotation, free = mounts.position.copy(), mounts.rotation.copy(), mounts.free.copy()
+    position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
+    rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
+    return replace(estimate, mounts=replace(mounts, position=position, rotation=rotation, free=free))
 
 
 def _rigs_of(survey: Survey) -> dict[str, list[int]]:

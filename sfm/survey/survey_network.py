@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.observations.mounts import MountObservations
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from sfm.survey.inputs.survey import Survey
@@ -48,12 +49,11 @@ def network_of(
     )
     if survey.exterior is not None and survey.datum.kind == "control":
         network = replace(network, exterior=exterior_observations(survey.exterior, images))
-    return with_given_mounts(survey, with_moments(survey, with_tables(survey.tables, network)))
+    return with_given_mounts(survey.given_mounts, with_moments(survey, with_tables(survey.tables, network)))
 
 
-def with_given_mounts(survey: Survey, network: Network) -> Network:
-    """Return the network with the mounts that a survey gives as observations, unless they are held fixed."""
-    mounts = survey.given_mounts
+def with_given_mounts(mounts: MountObservations, network: Network) -> Network:
+    """Return the network with given mounts as observations, unless they are held fixed."""
     loose = mounts.select(np.flatnonzero(np.trace(mounts.covariance, axis1=1, axis2=2) > 0))
     return replace(network, observations=(*network.observations, loose)) if len(loose) else network
 

@@ -98,7 +98,7 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
         (RIG.replace("moment ([0-9]+)", "(camera)"), "of camera camera 1 are of one moment, 'camera'"),
         (RIG.replace("moment ([0-9]+)", "(.+)"), "no moment has photographs of two cameras"),
         (RIG + RIG.replace("stereo", "other"), "camera camera 1 is on rig stereo already"),
-        (RIG + "tolerance_s = 2.0\n", "tolerance_s is given, moment = \"exif\" is needed with it"),
+        (RIG + "tolerance_s = 2.0\n", 'tolerance_s is given, moment = "exif" is needed with it'),
     ],
 )
 def test_wrong_rigs_are_refused_in_one_line(rig: str, said: str, tmp_path: Path) -> None:
@@ -181,6 +181,73 @@ def test_wrong_mounts_are_refused(row: str, said: str, tmp_path: Path) -> None:
     path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
     with pytest.raises(SurveyFileError, match=said):
         run_survey(read_survey(path))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3])
+@pytest.mark.parametrize(
+    ("mistake", "kind", "direction"),
+    [
+        ("inverse pose", "mount_contradicted", None),
+        ("opposite base", "mount_contradicted", 180.0),
+        ("turned", "mount_contradicted", 0.0),
+        ("longer", "mounts_scale_contradicted", None),
+        ("none", None, None),
+    ],
+)
+def test_given_mounts_are_judged_before_they_are_used(
+    sigma: float, mistake: str, kind: str | None, direction: float | None, tmp_path: Path
+) -> None:
+    """By the photographs, and by four distances; the result is that without the mount."""
+    network, truth = make_rig(seed_of("judged mounts"), moments=6, points=20)
+    assert truth.mounts is not None
+    X, R = truth.mounts.position[1], truth.mounts.rotation[1]
+    if mistake == "inverse pose":
+        X, R = -R.T @ X, R.T
+    if mistake == "turned":
+        R = R @ rotation_from_vector(np.array([0.05, 0.0, 0.0]))
+    X = {"opposite base": -1.0, "longer": 1.05}.get(mistake, 1.0) * X
+    angles = np.degrees(angles_from_rotation(R))
+    cells = [*X.tolist(), *[sigma] * 3, *angles.tolist(), *[100 * sigma] * 3]
+    header = "camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg"
+    (tmp_path / "mounts.csv").write_text(f"{header}\ncamera 2,{','.join(map(repr, cells))}\n", "utf-8")
+    P = truth.points
+    rows = [f"{j + 1},{j + 2},{float(np.linalg.norm(P[j] - P[j + 1]))!r},0.0001" for j in (0, 2, 4, 6)]
+    (tmp_path / "tape.csv").write_text("\n".join(["from,to,length,slength", *rows]), "utf-8")
+    tape = '[[survey_observations]]\nkind = "distance"\nfile = "tape.csv"\n\n'
+    path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n' + tape)
+    result = run_survey(read_survey(path))
+    judged = {one.kind: one for one in result.remarks if "mount" in one.kind or "rig" in one.kind}
+    assert list(judged) == ([] if kind is None else [kind])
+    if direction is not None:
+        found = judged["mount_contradicted"]
+        assert found.number("direction") == pytest.approx(direction, abs=0.5)
+        assert found.number("angle") == pytest.approx(np.degrees(0.05) if mistake == "turned" else 0, abs=0.1)
+    if kind == "mount_contradicted":
+        assert judged[kind].subjects.get("mistake", ()) == (() if mistake == "turned" else (mistake,))
+    if kind == "mounts_scale_contradicted":
+        assert judged[kind].number("off") == pytest.approx(5.0, abs=0.5)
+        assert judged[kind].names("cameras") == ("camera 2",) and judged[kind].names("others") == ("bars",)
+    (mount,) = findings_of(result).rigs[0].mounts
+    assert mount.base == pytest.approx(np.linalg.norm(truth.mounts.position[1]), abs=4 * mount.base_sigma)
+
+
+@pytest.mark.parametrize("longer", [1.0, 1.03])
+def test_mounts_of_two_scales_give_none(longer: float, tmp_path: Path) -> None:
+    network, truth = make_rig(seed_of("two scales"), cameras=3, moments=5, points=20)
+    assert truth.mounts is not None
+    rows = ["camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg"]
+    for a, factor in ((1, 1.0), (2, longer)):
+        X, angles = truth.mounts.position[a], angles_from_rotation(truth.mounts.rotation[a])
+        cells = [*(factor * X).tolist(), *[5e-4] * 3, *np.degrees(angles).tolist(), *[0.05] * 3]
+        rows.append(f"camera {a + 1},{','.join(map(repr, cells))}")
+    (tmp_path / "mounts.csv").write_text("\n".join(rows), "utf-8")
+    rig = RIG.replace('"camera 2"', '"camera 2", "camera 3"') + 'mounts = "mounts.csv"\n'
+    result = run_survey(read_survey(written(tmp_path, network, truth, rig)))
+    said = [one for one in result.remarks if one.kind == "mounts_scale_contradicted"]
+    assert len(said) == (longer != 1.0) and result.adjustment.has_scale == (longer == 1.0)
+    for one in said:
+        assert one.number("off") == pytest.approx(3.0, abs=1.0)
+        assert one.names("cameras") == ("camera 3",) and one.names("others") == ("the mount of camera 2",)
 
 
 BLOCKS = RIG + 'blocks = ["moment [1-4] *", "moment [5-8] *"]\n'

@@ -294,7 +294,7 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
 
     def given(network: Network) -> Network:
         network = with_tables(survey.tables, network)
-        return network if rig is None or free_mounts else with_given_mounts(survey, network)
+        return network if rig is None or free_mounts else with_given_mounts(survey.given_mounts, network)
 
     bars = tuple(ScaleBarPlan(bar.start, bar.end, bar.sigma) for bar in survey.scale_bars)
     return PlannedSetup(cameras, rig, bars, given, survey)

@@ -75,6 +75,25 @@ ROWS = (
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),
     Kind(
+        "mount_contradicted",
+        "error",
+        "The mount given for {camera} contradicts the photographs, by {angle} in its rotation and "
+        "{direction} in the direction of its base, {sigmas} standard deviations: it was not used.[[ It fits "
+        "if {mistake:@}.]]",
+        "another convention of rotations or signs, the mount of another camera, or a camera that was moved",
+        "Give X, Y, Z and the rotation of this camera in the image axes of the reference camera, or remove "
+        "its mount.",
+    ),
+    Kind(
+        "mounts_scale_contradicted",
+        "error",
+        "No dependable scale: that by the given {cameras:mount|mounts} of {cameras} [[differs by {off:+} "
+        "from]][[is {times} times]] that by {others:@}, {sigmas} standard deviations[[; nearly a factor of "
+        "{unit_factor}, as between {finer} and {coarser}]]. Given mounts were not used.",
+        CHECK_THE_LIST,
+        "Check the base and these values and their unit; a third source of scale shows which is wrong.",
+    ),
+    Kind(
         "plate_size_left_out",
         "warning",
         "The size of {given} [[differs by {off:+} from]][[is {times} times]] that by the other given values, "

@@ -21,6 +21,7 @@ from sfm.camera import base_name
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
+from sfm.observations.mounts import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -47,6 +48,7 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.hypotheses.given import JudgedGiven, judge_given
+from sfm.survey.hypotheses.given_mounts import judge_mount_scales, judge_mounts
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
@@ -58,6 +60,7 @@ from sfm.survey.observation_tables import find_gross, without_observations
 from sfm.survey.placing import (
     MIN_CONTROL,
     hold_fixed,
+    is_scaled,
     loosen_far,
     place_on_control,
     place_on_exterior,
@@ -65,7 +68,8 @@ from sfm.survey.placing import (
     place_on_observations,
     scale_to_bars,
 )
-from sfm.survey.rigs import split_blocks
+from sfm.survey.rigs import hold_mounts, split_blocks
+from sfm.survey.survey_network import with_given_mounts
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
@@ -136,8 +140,10 @@ def _solution(
     """Return the solution of a survey, with c of each photograph of some cameras."""
     start = _prepared(survey, matched, varying)
     free = _free_network(start)
-    task, given = _judged(start, free, _plates(survey, matched.naming, matched.network))
-    settled, gross = _settled(start, free, task, given)
+    mounts, of_mounts = _judged_mounts(start, free)
+    plates = _plates(survey, matched.naming, matched.network)
+    task, given = _judged(start, free, plates, checks_scale=bool(len(mounts)))
+    settled, gross = _settled(start, free, task, given, mounts)
     report_step("adjusting all observations")
     found, better = _best(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
@@ -165,6 +171,7 @@ def _solution(
         (
             *start.remarks,
             *(() if settled.per_photograph is None else settled.per_photograph.remarks),
+            *of_mounts,
             *given.remarks,
             *gross,
             *better,
@@ -227,6 +234,8 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
         varying: names of the cameras of which every photograph has c by itself, where it is adjusted.
     """
     network, estimate = matched.network, matched.estimate
+    tables = tuple(one for one in network.observations if not isinstance(one, MountObservations))
+    network = replace(network, observations=tables)  # mounts take part as far as photographs confirm them
     datum = survey.datum.kind
     unused: tuple[Remark, ...] = ()
     if survey.exterior is not None and datum == "control":
@@ -298,8 +307,23 @@ def _has_no_identity(survey: Survey) -> bool:
     return plate is not None and plate.is_ambiguous
 
 
+def _judged_mounts(
+    start: _Prepared, free: StableAdjustment | None
+) -> tuple[MountObservations, tuple[Remark, ...]]:
+    """Return the given mounts that the image points confirm, and remarks on the others."""
+    mounts = start.task.survey.given_mounts
+    if free is None or free.held or not len(mounts):
+        return mounts, ()
+    report_step("testing the given mounts")
+    return judge_mounts(mounts, free.adjustment)
+
+
 def _judged(
-    start: _Prepared, free: StableAdjustment | None, plates: tuple[tuple[str, ...], ...]
+    start: _Prepared,
+    free: StableAdjustment | None,
+    plates: tuple[tuple[str, ...], ...],
+    *,
+    checks_scale: bool,
 ) -> tuple[Task, JudgedGiven]:
     """Return the task with what was given, as on plates, as far as the image points confirm it."""
     task = start.task
@@ -328,6 +352,7 @@ def _judged(
         unit=task.survey.unit,
         rescale=task.survey.adjust.weights == "components",
         plates=plates if is_plate_control(task.survey.control, plate) else (),
+        checks_scale=checks_scale,
     )
     needed = task.needed.copy()
     if given.datum.kind == "control":
@@ -338,7 +363,11 @@ def _judged(
 
 
 def _settled(
-    start: _Prepared, free: StableAdjustment | None, task: Task, given: JudgedGiven
+    start: _Prepared,
+    free: StableAdjustment | None,
+    task: Task,
+    given: JudgedGiven,
+    mounts: MountObservations,
 ) -> tuple[StableAdjustment, tuple[Remark, ...]]:
     """Adjust the image points and what was given together.
 
@@ -347,9 +376,10 @@ def _settled(
         free: the image points adjusted alone.
         task: with what was given, as far as the image points confirm it.
         given: judged.
+        mounts: given ones that the image points confirm.
 
     Returns:
-        The adjustment, and remarks on observations of tables that were left out.
+        The adjustment, and remarks on observations of tables and mounts that were left out.
     """
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.adjustment
@@ -370,12 +400,37 @@ def _settled(
             estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
+    if len(mounts):
+        task, estimate, of_mounts = _with_mounts(task, estimate, free, mounts)
+        gross += of_mounts
     if free is None:
         return settle_by_photograph(task, estimate), gross
-    if task.datum.kind != "control" and not len(task.network.scale_bars) and not task.network.observations:
+    if task.datum.kind != "control" and not is_scaled(task.network, estimate):
         return _with_given(replace(free, task=task)), gross
     settled = settle(task, estimate, free.accepted).after(free)
     return replace(settled, held=settled.held or free.held), gross
+
+
+def _with_mounts(
+    task: Task, estimate: Estimate, free: StableAdjustment | None, mounts: MountObservations
+) -> tuple[Task, Estimate, tuple[Remark, ...]]:
+    """Return the task and start values with given mounts, if their scale agrees with that of all else."""
+    kinds = (("bars", task.network.scale_bars), ("control", task.network.control))
+    others = [name for name, some in kinds if len(some) and (name == "bars" or task.datum.kind == name)]
+    others += [one.name for one in task.network.observations]
+    said: tuple[Remark, ...] = ()
+    if free is not None and not free.held:
+        without = free.adjustment
+        if others:
+            with suppress(GeometryError):  # nothing else gives a scale that these others need
+                without = settle(task, estimate, free.accepted).adjustment
+        mounts, said = judge_mount_scales(mounts, without, others)
+    scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
+    estimate = hold_mounts(estimate, mounts, scaled=scaled)
+    network = with_given_mounts(mounts, task.network)
+    if task.network.observations and task.datum.kind != "control":
+        estimate = place_on_observations(task.network, estimate)
+    return replace(task, network=network), estimate, said
 
 
 def _best(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:

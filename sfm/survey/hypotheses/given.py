@@ -30,7 +30,6 @@ from sfm.survey.hypotheses.given_groups import (
     remarks_on_unchecked,
 )
 from sfm.survey.hypotheses.given_scales import judge_scales
-from sfm.survey.placing import mounts_give_scale
 
 MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
 
@@ -56,6 +55,7 @@ def judge_given(
     unit: str,
     rescale: bool = True,
     plates: Sequence[Collection[str]] = (),
+    checks_scale: bool = False,
 ) -> JudgedGiven:
     """Return which given values may take part in an adjustment, and remarks on the others.
 
@@ -68,6 +68,7 @@ def judge_given(
         plates: names of the points of each plate where control is the first of them: fixed coordinates of a
             grid are not rounded to decimals, and the scale is that of the plate, as asked for; bars between
             points of another plate are its size.
+        checks_scale: whether given mounts check the scale.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
@@ -78,8 +79,8 @@ def judge_given(
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    checked = mounts_give_scale(network, free.estimate)
-    task = Task(network, places, datum, unit, rescale, tuple(map(frozenset, plates)), checks_scale=checked)
+    of_plates = tuple(map(frozenset, plates))
+    task = Task(network, places, datum, unit, rescale, of_plates, checks_scale=checks_scale)
     return _judged(task)
 
 

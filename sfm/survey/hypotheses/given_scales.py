@@ -140,7 +140,7 @@ def _contradicting_scales(
         off = float(v[high] - v[low])
         sigma = float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high]))
         agreeing = None
-    by = _by(abs(off), sigma)
+    by = numbers_of_scale(abs(off), sigma)
     if plates:
         given = [one if one in plates else f"bar {one}" for one in (names[k] for k in which)]
         others = [names[k] for k in every if k not in which] or None
@@ -157,7 +157,7 @@ def _left_out(
     off, sigma = _difference(model, wrong, k)
     kind = "bar_left_out" if k < bars else "scale_left_out"
     kind = "plate_size_left_out" if names[k] in plates else kind
-    return remark(kind, given=names[k], **_by(off, sigma))
+    return remark(kind, given=names[k], **numbers_of_scale(off, sigma))
 
 
 def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
@@ -204,7 +204,7 @@ def _agree(bars: ScaleBars, a: int, b: int) -> bool:
     return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
 
 
-def _by(log: float, sigma: float) -> dict[str, Any]:
+def numbers_of_scale(log: float, sigma: float) -> dict[str, Any]:
     """Return the numbers of a difference of scale, and the units whose factor it is, if it is one."""
     unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(LEVEL, 1))) * sigma)
     found: dict[str, Any] = {"sigmas": abs(log) / sigma}
