@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,15 @@ from sfm.display import counted
 from sfm.files.result_tables import GIVEN
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings.given_residuals import Given
-from sfm.report.numbers import finer_unit_of, general, or_fixed, signed, significant, with_exponent
+from sfm.report.numbers import (
+    finer_unit_of,
+    general,
+    or_fixed,
+    signed,
+    significant,
+    with_exponent,
+    with_sigma,
+)
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -127,7 +136,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
 
 def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
     """Yield the residuals of the values of a kind, that with the largest w first."""
-    rows = found.table_rows
+    rows = [_to_its_sigma(row) for row in found.table_rows]
     if not rows:
         return
     yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
@@ -147,6 +156,14 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
         yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
 
 
+def _to_its_sigma(row: Sequence[Any]) -> tuple[Any, ...]:
+    """Return a row of given.csv with the given value written to the second digit of its sigma."""
+    names = GIVEN.names_of()
+    given, sigma = names.index("given"), names.index("sigma")
+    stated = np.nan if row[sigma] is None else float(row[sigma])
+    return (*row[:given], with_sigma(float(row[given]), stated)[0], *row[given + 1 :])
+
+
 def _named(found: GivenResiduals) -> str:
     """Return what the names of values are names of."""
     return "photograph" if found.kind in (CENTRE, ROTATION) else found.kind
@@ -163,7 +180,7 @@ def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...
     shown = {
         **({} if unit else {"unit": Column("unit")}),
         "name": Column(_named(found)),
-        "given": Column("given", "", unit, ".9g"),
+        "given": Column("given", "", unit, str),
         "difference": Column("adjusted - given", "", finer, signed, factor),
         "sigma": Column("sigma", "", finer, or_fixed, factor),
         "r": Column("r", format="z.3f", unknown=""),

@@ -329,7 +329,7 @@ def _correlations(f: Findings) -> Iterator[Part]:
     others = [pair for pair in s.correlations if pair not in s.camera_correlations]
     if others:
         summary = f"{len(others)} strong correlations within the exterior orientation of a photograph"
-        yield FoldedParts(summary, _pairs(others))
+        yield FoldedParts(summary, _pairs(others), in_text=True)
     if strong:
         heads = (Column("camera parameter"), Column("strongly correlated with"))
         rows = [

@@ -46,7 +46,7 @@ from sfm.report.phrases import (
     words_left_out,
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
-from sfm.report.tables.csv_files import left_out_rows
+from sfm.report.tables.csv_files import left_out_rows, table_stems
 from sfm.report.text import text, wrapped
 from sfm.report.viewer.embedded import Viewer
 from sfm.result import likest_first
@@ -56,7 +56,8 @@ MAX_OPEN = 60  # object points that are shown without a click
 CONVENTIONS = (
     "Pixel frame: (0, 0) is the centre of the top-left pixel, x to the right, y down. Rotation: "
     "R = Rx(omega) Ry(phi) Rz(kappa) turns image axes (x right, y up, looking along -z) into object axes. "
-    "Residuals are computed minus measured. A sigma is one standard deviation."
+    "Residuals are computed minus measured. A sigma is one standard deviation, a posteriori; w and minimal "
+    "bias rest on those of the weights."
 )
 
 
@@ -111,7 +112,8 @@ def page(
 
 def text_report(found: Findings) -> str:
     """Return report.txt: no dates and hosts, so that two reports can be compared."""
-    return "\n".join([text(page(found)), *wrapped(CONVENTIONS, behind=0), ""])
+    files = f"Tables (.csv): {', '.join(table_stems(found))}."
+    return "\n".join([text(page(found)), *wrapped(CONVENTIONS, behind=0), *wrapped(files, behind=0), ""])
 
 
 def _tiles(f: Findings) -> Iterator[Tile]:

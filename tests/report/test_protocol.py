@@ -62,6 +62,17 @@ def test_rejected_rays_stand_in_the_text_report_by_point(found: Findings) -> Non
     assert "where |tau| is beyond" in text
 
 
+def test_the_text_report_has_correlations_and_names_the_tables(found: Findings, tmp_path: Path) -> None:
+    text = " ".join(text_report(found).split())
+    write_tables(found, tmp_path)
+    listed = re.search(r"Tables \(\.csv\): ([^.]*)\.", text)
+    assert listed and sorted(listed[1].split(", ")) == sorted(one.stem for one in tmp_path.glob("*.csv"))
+    assert "one standard deviation, a posteriori" in text
+    s = found.statistics
+    within = [pair for pair in s.correlations if pair not in s.camera_correlations]
+    assert within and f"{100 * within[0].value:+.1f}" in text
+
+
 def test_control_has_its_standard_deviation_before_and_after(found: Findings) -> None:
     rows = found.protocol.control
     assert len(rows) == 15 and {row.use for row in rows} == {"control"}

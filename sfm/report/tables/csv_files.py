@@ -19,7 +19,7 @@ from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
 from sfm.files.plain_text import BLOCK
 from sfm.files.ply import write_ply
-from sfm.files.rig_tables import write_rigs
+from sfm.files.rig_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.given_residuals import given_rows
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
@@ -56,13 +56,26 @@ def write_tables(findings: Findings, folder: Path) -> None:
         table.write(folder, names, covariance[:, rows, columns])
     write_rigs(folder, result.solution)
     write_covariances(folder, result.solution, points=True)
-    if BALANCED_MODEL in findings.interior.models:
+    if _is_balanced(findings):
         tables.CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
     if len(result.seen_targets.image):
         tables.TARGETS.write_rows(folder, target_rows(findings))
     colours = [UNCODED_COLOUR if code is None else CODED_COLOUR for code in codes]
     unit = result.length_unit
     write_ply(folder / "points.ply", a.estimate.points, colours=colours, unit=unit)
+
+
+def table_stems(findings: Findings) -> tuple[str, ...]:
+    """Return the names of the tables of a result without their ending, as `write_tables` writes them."""
+    some = {tables.CAMERAS_BALANCED: _is_balanced(findings)}
+    some[tables.TARGETS] = len(findings.result.seen_targets.image) > 0
+    written = [one.file.removesuffix(".csv") for one in tables.TABLES if some.get(one, True)]
+    rigs = (MOUNTS, MOMENTS) if findings.rigs else ()
+    return (*written, *(name.removesuffix(".csv") for name in rigs))
+
+
+def _is_balanced(findings: Findings) -> bool:
+    return BALANCED_MODEL in findings.interior.models
 
 
 def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
