@@ -216,7 +216,7 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
 
     Where names do not begin so, the photographs are expected in folders named like the cameras.
     """
-    folders = [f"{name}/" for name in names]
+    folders = [re.sub(r"[^\w.\- ]+", "_", name) + "/" for name in names]  # blocks have globs in them
     if network.moment is None:
         return folders
     moments: dict[int, dict[int, str]] = defaultdict(dict)

@@ -179,6 +179,15 @@ def test_prefixes_are_what_names_of_a_camera_begin_with(
     assert [one["image_prefix"] for one in json.loads(text)[0]["cameras"]] == prefixes
 
 
+def test_folders_of_blocks_are_names_of_folders(tmp_path: Path) -> None:
+    network, truth = made()
+    cameras = tuple(replace(one, name=f"{one.name} [1-4]*") for one in truth.cameras)
+    network = replace(network, images=tuple(f"{i} {a}" for i, a in enumerate(network.camera)))
+    text = (written(tmp_path / "r", network, replace(truth, cameras=cameras)) / "rig_config.json").read_text()
+    found = [one["image_prefix"] for one in json.loads(text)[0]["cameras"]]
+    assert found == ["camera 1 _1-4_/", "camera 2 _1-4_/"]
+
+
 def test_kalibr_chains_each_camera_to_the_one_before(tmp_path: Path) -> None:
     """In metres: the pose of the third camera is that of the chain."""
     network, truth = made(cameras=3)
