@@ -20,7 +20,7 @@ from sfm.files.rig_tables import MOMENTS, MOUNTS
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
-from sfm.report.figures.plot_data import PlotCamera, PlotData, ProjectionMap
+from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.findings import Findings, with_remark
@@ -150,6 +150,7 @@ def plot_data(findings: Findings) -> PlotData:
     sigma = np.array([root_mean_square(one) for one in adjusted_sigmas(adjustment.covariance.points)])
     factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
     centre = np.array([camera.frame[:2] for camera in estimate.cameras])
+    sizes = {camera.name: camera.size_px for camera in estimate.cameras}
     return PlotData(
         unit=findings.result.length_unit,
         images=network.images,
@@ -170,6 +171,18 @@ def plot_data(findings: Findings) -> PlotData:
         sigma_unit=unit,
         projection=tuple(
             _projection(adjustment, interior.family == f) for f in range(len(interior.families))
+        ),
+        epipolar=tuple(
+            EpipolarMap(
+                f"{mount.camera} from {rig.reference}",
+                sizes[mount.camera],
+                mount.epipolar_xy,
+                mount.epipolar_px,
+                mount.epipolar_rms_px,
+            )
+            for rig in findings.rigs
+            for mount in rig.mounts
+            if len(mount.epipolar_px)
         ),
     )
 

@@ -314,6 +314,13 @@ def camera_parts(f: Findings) -> Iterator[Part]:
             for name, value, sigma, is_length in mount.values
         ]
         yield Table(columns("camera", "", ">value", ">sigma", "unit"), rows)
+        for mount in rig.mounts:
+            if len(mount.epipolar_px):
+                points = counted(len(mount.epipolar_px), "image point")
+                yield Paragraph(
+                    f"Camera {mount.camera}: RMS distance of {points} from the epipolar lines of camera "
+                    f"{rig.reference} {significant(mount.epipolar_rms_px)} px."
+                )
     yield FoldedParts("Correlations and significance of camera parameters", *_correlations(f), in_text=True)
 
 

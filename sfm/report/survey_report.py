@@ -237,7 +237,7 @@ def quality(report: Report) -> Section:
         *quality_of.given_values_parts(f),
         *(*quality_of.image_point_parts(f), report.plot("distribution"), report.plot("residuals")),
         *quality_of.largest_residual_parts(f),
-        *(*quality_of.camera_parts(f), report.plot("projection")),
+        *(*quality_of.camera_parts(f), report.plot("projection"), report.plot("epipolar")),
         *(photographs, report.plot("photographs"), *quality_of.component_parts(f)),
         key="quality",
     )

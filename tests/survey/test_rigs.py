@@ -15,10 +15,12 @@ from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
+from sfm.report.figures.plots import epipolar_figure
 from sfm.report.findings.findings import findings_of
-from sfm.report.output import write_result
+from sfm.report.findings.rigs import rigs_of
+from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
 from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
@@ -83,6 +85,20 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     assert stored["mounts"][0]["base"] == {"value": mount.base, "sigma": mount.base_sigma}
     assert set(stored["mounts"][0]["rotation_deg"]) == {"omega", "phi", "kappa"}
     assert "Rig stereo" in text_report(found)
+    assert 0.06 < mount.epipolar_rms_px < 0.16  # of points with 0.1 px in both photographs, one is adjusted
+    assert stored["mounts"][0]["epipolar_rms_px"] == mount.epipolar_rms_px
+    (drawn, *_), shown = epipolar_figure(plot_data(found)).axes, mount.epipolar_rms_px
+    assert drawn.get_title() == f"camera 2 from camera 1: RMS {shown:.3g} px"
+    far = replace(result.adjustment, estimate=replace(result.estimate, mounts=turned(result.estimate.mounts)))
+    assert rigs_of(far)[0].mounts[0].epipolar_rms_px > 5 * mount.epipolar_rms_px
+
+
+def turned(mounts: Mounts | None) -> Mounts:
+    """Return mounts with the second camera turned by 1 mrad about the base."""
+    assert mounts is not None
+    rotation, axis = mounts.rotation.copy(), mounts.position[1] / np.linalg.norm(mounts.position[1])
+    rotation[1] = rotation_from_vector(1e-3 * axis) @ rotation[1]
+    return replace(mounts, rotation=rotation)
 
 
 @pytest.mark.parametrize(

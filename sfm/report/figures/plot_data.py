@@ -38,6 +38,17 @@ class ProjectionMap:
 
 
 @dataclass(frozen=True)
+class EpipolarMap:
+    """Distances of image points of a camera from the epipolar lines of its reference camera."""
+
+    name: str  # "right from left"
+    size_px: tuple[int, int]
+    xy: FloatArray  # px, (k, 2)
+    distance_px: FloatArray  # (k,)
+    rms_px: float
+
+
+@dataclass(frozen=True)
 class PlotData:
     """Network and residuals of m photographs and k accepted image points."""
 
@@ -59,3 +70,4 @@ class PlotData:
     sigma: FloatArray  # of the points, RMS of sX, sY, sZ; NaN where fixed or not known, (n,)
     sigma_unit: str  # of these
     projection: tuple[ProjectionMap | None, ...]  # of each camera; None where nothing of it was adjusted
+    epipolar: tuple[EpipolarMap, ...] = ()  # of each mount of a rig

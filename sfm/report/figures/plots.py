@@ -49,6 +49,8 @@ def all_plots(shown: PlotData) -> tuple[Plot, ...]:
         drawn += (("precision", _PRECISION, precision_figure),)
     if any(shown.projection):
         drawn += (("projection", _PROJECTION, projection_figure),)
+    if shown.epipolar:
+        drawn += (("epipolar", _EPIPOLAR, epipolar_figure),)
     return tuple(plot(stem, caption, draw(shown)) for stem, caption, draw in drawn)
 
 
@@ -127,6 +129,36 @@ _PROJECTION = (
     "where a direction is seen, a rotation of the camera taken out; the 95 % value is 1.96 times it. Dots "
     "are the image points: beyond them the distortion is extrapolated."
 )
+
+
+_EPIPOLAR = (
+    "Distances of image points from the epipolar lines of the reference camera, points seen by both at one "
+    "moment. A pattern is distortion that the camera model does not describe, or a moment that is none."
+)
+
+
+def epipolar_figure(shown: PlotData) -> Figure:
+    """Draw the distances from epipolar lines over the format of each mounted camera, two in a row."""
+    rows = -(-len(shown.epipolar) // 2)
+    figure = panelled(4.4 * rows, rows=rows)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for panel, one in zip(panels, shown.epipolar, strict=False):
+        keep = slice(None, None, max(1, len(one.xy) // MAX_ARROWS))
+        limit = 3 * max(one.rms_px, 1e-12)
+        drawn = panel.scatter(
+            *one.xy[keep].T, c=one.distance_px[keep], s=6, cmap="coolwarm", vmin=-limit, vmax=limit
+        )
+        figure.colorbar(drawn, ax=panel, label="distance [px]", shrink=0.85, fraction=BAR_FRACTION)
+        width, height = one.size_px
+        panel.set_xlim(-0.5, width - 0.5)
+        panel.set_ylim(height - 0.5, -0.5)
+        panel.set_aspect("equal")
+        panel.set_xlabel("x [px]")
+        panel.set_ylabel("y [px]")
+        entitled(panel, f"{_plain(one.name)}: RMS {one.rms_px:.3g} px")
+    for panel in panels[len(shown.epipolar) :]:
+        panel.set_axis_off()
+    return figure
 
 
 def network_figure(shown: PlotData) -> Figure:
