@@ -33,7 +33,8 @@ from sfm.similarity import Similarity, fit_similarity, nearest_rotation
 K = TypeVar("K", bound=Kind)
 Weighted = TableKind | ScaleBars  # with one standard deviation for each value
 
-ROUNDS = 20  # of Gauss-Newton from each attitude
+ROUGH_ROUNDS, ROUNDS = 6, 20  # of Gauss-Newton from each attitude, and from the best of them
+BEST = 3  # attitudes that are fitted to the end
 # Standard deviations from which on an observation is taken for wrong before anything is adjusted.
 MIN_FAR_SIGMAS = 100.0
 MIN_FRACTION = 1e-9  # of the derivatives, below which what is left of a motion is rounding
@@ -61,8 +62,9 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
     scaled = not has_held_mounts(estimate)
     turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in _attitudes()]
-    tried = [_fitted(kinds, one, scaled=scaled) for one in turned]
-    return min(tried, key=lambda one: one[1])[0]
+    tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
+    best = sorted(tried, key=lambda one: one[1])[:BEST]
+    return min((_fitted(kinds, one, ROUNDS, scaled=scaled) for one, _ in best), key=lambda one: one[1])[0]
 
 
 def loosen_far(network: Network, estimate: Estimate) -> Network:
@@ -127,14 +129,16 @@ def _usable(kind: K, estimate: Estimate) -> K:
     return kind.select(on)
 
 
-def _fitted(kinds: list[Weighted], estimate: Estimate, *, scaled: bool) -> tuple[Estimate, float]:
+def _fitted(
+    kinds: list[Weighted], estimate: Estimate, rounds: int, *, scaled: bool
+) -> tuple[Estimate, float]:
     """Return the estimate moved, and scaled, to the least sum of residuals over their sigmas, and it.
 
     The sum of squares would let one mistyped value decide; weights of 1 over the residual make it that of
     absolute values (Foerstner and Wrobel 2016, sec. 4.7.4).
     """
     weighted = kinds
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         rows, l = _rows(weighted, estimate)
         rows[:, 6] *= scaled
         step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
