@@ -61,7 +61,11 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
     scaled = not has_held_mounts(estimate)
-    turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in _attitudes()]
+    rows, _ = _rows(kinds, start)
+    size = float(np.nanmax(np.abs(start.points)))
+    open_ = np.abs(rows[:, 3:6]).max() <= MIN_FRACTION * size * sum(_largest(one, start) for one in kinds)
+    attitudes = [np.eye(3)] if open_ else _attitudes()  # which distances and frames do not determine
+    turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
     tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
     best = sorted(tried, key=lambda one: one[1])[:BEST]
     return min((_fitted(kinds, one, ROUNDS, scaled=scaled) for one, _ in best), key=lambda one: one[1])[0]
