@@ -145,7 +145,7 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
         yield Paragraph(f"{what} held fixed: adjusted coordinates are those given, without residuals.")
         return
     heads, factor, unit = _columns(found, length_unit)
-    if len(found.coordinates) > 1 and unit:
+    if len(found.names) > 1 and len(found.coordinates) > 1 and unit:  # not of one group of observations
         rms = ", ".join(significant(factor * one) for one in found.rms)
         yield Paragraph(f"{what}, RMS {rms} {unit} in {', '.join(found.coordinates)}, adjusted minus given.")
     yield Note(R_AND_W)
