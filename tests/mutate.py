@@ -84,6 +84,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/survey/test_survey_observations.py",
         "tests/adjustment/test_statistics.py",
         "tests/survey/test_rigs.py",
+        "tests/planning/test_planned_rigs.py",
         "tests/test_new_kind.py",
     ),
     **{
@@ -99,7 +100,11 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/adjustment/hypotheses/rig_bumps.py": ("tests/adjustment/test_rig_bumps.py",),
     "sfm/survey/rigs.py": ("tests/survey/test_rigs.py",),
     "sfm/survey/observation_tables.py": ("tests/survey/test_survey_observations.py",),
-    "sfm/survey/placing.py": ("tests/survey/test_survey_observations.py",),
+    "sfm/survey/placing.py": (
+        "tests/survey/test_survey_observations.py",
+        "tests/survey/test_exterior.py",
+        "tests/survey/test_solution.py",
+    ),
     "sfm/orientation/resection": ("tests/orientation/resection",),
     "sfm/orientation/absolute.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
     "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),
