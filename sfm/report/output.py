@@ -176,13 +176,13 @@ def plot_data(findings: Findings) -> PlotData:
             EpipolarMap(
                 f"{mount.camera} from {rig.reference}",
                 sizes[mount.camera],
-                mount.epipolar_xy,
-                mount.epipolar_px,
-                mount.epipolar_rms_px,
+                mount.epipolar.xy,
+                mount.epipolar.px,
+                mount.epipolar.rms_px,
             )
             for rig in findings.rigs
             for mount in rig.mounts
-            if len(mount.epipolar_px)
+            if mount.epipolar is not None and len(mount.epipolar.px)
         ),
     )
 

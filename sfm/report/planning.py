@@ -223,7 +223,7 @@ def _rigs(plan: Plan) -> tuple[Part, ...]:
     columns = (*map(Column, ("camera", "")), Column("value"), Column("sigma"), Column("unit"))
     rows = [
         (mount.camera, name, *with_exponent(value, sigma), plan.unit if is_length else "deg")
-        for rig in rigs_of(plan.prediction.adjustment)
+        for rig in rigs_of(plan.prediction.adjustment, planned=True)
         for mount in rig.mounts
         for name, value, sigma, is_length in mount.values
     ]
@@ -305,7 +305,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             f"{len(plan.coded)} give every photograph five, or all that it shows, and name what is observed",
         ),
     ]
-    rows += describe_rigs(rigs_of(a), plan.unit)
+    rows += describe_rigs(rigs_of(a, planned=True), plan.unit)
     for one in plan.contributions:
         name = "scale bars and distances" if one.name == ScaleBars.name else one.name  # both are bars
         rows.append((f"gain by {name}", _gain_in_words(one)))
@@ -357,7 +357,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
         "coded_targets": len(plan.coded),
         **_observed(plan),
         "cameras": [_camera_summary(camera, found.get(camera.name)) for camera in p.cameras],
-        "rigs": summary_of_rigs(rigs_of(p.adjustment)),
+        "rigs": summary_of_rigs(rigs_of(p.adjustment, planned=True)),
         "contributions": [
             values_of(one, "name count shifts rotations scale points sigma_without sigma_with gain")
             for one in plan.contributions

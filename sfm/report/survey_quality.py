@@ -315,11 +315,11 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         ]
         yield Table(columns("camera", "", ">value", ">sigma", "unit"), rows)
         for mount in rig.mounts:
-            if len(mount.epipolar_px):
-                points = counted(len(mount.epipolar_px), "image point")
+            if mount.epipolar is not None and len(mount.epipolar.px):
+                points = counted(len(mount.epipolar.px), "image point")
                 yield Paragraph(
                     f"Camera {mount.camera}: RMS distance of {points} from the epipolar lines of camera "
-                    f"{rig.reference} {significant(mount.epipolar_rms_px)} px."
+                    f"{rig.reference} {significant(mount.epipolar.rms_px)} px."
                 )
     yield FoldedParts("Correlations and significance of camera parameters", *_correlations(f), in_text=True)
 

@@ -85,12 +85,15 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     assert stored["mounts"][0]["base"] == {"value": mount.base, "sigma": mount.base_sigma}
     assert set(stored["mounts"][0]["rotation_deg"]) == {"omega", "phi", "kappa"}
     assert "Rig stereo" in text_report(found)
-    assert 0.06 < mount.epipolar_rms_px < 0.16  # of points with 0.1 px in both photographs, one is adjusted
-    assert stored["mounts"][0]["epipolar_rms_px"] == mount.epipolar_rms_px
-    (drawn, *_), shown = epipolar_figure(plot_data(found)).axes, mount.epipolar_rms_px
-    assert drawn.get_title() == f"camera 2 from camera 1: RMS {shown:.3g} px"
+    assert mount.epipolar is not None
+    epipolar_px = mount.epipolar.rms_px
+    assert 0.06 < epipolar_px < 0.16  # of points with 0.1 px in both photographs, one is adjusted
+    assert stored["mounts"][0]["epipolar_rms_px"] == epipolar_px
+    drawn, *_ = epipolar_figure(plot_data(found)).axes
+    assert drawn.get_title() == f"camera 2 from camera 1: RMS {epipolar_px:.3g} px"
     far = replace(result.adjustment, estimate=replace(result.estimate, mounts=turned(result.estimate.mounts)))
-    assert rigs_of(far)[0].mounts[0].epipolar_rms_px > 5 * mount.epipolar_rms_px
+    turned_away = rigs_of(far)[0].mounts[0].epipolar
+    assert turned_away is not None and turned_away.rms_px > 5 * epipolar_px
 
 
 def turned(mounts: Mounts | None) -> Mounts:

@@ -9,6 +9,22 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
+from sfm.matching.epipolar import essential_matrices
+
+TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True)
+class EpipolarDistances:
+    """Distances of image points from the epipolar lines of the same points in the reference camera."""
+
+    xy: FloatArray  # image points that both saw at one moment, px, (k, 2)
+    px: FloatArray  # their distances, (k,)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance, px; NaN without image points."""
+        return float(np.sqrt(np.mean(self.px**2))) if len(self.px) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -22,13 +38,7 @@ class Mount:
     position_sigma: FloatArray  # (3,)
     rotation_deg: FloatArray  # omega, phi, kappa of R, image axes to those of the rig, deg, (3,)
     rotation_sigma_deg: FloatArray  # (3,)
-    epipolar_xy: FloatArray  # image points that the reference camera saw at the same moment, px, (k, 2)
-    epipolar_px: FloatArray  # their distances from the epipolar lines of its image points, px, (k,)
-
-    @property
-    def epipolar_rms_px(self) -> float:
-        """Root mean square distance of image points from their epipolar lines, px; NaN without any."""
-        return float(np.sqrt(np.mean(self.epipolar_px**2))) if len(self.epipolar_px) else float("nan")
+    epipolar: EpipolarDistances | None  # None where image points are planned
 
     @property
     def values(self) -> tuple[tuple[str, float, float, bool], ...]:
@@ -53,53 +63,51 @@ class Rig:
     moments: int  # with photographs of two cameras at least
 
 
-def rigs_of(a: Adjustment) -> tuple[Rig, ...]:
-    """Return the rigs of an adjustment."""
+def rigs_of(a: Adjustment, *, planned: bool = False) -> tuple[Rig, ...]:
+    """Return the rigs of an adjustment; of one that is planned without distances from epipolar lines."""
     mounts, moment = a.estimate.mounts, a.network.moment
     if mounts is None or moment is None:
         return ()
     found = []
     for rig, (reference, *others_on) in mounts.by_rig().items():
         of_rig = np.isin(a.network.camera, [reference, *others_on])
-        others = tuple(_mount(a, reference, k, moment) for k in others_on)
+        others = tuple(
+            _mount(a, k, None if planned else _epipolar(a, reference, k, moment)) for k in others_on
+        )
         shared = int((np.bincount(moment[of_rig]) > 1).sum())
         found.append(Rig(rig, a.estimate.cameras[reference].name, others, shared))
     return tuple(found)
 
 
-def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return image points of a camera and their distances from epipolar lines of its reference camera, px.
-
-    With the directions d1, d2 in the axes of each camera, the base b in those of the rig and the rotation R
-    of the camera into them, the line of d1 is n d2 = 0 with n = R'(b x d1).
+def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> EpipolarDistances:
+    """Return the distances of image points of a camera from epipolar lines of its reference camera.
 
     Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.3.2 (coplanarity).
     """
     mounts, k = a.estimate.mounts, a.network.image_points
     assert mounts is not None
-    rows = {}
-    for of in (reference, camera):
-        used = np.flatnonzero(~a.rejected & (a.network.camera[k.image] == of))
-        rows[of] = dict(zip(zip(moment[k.image[used]], k.point[used], strict=True), used, strict=True))
-    common = sorted(rows[reference].keys() & rows[camera].keys())
-    pairs = np.array([(rows[reference][key], rows[camera][key]) for key in common], dtype=np.int64)
-    first, second = pairs.reshape(-1, 2).T
+    rows = [np.flatnonzero(~a.rejected & (a.network.camera[k.image] == of)) for of in (reference, camera)]
+    keys = [moment[k.image[some]] * len(a.network.points) + k.point[some] for some in rows]
+    _, *common = np.intersect1d(keys[0], keys[1], return_indices=True)
+    first, second = (some[at] for some, at in zip(rows, common, strict=True))
     d1, d2 = (
         np.column_stack([tangents_from_pixel(a.estimate.cameras[of], k.xy[at]), -np.ones(len(at))])
         for of, at in ((reference, first), (camera, second))
     )
-    n = np.cross(mounts.position[camera], d1) @ mounts.rotation[camera]
-    away = np.einsum("ka,ka->k", n, d2) / np.maximum(np.hypot(n[:, 0], n[:, 1]), np.finfo(float).tiny)
+    pair = [reference, camera]
+    (E,) = essential_matrices(mounts.position[pair], mounts.rotation[pair], np.array([[0, 1]]))
+    line = d1 @ E.T
+    away = np.einsum("ka,ka->k", line, d2) / np.maximum(np.hypot(line[:, 0], line[:, 1]), TINY)
     known = np.isfinite(away)
-    return k.xy[second][known], a.estimate.cameras[camera].c_px * away[known]
+    return EpipolarDistances(k.xy[second][known], a.estimate.cameras[camera].c_px * away[known])
 
 
-def _mount(a: Adjustment, reference: int, camera: int, moment: IntArray) -> Mount:
+def _mount(a: Adjustment, camera: int, epipolar: EpipolarDistances | None) -> Mount:
     mounts, Q = a.estimate.mounts, a.covariance.mounts[camera]
     assert mounts is not None
     X = mounts.position[camera]
     base = float(np.linalg.norm(X))
-    along = X / max(base, np.finfo(float).tiny)
+    along = X / max(base, TINY)
     sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
     return Mount(
         a.estimate.cameras[camera].name,
@@ -109,5 +117,5 @@ def _mount(a: Adjustment, reference: int, camera: int, moment: IntArray) -> Moun
         sigma[:3],
         np.degrees(angles_from_rotation(mounts.rotation[camera])),
         np.degrees(sigma[3:]),
-        *_epipolar(a, reference, camera, moment),
+        epipolar,
     )

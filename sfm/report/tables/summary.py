@@ -381,7 +381,7 @@ def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
             "mounts": [
                 {
                     "camera": mount.camera,
-                    "epipolar_rms_px": or_none(mount.epipolar_rms_px),
+                    **({} if mount.epipolar is None else {"epipolar_rms_px": or_none(mount.epipolar.rms_px)}),
                     **stated(one for one in mount.values if one[3]),
                     "rotation_deg": stated(one for one in mount.values if not one[3]),
                 }
