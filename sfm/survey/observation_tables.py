@@ -129,20 +129,21 @@ def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network
     """Return the network with the observations of tables whose points or photographs it has."""
     added: list[TableKind] = []
     for one, labels in zip(tables, _labels(tables), strict=True):
-        rows = np.flatnonzero(_known(one, network))
+        known = _known(one, network)
+        rows = np.flatnonzero(known)
         number = {name: k for k, name in enumerate(_names(one, network))}
         named = one.named
         indices = [np.array([number[column[row]] for row in rows], dtype=np.int64) for column in named]
         if issubclass(one.of, Group):
             for group, label in labels.items():
-                of_group = np.array([one.table.texts[0][row] == group for row in rows], dtype=bool)
-                if of_group.any():
-                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[of_group]
-                    value, sigma = one.value[rows][of_group], one.sigma[rows][of_group]
+                of_group = np.array([name == group for name in one.table.texts[0]], dtype=bool)
+                some = of_group & known
+                if some.any():
+                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[of_group[rows]]
+                    value, sigma = one.value[some], one.sigma[some]
                     made = one.of.of_group(group, points, value, sigma, number)
                     if isinstance(made, RigidFrames):
-                        of_group = np.array([name == group for name in one.table.texts[0]], dtype=bool)
-                        rest = np.flatnonzero(of_group & ~_known(one, network))
+                        rest = np.flatnonzero(of_group & ~known)
                         made = replace(
                             made,
                             hidden=tuple(one.table.texts[1][row] for row in rest),
@@ -230,19 +231,19 @@ def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -
     while network.observations:
         a = adjust_with(network)
         first = len(network.kinds) - len(network.observations)
-        tests = [(*test, one) for one in a.observed if one.index >= first for test in _largest(one)]
-        w, row, component, one = max(tests, key=lambda test: test[0], default=(0.0, 0, 0, None))
+        w, row, component, one = _worst(a, first)
         if one is None or not w > _critical(a, first):
             break
-        kind = network.kinds[one.index]
+        kind, explained = network.kinds[one.index], list[Gross]()
         if estimate is None:
             estimate = a.estimate
             for other in given:
                 total[other.name] += len(other.parts(network, estimate))
-            for gross in _explained(network, estimate, kind, adjust_with):
-                wrong[gross.kind], mistakes[gross.kind] = list(gross.names), gross.mistake
-                whole |= {gross.kind} if gross.whole else set()
-        if not wrong or estimate is not a.estimate:
+            explained = _explained(network, estimate, kind, adjust_with)
+        for gross in explained:
+            wrong[gross.kind], mistakes[gross.kind] = list(gross.names), gross.mistake
+            whole |= {gross.kind} if gross.whole else set()
+        if not explained:
             if total[kind.name] < 3:
                 break  # of two nothing shows which is wrong; the remark on residuals names the larger one
             part = kind.parts(network, estimate)[kind.part_of(int(one.rows[row]), component)]
@@ -270,8 +271,7 @@ def _explained(
             mended = tuple(kind.mistakes()[mistake] for kind in of)
             a = adjust_with(replace(network, observations=(*others, *mended)))
             first = len(network.kinds) - len(network.observations)
-            tests = [w for one in a.observed if one.index >= first for w, _, _ in _largest(one)]
-            if tests and max(tests) <= _critical(a, first) and name not in {one.kind for one in found}:
+            if _agrees(a, first) and name not in {one.kind for one in found}:
                 names = [part for kind in of for part in kind.parts(network, estimate)]
                 whole = not any(kind.name == name for kind in others)
                 found.append(Gross(name, tuple(names), whole, mistake))
@@ -298,8 +298,7 @@ def _mistake(
         others = [kind for kind in network.observations if not _same_group(kind, mended)]
         a = adjust_with(replace(network, observations=(*others, *mended)))
         first = len(network.kinds) - len(network.observations) + len(others)
-        tests = [w for one in a.observed if one.index >= first for w, _, _ in _largest(one)]
-        if tests and max(tests) <= _critical(a, first):
+        if _agrees(a, first):
             return mistake
     return None
 
@@ -311,6 +310,18 @@ def _same_group(kind: Kind, others: Sequence[Kind]) -> bool:
         for other in others
         if isinstance(other, Group)
     )
+
+
+def _worst(a: Adjustment, first: int) -> tuple[float, int, int, ObservedResiduals | None]:
+    """Return the largest |w| of the kinds from an index on, its row, its component and its residuals."""
+    tests = [(*test, one) for one in a.observed if one.index >= first for test in _largest(one)]
+    return max(tests, key=lambda test: test[0], default=(0.0, 0, 0, None))
+
+
+def _agrees(a: Adjustment, first: int) -> bool:
+    """Return whether the kinds from an index on are checked, and none contradicts."""
+    w, _, _, one = _worst(a, first)
+    return one is not None and w <= _critical(a, first)
 
 
 def _critical(a: Adjustment, first: int) -> float:
