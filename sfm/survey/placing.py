@@ -58,13 +58,10 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     kinds = _of_motions(network, estimate)
     if not kinds or not network.observations:
         return estimate
-    centre = np.nanmean(estimate.points, axis=0)
-    start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
+    start, rows, rounding = _about_centre(kinds, estimate)
     scaled = not has_held_mounts(estimate)
-    rows, _ = _rows(kinds, start)
-    size = float(np.nanmax(np.abs(start.points)))
-    open_ = np.abs(rows[:, 3:6]).max() <= MIN_FRACTION * size * sum(_largest(one, start) for one in kinds)
-    attitudes = [np.eye(3)] if open_ else _attitudes()  # which distances and frames do not determine
+    turns = np.abs(rows[:, 3:6]).max() > rounding
+    attitudes = _attitudes() if turns else [np.eye(3)]  # which distances and frames do not determine
     turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
     tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
     best = sorted(tried, key=lambda one: one[1])[:BEST]
@@ -98,21 +95,29 @@ def scale_sigma(network: Network, estimate: Estimate) -> float:
     kinds = _of_motions(network, estimate)
     if not kinds:
         return float("inf")
-    centre = np.nanmean(estimate.points, axis=0)
-    rows, _ = _rows(kinds, Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate))
-    size = float(np.nanmax(np.abs(estimate.points - centre)))
-    rows[:, :3] *= size  # shifts in units of the extent, beside turns in rad
-    largest = sum(_largest(kind, estimate) for kind in kinds) * size
+    _, rows, rounding = _about_centre(kinds, estimate)
     U, singular, _ = np.linalg.svd(rows[:, :6], full_matrices=False)
-    U = U[:, singular > MIN_FRACTION * largest]
+    U = U[:, singular > rounding]
     left = float(np.linalg.norm(rows[:, 6] - U @ (U.T @ rows[:, 6])))
-    return 1 / left if left > MIN_FRACTION * largest else float("inf")
+    return 1 / left if left > rounding else float("inf")
 
 
-def _largest(kind: Kind, estimate: Estimate) -> float:
-    """Return the norm of the whitened derivatives of observations, before those of motions cancel out."""
-    J = np.concatenate([by.ravel() for by in kind.linearise(values_of(estimate)).J])
-    return float(np.linalg.norm(J) * np.sqrt(inverse_of_observed(kind.covariances()).max()))
+def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, FloatArray, float]:
+    """Return an estimate about its centre, with derivatives by its motions and their rounding.
+
+    Returns:
+        The estimate; whitened derivatives by shift in units of its extent, turn and scale, (n, 7); below
+        which these are nothing but rounding of derivatives by points and photographs that cancel out.
+    """
+    centre = np.nanmean(estimate.points, axis=0)
+    start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
+    rows, _ = _rows(kinds, start)
+    size, norm = float(np.nanmax(np.abs(start.points))), 0.0
+    rows[:, :3] *= size
+    for kind in kinds:
+        J = np.concatenate([by.ravel() for by in kind.linearise(values_of(start)).J])
+        norm += float(np.linalg.norm(J) * np.sqrt(inverse_of_observed(kind.covariances()).max()))
+    return start, rows, MIN_FRACTION * size * norm
 
 
 def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:

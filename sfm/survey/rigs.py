@@ -90,12 +90,18 @@ def planned_mounts(survey: Survey) -> Mounts:
         raise SurveyFileError(
             f"{survey.source}: rig {rig.name}: no mount of {listed(missing)}; a plan needs their mounts"
         )
-    a, n = given.camera, len(names)
-    position, rotation = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
-    free = np.zeros((n, 6), dtype=bool)
+    n = len(names)
+    at_reference = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 6), dtype=bool)
+    return _with_given(Mounts(*at_reference, (rig.name,) * n), given)
+
+
+def _with_given(mounts: Mounts, given: MountObservations) -> Mounts:
+    """Return mounts with given ones among them, those without standard deviations held fixed."""
+    a = given.camera
+    position, rotation, free = mounts.position.copy(), mounts.rotation.copy(), mounts.free.copy()
     position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
     rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
-    return Mounts(position, rotation, free, (rig.name,) * n)
+    return replace(mounts, position=position, rotation=rotation, free=free)
 
 
 def _moments(
@@ -169,10 +175,7 @@ def hold_mounts(estimate: Estimate, given: MountObservations, *, scaled: bool) -
         scale = float(np.median(np.linalg.norm(given.position, axis=1) / base))
         estimate = Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
         mounts = replace(mounts, position=scale * mounts.position)  # all of them free
-    position, rotation, free = mounts.position.copy(), mounts.rotation.copy(), mounts.free.copy()
-    position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
-    rotation[a] = [rotation_from_angles(*angles) for angles in given.angles]
-    return replace(estimate, mounts=replace(mounts, position=position, rotation=rotation, free=free))
+    return replace(estimate, mounts=_with_given(mounts, given))
 
 
 def _rigs_of(survey: Survey) -> dict[str, list[int]]:
