@@ -39,7 +39,7 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
-from sfm.files.scratch import scratch_folder
+from sfm.files.user_cache import scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
 from sfm.runtime.folder_settings import closed_current_folder
 

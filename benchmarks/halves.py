@@ -30,7 +30,7 @@ import sfm
 from benchmarks.textured import onto_centres
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.engine.correlated import correlated_sum
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation
+from sfm.adjustment.quality.correlations import estimate_error_correlation
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray

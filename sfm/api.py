@@ -23,17 +23,17 @@ from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.shapes.fit import fit_shape as fit_points
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
+from sfm.kernels.threads import cores
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult
-from sfm.runtime.cores import cores
 from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
 from sfm.solution import Solution, solution_of
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.other_programs import OtherPrograms
 
 load_adapters()
 BACKENDS = ("colmap", "none")
@@ -326,7 +326,7 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
     """
     others = OtherPrograms()
     if backend == "colmap":
-        from adapters.colmap.validation_backend import adjust_with_covariance
+        from adapters.colmap.adjuster import adjust_with_covariance
 
         others = replace(others, adjuster=adjust_with_covariance)
     if baseline == "mapper":
@@ -342,7 +342,7 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
     Args:
         note: receives the remark on a camera that could not be looked up, as without pycolmap.
     """
-    from adapters.colmap.sensor_widths import sensor_width_mm
+    from adapters.colmap.mapper import sensor_width_mm
 
     def width(make: str, model: str) -> float | None:
         try:

@@ -16,7 +16,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, WIDE_ANGLE, Role, number_of, observe
 from sfm.errors import SurveyFileError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-10

@@ -19,9 +19,8 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey, solve_survey
-from sfm.survey.assembly import assemble_result
+from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
 from sfm.survey.board_turns import agree_on_turns
-from sfm.survey.camera_models import orient_with_models
 from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
@@ -32,7 +31,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.other_sizes import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
-from sfm.survey.other_programs import ALONE, OtherPrograms, compare_solution
+from sfm.survey.orientation import orient_with_models
 from sfm.survey.target_network import measure_targets
 
 

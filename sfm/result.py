@@ -15,14 +15,13 @@ from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
-from sfm.comparison.baseline import BaselineComparison
+from sfm.comparison.solutions import BaselineComparison
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
-from sfm.point_table import Point, PointTable
 from sfm.remarks.remark import Remark
-from sfm.solution import NO_SCALE, OrientedImage, SeenTargets, Solution
+from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution
 from sfm.targets.flags import LIKEST_FIRST, Flag, count_flags
 
 COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")

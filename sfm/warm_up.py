@@ -19,27 +19,26 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.comparison.solutions import reprojection
-from sfm.comparison.two_adjusters.common_problem import common_problem
+from sfm.comparison.two_adjusters.adjusters import common_problem
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.errors import KolinearError
 from sfm.geometry.mesh import Mesh
+from sfm.kernels.compiling import set_warm
 from sfm.kernels.sampling import resample
-from sfm.kernels.warmed import set_warm
+from sfm.kernels.threads import cores
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import METHODS
 from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.feature_tracks import link_features
-from sfm.matching.tracks.interest import foerstner_points
-from sfm.matching.tracks.natural_points import natural_points
+from sfm.matching.tracks.interest import foerstner_points, natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
-from sfm.planning.design.gain import gains
+from sfm.planning.design.candidates import gains
 from sfm.planning.sight.occlusion import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring
-from sfm.runtime.cores import cores
 from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.plates import PlateFamily

@@ -13,8 +13,8 @@ from sfm.batch.job import Comparers, SurveyRow
 from sfm.cli.commands.batching import InProcess
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Send
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.other_programs import OtherPrograms
 
 # The command line in a process that draws no plots, which take as long as a survey, for tests that see none
 PLOTLESS = (

@@ -97,7 +97,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         )
         for module in ("unknowns", "observed", "motions", "iterate")
     },
-    "sfm/adjustment/hypotheses/rig_bumps.py": ("tests/adjustment/test_rig_bumps.py",),
+    "sfm/adjustment/hypotheses/moved.py": ("tests/adjustment/test_rig_bumps.py",),
     "sfm/survey/rigs.py": ("tests/survey/test_rigs.py",),
     "sfm/survey/observation_tables.py": ("tests/survey/test_survey_observations.py",),
     "sfm/survey/placing.py": (
@@ -109,7 +109,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/orientation/absolute.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
     "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),
     "sfm/epochs/displacements.py": ("tests/epochs/test_displacements.py",),
-    "sfm/units.py": ("tests/test_units.py",),
+    "sfm/conventions.py": ("tests/test_units.py",),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
     "sfm/targets/codes/dot_plates.py": ("tests/targets/test_plates.py",),
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm.photographs.satellite_positions import SatellitePosition
+from sfm.photographs.exif import SatellitePosition
 
 M_PER_DEG_EQUATOR = (111_319.49, 110_574.28)  # of a degree of longitude and of latitude
 UNKNOWN = (math.nan, math.nan, math.nan)

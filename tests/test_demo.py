@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
-from adapters.formats.result_tables import read_image_points, read_result
-from adapters.formats.targets_table import read_targets
+from adapters.formats.result_tables import read_image_points, read_result, read_targets
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
@@ -23,8 +22,8 @@ from sfm.report.viewer.scene import Marks
 from sfm.report.viewer.solution_scene import scene_of_result, scene_of_stored
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.other_programs import OtherPrograms
 from tests.places import ROOT
 
 DEMO = ROOT / "datasets" / "demo"

@@ -14,9 +14,9 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.other_programs import OtherPrograms
 from sfm.targets.flags import Flag
 from tests.places import ROOT
 

@@ -26,10 +26,10 @@ REASONS = (
     "sfm/survey/diagnosis",
     "sfm/survey/drafting/camera_groups.py",
     "sfm/survey/measuring/other_sizes.py",
-    "sfm/survey/measuring/photographs.py",
+    "sfm/survey/measuring/targets.py",
     "sfm/survey/orientation.py",
     "sfm/survey/adjusting/settling.py",
-    "sfm/survey/inputs/checks/settings_errors.py",
+    "sfm/survey/inputs/settings.py",
     "sfm/orientation/incremental",
     "sfm/pipeline.py",
 )

@@ -7,9 +7,8 @@ from typing import get_args
 import pytest
 from pydantic import TypeAdapter
 
-from sfm.conventions import METRES
+from sfm.conventions import METRES, SWELLING, UNITS, find_unit
 from sfm.survey.inputs.settings import Unit
-from sfm.units import SWELLING, UNITS, find_unit
 
 MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
 

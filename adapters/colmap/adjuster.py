@@ -8,6 +8,10 @@ The only module that imports pycolmap. Limits of its adjuster against Kolinear's
 Pixel origin and axes are turned in adapters.colmap.reconstruction.
 
 Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
+
+COLMAP as the other adjuster of a validation: adjustment and covariances.
+
+Source: COLMAP 4.2, estimate_ba_covariance.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -36,7 +40,6 @@ from sfm.files.plain_text import as_plain
 from sfm.network import Estimate, Network
 
 NEEDED_VERSION = (4, 2)
-
 # The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
 # Gauss-Newton's. Ceres' tolerances stop long before the last digits.
 START_RADIUS = 1e8
@@ -62,6 +65,7 @@ class ColmapAdjustment:
     seconds: float  # time in Ceres, s; without building the problem
     threads: int  # threads that Ceres was given
     point_covariance: FloatArray | None = None  # of the points, photographs and cameras held, image points of
+
     # standard deviation 1 px, object unit^2, (n, 3, 3); None where not asked for
 
 
@@ -256,3 +260,79 @@ def reason_of(error: BaseException) -> str:
     text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
     text = re.sub(r"^Check failed: *", "COLMAP expected ", text)
     return as_plain(text if len(text) <= MAX_TOLD else text[:MAX_TOLD] + "...")
+
+
+@dataclass(frozen=True)
+class ColmapCovariance:
+    """Covariances as COLMAP estimates them, for image coordinates of standard deviation 1 px."""
+
+    interior: tuple[FloatArray, ...]  # marginal, of the free parameters of each camera, in order, (f, f)
+    points: FloatArray  # with cameras and photographs held fixed (conditional), object unit^2, (n, 3, 3)
+
+
+def covariance_with_colmap(
+    network: Network, estimate: Estimate, *, gauge: str = "two_cameras"
+) -> ColmapCovariance | None:
+    """Return COLMAP's covariances at a solution, None of rigs and where COLMAP finds it singular.
+
+    What COLMAP calls the covariance of a point is conditional on all photographs and cameras, too small
+    by the share that these contribute. That of the interior orientation is marginal and does not depend
+    on the gauge.
+
+    Args:
+        network: photographs, points and image points.
+        estimate: the solution, cameras in a model that COLMAP has.
+        gauge: two_cameras | control; COLMAP has no covariance without a gauge.
+
+    Raises:
+        BackendError: as for `adjust_with_colmap`.
+    """
+    pycolmap = load_pycolmap()
+    if estimate.mounts is not None:  # COLMAP 4.2 refuses photographs that are not of reference cameras
+        return None
+    options = ceres_options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
+    with quiet(pycolmap):
+        scene = reconstruction(pycolmap, network, estimate)
+        config = adjustment_config(pycolmap, network, estimate, gauge)
+        # estimate_ba_covariance wants this adjuster and no other; it need not have been run
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+        wanted = pycolmap.BACovarianceOptions()
+        wanted.damping = 0.0
+        found = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
+        if found is None:
+            return None
+        interior = []
+        for k, camera in enumerate(estimate.cameras):
+            block = found.get_other_params_cov(scene.camera(k + 1).params) if camera.free.any() else None
+            interior.append(np.zeros((0, 0)) if block is None else np.array(block))
+        points = np.zeros((len(network.points), 3, 3))  # held points have none
+        for j in range(len(network.points)):
+            block = found.get_point_cov(j + 1)
+            if block is not None:
+                points[j] = block
+    return ColmapCovariance(tuple(interior), points)
+
+
+def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 1) -> ColmapAdjustment:
+    """Adjust with COLMAP in a free datum, and have its covariances of points at the solution.
+
+    Args, Raises: as `adjust_with_colmap`.
+    """
+    found = adjust_with_colmap(network, start, threads=threads)
+    covariance = covariance_with_colmap(network, found.estimate)
+    return replace(found, point_covariance=None if covariance is None else covariance.points)
+
+
+@dataclass(frozen=True)
+class ColmapBackend:
+    """COLMAP as the other adjuster of a validation (sfm.comparison.two_adjusters.adjuster_validation)."""
+
+    name: str = "colmap"
+
+    def adjust(self, network: Network, start: Estimate, *, control: bool) -> ColmapAdjustment:
+        """Adjust with control points held or the datum free."""
+        return adjust_with_colmap(network, start, gauge="control" if control else "free")
+
+    def covariance(self, network: Network, estimate: Estimate, *, control: bool) -> ColmapCovariance | None:
+        """Return COLMAP's covariances at a solution."""
+        return covariance_with_colmap(network, estimate, gauge="control" if control else "two_cameras")

@@ -4,11 +4,16 @@ COLMAP cannot hold names of cameras and points or the size of a pixel; they lie 
 kolinear.json.
 
 Source: COLMAP 4.2 documentation, "Output Format".
+
+kolinear.json beside a COLMAP model: what COLMAP cannot hold.
+
+Names of cameras, photographs and points, the size of a pixel, and which parameters are free.
 """
 
 from __future__ import annotations
 
 import errno
+import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -16,18 +21,20 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
-from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links_out
-from sfm.files.plain_text import MAX_NAME, is_name, shown
-from sfm.files.rig_tables import refuse_moments
+from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shown
+from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
 from sfm.network import Estimate, ImagePoints, Mounts, Network
+
+SIDE_FILE = "kolinear.json"
 
 
 def write_model(
@@ -298,3 +305,57 @@ def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
             position[a], rotation[a] = mount_of(poses[camera] * poses[reference].inverse())
             free[a] = True
     return Mounts(position, rotation, free, tuple(names)) if any(names) else None
+
+
+class NamedCamera(Content):
+    """What COLMAP does not know of a camera."""
+
+    name: Name
+    pixel_mm: tuple[Pixel, Pixel]  # width and height of a pixel, mm
+    free: tuple[bool, ...]  # to be adjusted, of each parameter
+    size_px: tuple[Side, Side] | None = None  # width and height of its photographs, px
+    rig: Name | None = None  # what its rig is called
+    mount_free: tuple[bool, bool, bool, bool, bool, bool] | None = None  # which of X, Y, Z, rotations
+
+
+class Names(Content):
+    """Content of kolinear.json."""
+
+    cameras: tuple[NamedCamera, ...] = ()  # in the order of their numbers
+    images: dict[str, Name] = Field(default_factory=dict)  # names by COLMAP's number of the photograph
+    points: dict[str, Name] = Field(default_factory=dict)  # names by COLMAP's number of the point
+
+
+def read_side_file(path: Path) -> Names:
+    """Read what Kolinear adds to a model; nothing where the file is missing.
+
+    Raises:
+        SurveyFileError: what is wrong in it.
+    """
+    if not path.is_file():
+        return Names()
+    return read_json(path, Names, "the names beside a COLMAP model")
+
+
+def write_side_file(path: Path, network: Network, estimate: Estimate) -> None:
+    """Write what COLMAP cannot hold."""
+    mounts = estimate.mounts
+    side = {
+        "cameras": [
+            {
+                "name": camera.name,
+                "size_px": [int(side) for side in camera.size_px],
+                "pixel_mm": [float(side) for side in camera.pixel_mm],
+                "free": camera.free.tolist(),
+            }
+            | (
+                {"rig": mounts.rig[a], "mount_free": mounts.free[a].tolist()}
+                if mounts is not None and mounts.rig[a]
+                else {}
+            )
+            for a, camera in enumerate(estimate.cameras)
+        ],
+        "images": {str(i + 1): name for i, name in enumerate(network.images)},
+        "points": {str(j + 1): name for j, name in enumerate(network.points)},
+    }
+    path.write_text(json.dumps(side, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")

@@ -36,8 +36,7 @@ from sfm.camera import Camera
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
-from sfm.files.json_files import MAX_SIDE_PX
-from sfm.files.plain_text import MAX_NAME, as_plain, is_name
+from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, as_plain, is_name
 from sfm.files.whole_files import refuse_full, whole_file
 from sfm.network import ImagePoints, Network, rows_of
 

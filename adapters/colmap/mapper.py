@@ -1,9 +1,14 @@
 """COLMAP's pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
 
 The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
-are compared with the survey's by sfm.comparison.baseline.
+are compared with the survey's by sfm.comparison.solutions.
 
 Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
+
+Widths of camera sensors from COLMAP's list of cameras.
+
+pycolmap gives them only through the focal length that it infers for a photograph, so it is given a small one
+with the make, the model and a known focal length.
 """
 
 from __future__ import annotations
@@ -13,14 +18,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import read_model
 from sfm.camera import project
 from sfm.errors import BackendError, one_line
-from sfm.files.scratch import scratch_folder
+from sfm.files.user_cache import scratch_folder
 from sfm.network import Estimate, Network, rows_of
 
+SIDE_PX = (1000, 750)
+FOCAL_MM = 10
 MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does
 RANDOM_SEED = 0  # of RANSAC, so that a run repeats as far as threads allow
 
@@ -99,3 +108,27 @@ def _rms(network: Network, estimate: Estimate) -> float:
         xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
         squares.append(((xy - seen.xy[rows]) ** 2).ravel())
     return float(np.sqrt(np.nanmean(np.concatenate(squares))))
+
+
+def sensor_width_mm(make: str, model: str) -> float | None:
+    """Return the width of a camera's sensor, mm, None if COLMAP does not know the camera.
+
+    Args:
+        make: maker as EXIF data have it.
+        model: model as EXIF data have it.
+
+    Raises:
+        BackendError: pycolmap is missing.
+    """
+    pycolmap = load_pycolmap()
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: IFDRational(FOCAL_MM, 1)}
+    with scratch_folder() as folder:
+        path = folder / "camera.jpg"
+        Image.new("L", SIDE_PX).save(path, exif=exif)
+        with quiet(pycolmap):
+            camera = pycolmap.infer_camera_from_image(str(path))
+    if not camera.has_prior_focal_length:
+        return None
+    return FOCAL_MM * max(SIDE_PX) / float(camera.mean_focal_length())

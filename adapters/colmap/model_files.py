@@ -20,7 +20,7 @@ import numpy as np
 from adapters.reading.text_lines import Lines
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
-from sfm.files.json_files import MAX_SIDE_PX
+from sfm.files.plain_text import MAX_SIDE_PX
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 OLDER = ("rigs", "frames")  # models of COLMAP before version 3.12 have neither

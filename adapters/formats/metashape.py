@@ -35,8 +35,7 @@ from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.json_files import MAX_PIXEL_MM
-from sfm.files.plain_text import shown
+from sfm.files.plain_text import MAX_PIXEL_MM, shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 

@@ -43,8 +43,7 @@ from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angl
 from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import UNCODED
-from sfm.files.json_files import MAX_SIDE_PX
-from sfm.files.plain_text import shown
+from sfm.files.plain_text import MAX_SIDE_PX, shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.solution import Solution
 

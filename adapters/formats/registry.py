@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap.camera_models import read_model, write_model
+from adapters.colmap.camera_models import SIDE_FILE, read_model, write_model
 from adapters.colmap.database import read_database, write_database
-from adapters.colmap.names import SIDE_FILE
 from adapters.colmap.reconstruction import COLMAP_NAMES
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
@@ -45,8 +44,8 @@ from sfm.camera import Camera
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.files.csv_tables import write_ply
 from sfm.files.open_folders import refuse_links, refuse_links_out
-from sfm.files.ply import write_ply
 from sfm.files.whole_files import whole_file, whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.solution import Solution

@@ -2,6 +2,8 @@
 
 These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are passed over.
 Sizes and pixels missing from a summary are taken from the COLMAP model in the folder `colmap`.
+
+Targets measured and candidates rejected in the photographs, read from targets.csv of a result.
 """
 
 from __future__ import annotations
@@ -15,10 +17,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
+from adapters.colmap.camera_models import SIDE_FILE, NamedCamera, read_side_file
 from adapters.formats.content import Content
-from adapters.formats.given_table import Statistics, read_given, write_given
-from adapters.formats.known_points import read_known_points
+from adapters.formats.given_table import Statistics, read_given, read_known_points, write_given
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.distortion.models import MODELS
@@ -31,13 +32,13 @@ from sfm.files.covariance_file import (
     write_covariances,
 )
 from sfm.files.csv_tables import CsvTable
-from sfm.files.json_files import Content as Json
-from sfm.files.json_files import Name, Pixel, Side, Text, read_json
 from sfm.files.open_folders import refuse_links_out
-from sfm.files.rig_tables import read_rigs, write_rigs
+from sfm.files.plain_text import Content as Json
+from sfm.files.plain_text import Name, Pixel, Side, Text, read_json
+from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.network_check import CORRELATION_LIMIT
-from sfm.solution import Solution
+from sfm.solution import MEASURED, SeenTargets, Solution
 
 SIGMAS, SIGMAS_PX = ("sX", "sY", "sZ"), ("sx_px", "sy_px")
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
@@ -402,3 +403,36 @@ def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:
     """Diagonal covariances (n, 3, 3) of columns sX, sY, sZ; None where no row has any."""
     table.refuse(sigma, sigma < 0, SIGMAS, "0 or more, or nothing")
     return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
+
+
+def read_targets(folder: Path, network: Network) -> SeenTargets | None:
+    """Read the targets and rejected candidates of a result; None where it has no such table.
+
+    Args:
+        folder: of the result.
+        network: what `read_result` has read of it.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    path = folder / TARGETS.file
+    if not path.is_file():
+        return None
+    table = TARGETS.read(folder)
+    index = {name: i for i, name in enumerate(network.images)}
+    images, reasons = table.texts
+    for line, name in zip(table.line, images, strict=True):
+        if name not in index:
+            raise SurveyFileError(f"{path}, line {line}: image '{name}' is not in images.csv")
+    axes = table.values[:, 2:4]
+    table.refuse(axes, axes <= 0, ("a_px", "b_px"), "more than 0, or nothing")
+    ellipse = np.column_stack([axes, np.deg2rad(table.values[:, 4])])
+    for line, reason, outline in zip(table.line, reasons, ellipse, strict=True):
+        if reason == MEASURED and not np.isfinite(outline).all():
+            raise SurveyFileError(f"{path}, line {line}: a measured target without a_px, b_px and angle_deg")
+    return SeenTargets(
+        np.array([index[name] for name in images], dtype=np.int64),
+        table.values[:, :2].copy(),
+        ellipse,
+        tuple("" if reason == MEASURED else reason for reason in reasons),
+    )

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.content import Content
-from adapters.formats.known_points import CONTROL, write_known_points
+from adapters.formats.given_table import CONTROL, write_known_points
 from sfm.camera import Camera
 from sfm.conventions import METRES, angles_from_rotation
 from sfm.files.plain_text import csv_text
-from sfm.files.rig_tables import MOMENTS
+from sfm.files.result_tables import MOMENTS
 from sfm.network import Estimate, Network
 
 MIN_CONTROL = 3  # points that fix position, attitude and scale

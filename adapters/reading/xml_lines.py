@@ -17,8 +17,7 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.json_files import MAX_SIDE_PX
-from sfm.files.plain_text import MAX_NAME, is_name, shown
+from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shown
 
 MAX_XML_BYTES = 4_000_000_000
 MAX_KEPT_BYTES = 1_000_000_000  # of memory; 100,000 cameras with all that is exported of them take half of it

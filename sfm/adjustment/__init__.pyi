@@ -5,8 +5,8 @@ from sfm.adjustment.covariance import change_datum as change_datum
 from sfm.adjustment.covariance import marginal_of as marginal_of
 from sfm.adjustment.covariance import with_error_correlation as with_error_correlation
 from sfm.adjustment.datum import Datum as Datum
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation as estimate_error_correlation
-from sfm.adjustment.quality.error_correlation import with_neighbours as with_neighbours
+from sfm.adjustment.quality.correlations import estimate_error_correlation as estimate_error_correlation
+from sfm.adjustment.quality.correlations import with_neighbours as with_neighbours
 from sfm.adjustment.quality.statistics import CoordinateTest as CoordinateTest
 from sfm.adjustment.quality.statistics import tau_test as tau_test
 from sfm.adjustment.quality.statistics import w_test as w_test

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.covariance import Local, local_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.cofactors import (
     Cofactors,
@@ -27,7 +28,6 @@ from sfm.adjustment.engine.iterate import (
     optimum_at,
     problem_of,
 )
-from sfm.adjustment.engine.local_frame import Local, local_of
 from sfm.adjustment.engine.observed import count_of, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, unknowns_of
 from sfm.adjustment.quality.gross_errors.rejection import REJECTS, Run, find_optimum

@@ -1,21 +1,32 @@
-"""One survey of a batch, as a worker runs it: its photographs one by one, then the rest, into one folder."""
+"""One survey of a batch, as a worker runs it: its photographs one by one, then the rest, into one folder.
+
+Which results were finished by batches of this user: what `--resume` may keep.
+
+A result that lies in the folder of a batch may have come with the survey, with a log and a manifest that fit.
+So whoever finishes a result notes it in the user's cache folder, by its path and the hash of its manifest,
+which has the hashes of its files.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import os
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sfm.batch.finished import note_finished
 from sfm.errors import FolderInUseError, OutputError
-from sfm.files.folder_lock import Owner, locked, owner_of
+from sfm.files.manifest import MANIFEST, sha256_of
+from sfm.files.open_folders import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
+from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
+from sfm.files.whole_files import whole_file
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
@@ -25,13 +36,13 @@ from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Send
 from sfm.runtime.faults import error_in_words, is_fault
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import Measured, MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.survey.measuring.tie_points import natural_points_of
-from sfm.survey.other_programs import OtherPrograms
 
 LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
@@ -301,3 +312,44 @@ class _Sending:
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
         """A batch shows the stages only."""
+
+
+def note_finished(folder: Path) -> None:
+    """Note that a result is by this user; where there is no room it is computed again at `--resume`."""
+    with suppress(OSError, OutputError):
+        entry = _entry(folder)
+        make_user_folder(entry.parents[1])
+        with whole_file(entry, replaces=True) as part:
+            part.touch()
+
+
+def was_finished(folder: Path) -> bool:
+    """Whether a result was noted, and has the same manifest as then.
+
+    Raises:
+        OutputError: others can write where results are noted.
+    """
+    try:
+        os.utime(_entry(folder))  # asked for now
+    except OSError:
+        return False
+    return True
+
+
+def remove_old_notes() -> None:
+    """Remove notes not asked for in months.
+
+    Raises:
+        OutputError: others can write where results are noted.
+    """
+    remove_unused(_notes())
+
+
+def _notes() -> Path:
+    return user_folder("finished", "notes on finished results")
+
+
+def _entry(folder: Path) -> Path:
+    """Return the file that notes a result as it is now."""
+    key = hashlib.sha256(os.fsencode(f"{folder.absolute()}\0{sha256_of(folder / MANIFEST)}")).hexdigest()
+    return _notes() / key[:2] / key

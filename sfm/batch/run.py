@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from sfm.batch.finished import note_finished, remove_old_notes, was_finished
 from sfm.batch.job import (
     LOCK,
     LOGS,
@@ -28,13 +27,16 @@ from sfm.batch.job import (
     finished_row,
     lock_of,
     measure_one,
+    note_finished,
     reconstruct,
+    remove_old_notes,
+    was_finished,
 )
-from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
+from sfm.batch.table import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
-from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
+from sfm.files.open_folders import locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log

@@ -13,11 +13,9 @@ from sfm.cli.commands import (
     batching,
     checking,
     comparing_epochs,
-    drafting,
     inspecting,
     measuring,
     planning,
-    planning_surveys,
     refining,
     solvers,
     surveying,
@@ -55,7 +53,7 @@ def _commands(
 
 for _command in (
     surveying.run,
-    drafting.init,
+    surveying.init,
     surveying.adjust,
     batching.batch,
     measuring.resect,
@@ -72,8 +70,8 @@ for _command in (
     viewing.view,
 ):
     app.command()(_command)
-planning.plan.command("simulate")(planning_surveys.simulate_command)
-planning.plan.command("more")(planning_surveys.more_command)
+planning.plan.command("simulate")(planning.simulate_command)
+planning.plan.command("more")(planning.more_command)
 app.add_typer(planning.plan)
 
 

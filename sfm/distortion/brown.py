@@ -12,7 +12,7 @@ Signs as PhotoModeler and DBAT. Its outputs are described in `sfm.distortion.mod
 from __future__ import annotations
 
 from sfm.conventions import FloatArray
-from sfm.kernels.options import inlined
+from sfm.kernels.compiling import inlined
 
 LOCATED_PX = (
     0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square

@@ -6,7 +6,7 @@ They distort the ideal point. Its outputs are described in `sfm.distortion.model
 from __future__ import annotations
 
 from sfm.conventions import FloatArray
-from sfm.kernels.options import inlined
+from sfm.kernels.compiling import inlined
 
 
 @inlined

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from sfm.conventions import FloatArray
-from sfm.kernels.options import inlined
+from sfm.kernels.compiling import inlined
 
 SERIES = 0.01  # r2 below which a closed form has lost more digits than its series leaves out
 SMALL_OMEGA2 = 1e-3  # likewise, of omega^2

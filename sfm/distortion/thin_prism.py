@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from sfm.conventions import FloatArray
 from sfm.distortion.radial import along, equidistant, seen
-from sfm.kernels.options import inlined
+from sfm.kernels.compiling import inlined
 
 
 @inlined

@@ -12,24 +12,44 @@ control, that both share.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2; Koch (1999), Parameter Estimation and Hypothesis
 Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
+
+Change of the mounts of a rig between two epochs: T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom.
+
+Values given alike to both epochs, as a scale bar, make the true variance of d smaller than Q_1 + Q_2: the
+test then finds less, and does not find what is not there.
+
+Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.
+
+Epoch: a result with what it was given, and what it has in common with other epochs.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sfm.arguments import checked_arguments
 from sfm.comparison.congruency import MOTIONS, motions
-from sfm.comparison.pairing import fit_robustly, pair_results
-from sfm.comparison.point_pairs import PointPairs, coordinates_of, held_points, pairs_of_results
-from sfm.comparison.point_tests import known_scale
-from sfm.conventions import FloatArray, IntArray
+from sfm.comparison.pairing import (
+    PointPairs,
+    coordinates_of,
+    fit_robustly,
+    held_points,
+    pair_results,
+    pairs_of_results,
+)
+from sfm.comparison.significance import known_scale
+from sfm.comparison.stable_points import critical_value
+from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.display import counted
-from sfm.epochs.epoch import MAX_SAME_DIFFERENCE, Epoch, given_observations
 from sfm.errors import GeometryError
+from sfm.network import ObjectPoints, ScaleBars
 from sfm.solution import Solution
+
+MAX_SAME_DIFFERENCE = 1e-9  # relative difference of two given values that are the same one
 
 
 @dataclass(frozen=True)
@@ -226,3 +246,116 @@ def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs
         coordinates_of(one.result.covariance_rows(p)) for one, p in zip((first, second), pairs.T, strict=True)
     )
     return np.asarray(a[rows_a] @ b[rows_b].T)
+
+
+@dataclass(frozen=True)
+class MountChange:
+    """A camera on its rig in two epochs."""
+
+    camera: str
+    difference: FloatArray  # second minus first: X, Y, Z (object unit of the first; NaN where not both epochs
+    # have a scale), omega, phi, kappa (rad), (6,)
+    sigma: FloatArray  # (6,)
+    statistic: float  # T
+    critical: float
+
+    @property
+    def changed(self) -> bool:
+        """Whether the camera was moved on its rig."""
+        return self.statistic > self.critical
+
+
+def mount_changes(
+    first: Solution, second: Solution, *, alpha: float, redundancy: int | None
+) -> tuple[MountChange, ...]:
+    """Test the mounts that two epochs have adjusted, all of them together at one level.
+
+    Args:
+        first: an epoch.
+        second: a later one.
+        alpha: level of the tests of all mounts.
+        redundancy: of both; None if their variances are known.
+    """
+    scale = known_scale(first, second)
+    ours, theirs = _mounts(first, 1.0), _mounts(second, scale or 1.0)
+    common = [name for name in ours if name in theirs]
+    tested = np.arange(6) if scale is not None else np.arange(3, 6)
+    found = []
+    for name in common:
+        (a, Q_a), (b, Q_b) = ours[name], theirs[name]
+        d, Q = b - a, Q_a + Q_b
+        d[3:] = (d[3:] + np.pi) % (2 * np.pi) - np.pi
+        sigma = np.sqrt(np.diagonal(Q))
+        if scale is None:
+            d[:3] = sigma[:3] = np.nan
+        part = Q[np.ix_(tested, tested)]
+        statistic = float(d[tested] @ np.linalg.solve(part, d[tested])) / len(tested)
+        critical = critical_value(alpha / len(common), len(tested), redundancy)
+        found.append(MountChange(name, d, sigma, statistic, critical))
+    return tuple(found)
+
+
+def _mounts(result: Solution, scale: float) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return values and covariance of the mounts of a result that were adjusted, by camera."""
+    mounts, Q = result.estimate.mounts, result.mount_covariance
+    if mounts is None or Q is None:
+        return {}
+    unit = np.repeat([scale, 1.0], 3)
+    values = unit * np.hstack([mounts.position, angles_from_rotation(mounts.rotation)])
+    Q = unit[:, None] * Q * unit
+    on = mounts.free.any(axis=1) & np.isfinite(Q).all(axis=(1, 2))
+    on &= (np.diagonal(Q, axis1=1, axis2=2) > 0).all(axis=1)
+    return {result.estimate.cameras[a].name: (values[a], Q[a]) for a in np.flatnonzero(on)}
+
+
+@dataclass(frozen=True)
+class Common:
+    """Correlation of an epoch with those that it was adjusted together with: C_12 = U_1 diag(signs) U_2'."""
+
+    given: tuple[str, ...]  # values that were given to several, g of them
+    columns: FloatArray  # U, those of the given values first, object unit, (3 k, q)
+    signs: FloatArray  # (q,)
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One epoch: a result, and what it was given."""
+
+    name: str
+    result: Solution
+    bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
+    control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
+    interior: tuple[tuple[str, str, float, float], ...] = ()  # camera, parameter, value and sigma observed
+    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
+    sigma0_px: float | None = None  # a posteriori of an image coordinate, the median; None where not known
+    common: Common | None = None  # with the other epochs, of those adjusted together
+
+
+Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, standard deviation, value
+
+
+def given_observations(epoch: Epoch) -> Iterator[tuple[str, Observed]]:
+    """Yield bars and coordinates of control that an epoch was given with a standard deviation, by name.
+
+    Args:
+        epoch: with its covariance, by whose rows the gradients count.
+    """
+    names, x = epoch.result.network.points, epoch.result.estimate.points
+    bars, row = epoch.bars, epoch.result.covariance_rows(np.arange(len(names)))
+    count: Counter[str] = Counter()
+    for i, j, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
+        if not (sigma > 0 and row[i] >= 0 and row[j] >= 0):
+            continue
+        key = f"bar {' - '.join(sorted((names[i], names[j])))}"
+        count[key] += 1
+        u = (x[j] - x[i]) / np.linalg.norm(x[j] - x[i])
+        gradient = [(3 * int(row[i]) + k, -float(u[k])) for k in range(3)]
+        gradient += [(3 * int(row[j]) + k, float(u[k])) for k in range(3)]
+        again = f" ({count[key]})" if count[key] > 1 else ""
+        yield key + again, (gradient, float(sigma), float(length))
+    control = epoch.control
+    for j, given, C in zip(control.point, control.xyz, control.covariance, strict=True):
+        for k in range(3):
+            if 0 < C[k, k] < np.inf and row[j] >= 0:
+                key = f"{'XYZ'[k]} of control point {names[j]}"
+                yield key, ([(3 * int(row[j]) + k, 1.0)], float(np.sqrt(C[k, k])), float(given[k]))

@@ -27,7 +27,7 @@ from sfm.adjustment.solve import adjust
 from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import FloatArray, IntArray
-from sfm.epochs.epoch import MAX_SAME_DIFFERENCE, Common, Epoch, given_observations
+from sfm.epochs.differences import MAX_SAME_DIFFERENCE, Common, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
 

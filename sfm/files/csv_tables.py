@@ -3,6 +3,10 @@
 Their size is bounded before memory is allocated, and every refusal names the line and the column.
 
 Source: RFC 4180.
+
+Object points written as a PLY point cloud in text form.
+
+Source: Turk, The PLY polygon file format (1994).
 """
 
 from __future__ import annotations
@@ -20,9 +24,11 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
-from sfm.errors import SurveyFileError
+from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
 
+SIGMAS = ("sx", "sy", "sz")
+COLOURS = ("red", "green", "blue")
 # Room for the largest networks that are adjusted here; memory grows with the rows, some 100 bytes each.
 MAX_TABLE_BYTES = 2_000_000_000
 MAX_ROWS = 20_000_000
@@ -287,3 +293,44 @@ def _number(cell: str, where: str) -> float:
     if abs(value) > MAX_NUMBER:
         raise SurveyFileError(f"{where} contains {text:.60}, needed a number of at most {MAX_NUMBER:g}")
     return value
+
+
+def write_ply(
+    path: Path,
+    xyz: FloatArray,
+    *,
+    names: tuple[str, ...] = (),
+    sigma: FloatArray | None = None,
+    colours: Sequence[tuple[int, int, int]] | None = None,
+    unit: str = "",
+) -> None:
+    """Write points; those with NaN are left out.
+
+    Args:
+        path: the file; whoever wants it whole or not at all gives one of `sfm.files.whole_files`.
+        xyz: coordinates, (n, 3).
+        names: of the points, which follow as comments "name <id>" in their order; none without.
+        sigma: standard deviations, (n, 3).
+        colours: red, green and blue of each point, 0 to 255.
+        unit: of lengths, for a comment.
+
+    Raises:
+        OutputError: a name has spaces that a comment does not keep.
+    """
+    if any(" ".join(name.split()) != name for name in names):
+        raise OutputError("PLY: names of points cannot begin or end with a space or have two in a row")
+    table = np.asarray(xyz) if sigma is None else np.hstack([xyz, sigma])
+    kept = np.flatnonzero(np.isfinite(table).all(axis=1)).tolist()
+    words = " ".join(unit.encode("ascii", "replace").decode().split())
+    lines = [
+        *("ply", "format ascii 1.0", f"comment kolinear, {words}" if words else "comment kolinear"),
+        *(f"comment name {names[j]}" for j in kept if names),
+        f"element vertex {len(kept)}",
+        *(f"property double {one}" for one in ("x", "y", "z", *(() if sigma is None else SIGMAS))),
+        *(f"property uchar {one}" for one in (COLOURS if colours else ())),
+        "end_header",
+    ]
+    for j in kept:
+        row = (*table[j].tolist(), *(colours[j] if colours else ()))
+        lines.append(" ".join(map(repr, row)))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -8,23 +8,69 @@ names, and written out in other texts.
 
 Source: OWASP, "CSV Injection"; Unicode Standard 15, property Default_Ignorable_Code_Point, and UAX 9 for
 bidirectional characters.
+
+JSON files read as untrusted: their size bounded, their content checked against a model before use.
+
+TOML files read as untrusted: what makes the standard library's parser slow is refused before it runs.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import tomllib
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import islice
-from typing import cast
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    StrictStr,
+    StringConstraints,
+    ValidationError,
+)
 
+from sfm.errors import SurveyFileError
+
+MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger is another file
+MAX_SAID = 200  # characters of the text of the parser
+MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
+# Usual mistakes in TOML: what the line looks like, and what to write.
+SLIPS = (
+    (
+        re.compile(r"=\s*(?:[-+]?\d+,\d+\s*(?:#.*)?$|\[[^\]\"']*\d,0\d)"),
+        "a number has a decimal point, not a comma",
+    ),
+    (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text must be in straight quotation marks, \" or '"),
+    (
+        re.compile(r'"[^"\n]*\\[^"\n]*"'),
+        "write / in a path, or put it between single quotation marks",
+    ),
+    (re.compile(r"=\s*(?:True|False|yes|no|on|off)\b", re.IGNORECASE), "write true or false"),
+    (
+        re.compile(r"^\s*\[{1,2}[^\]]*$|^\s*\[\[[^\]]*\][^\]]*$"),
+        "a section must be in [ ] or [[ ]]",
+    ),
+    (re.compile(r"=\s*(?:#.*)?$"), "no value follows the ="),
+    (re.compile(r"=\s*[^\W\d][^\"']*$"), "text must be in quotation marks"),
+    (re.compile(r"^[^=\[#]+$"), "neither a section in [ ] nor a key with = and its value"),
+)
+_SECTION = re.compile(r"^\s*\[{1,2}\s*([^\[\]]+?)\s*\]{1,2}\s*(?:#.*)?$")
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_KEY_PARTS}}}")
+MAX_JSON_BYTES = 100_000_000  # names of four million points, for which reading takes 2 GB
+MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor and no scan is larger
+MAX_PIXEL_MM = 1e3  # of a pixel; COLMAP's models without a size have 1 mm
 MAX_NAME = 500  # characters of a name that is read from a file
 BLOCK = 10_000  # rows that are written at a time
 SHOWN = 40  # characters of what was found that a message repeats
-
 # Invisible characters, and those that change how the text around them is seen: categories Cc, Cf, Cs, Zl and
 # Zp, and all else that is ignored by default.
 _HIDDEN = re.compile(
@@ -125,3 +171,134 @@ def _cell(value: object) -> str:
 def _text_cell(text: str) -> str:
     """Return the cell of a text; most are names of photographs that are in thousands of rows."""
     return _quoted(as_cell(as_plain(text)))
+
+
+def _plain(text: str) -> str:
+    if not is_plain(text):
+        raise ValueError("plain text without control or invisible characters")
+    return text
+
+
+Text = Annotated[StrictStr, StringConstraints(max_length=MAX_NAME), AfterValidator(_plain)]
+Name = Annotated[Text, StringConstraints(min_length=1)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX, strict=True)]
+Pixel = Annotated[FiniteFloat, Field(gt=0, le=MAX_PIXEL_MM, strict=True)]
+
+
+class Content(BaseModel):
+    """The part of a file that is read; the rest is ignored."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+ContentT = TypeVar("ContentT", bound=Content)
+
+
+def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
+    """Read a file.
+
+    Args:
+        path: the file.
+        content: what must be in it.
+        what: the file is, for the message.
+
+    Raises:
+        SurveyFileError: unreadable, too large, no JSON, or something in it is not what it must be.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_JSON_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_JSON_BYTES} are read")
+        return content.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValidationError as error:
+        raise SurveyFileError(_first_error(path, error, what)) from error
+
+
+def _first_error(path: Path, error: ValidationError, what: str) -> str:
+    """Say the first thing that is wrong: where, what was found, what is needed."""
+    first = error.errors(include_url=False)[0]
+    message = " ".join(first["msg"].split())
+    if first["type"] == "json_invalid":
+        line = re.search(r" at line (\d+) column \d+$", message)
+        number, reason = (line[1], message[: line.start()]) if line else ("1", message)
+        return f"{path}, line {number}: not {what} ({as_plain(reason)})"
+    place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"]).lstrip(".")
+    place = as_plain(place[:MAX_NAME])
+    if first["type"] == "missing":
+        return f"{path}: {place} is missing, which {what} needs"
+    found = " ".join(as_plain(repr(first["input"])[: SHOWN + 1]).split())
+    found = found if len(found) <= SHOWN else found[:SHOWN] + "..."
+    needed = message.removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"{path}: {place or 'the content'} is {found}, needed {needed}"
+
+
+def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple[str, dict[str, Any]]:
+    """Return the text of a file and its table.
+
+    Args:
+        path: the file.
+        what: it is, with its article, for messages.
+        repeated: sections of which a file may have several, each in [[ ]].
+
+    Raises:
+        SurveyFileError: unreadable, too large, or no TOML.
+    """
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would never end
+            raise SurveyFileError(f"{path}: not a file, {what} (TOML) is needed")
+        size = path.stat().st_size
+        if size > MAX_TOML_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, {what} has at most {MAX_TOML_BYTES}")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a byte order mark first
+    except OSError as error:
+        raise SurveyFileError(f"{path}: {what} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SurveyFileError(
+            f"{path}: not a text file in UTF-8 (byte {error.start}); save it as such"
+        ) from error
+    long = _LONG_KEY.search(text)
+    if long:
+        line = text.count("\n", 0, long.start()) + 1
+        raise SurveyFileError(f"{path}, line {line}: more than {MAX_KEY_PARTS} words joined by dots")
+    try:
+        return text, tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SurveyFileError(f"{path}{_slip(text, str(error), repeated)}") from error
+    except (ValueError, RecursionError) as error:
+        reason = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
+        raise SurveyFileError(f"{path}: not a TOML file: {reason}") from error
+
+
+def _slip(text: str, message: str, repeated: Collection[str]) -> str:
+    """Return where and what is wrong in words; the text of the parser where it is nothing usual."""
+    found = re.search(r"\(at line (\d+), column \d+\)$", message)
+    number = int(found[1]) if found else 0
+    line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
+    if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
+        return f", line {number}: {_doubled(text.splitlines(), number, section[1], repeated)}"
+    if message.startswith("Cannot overwrite a value"):
+        return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} is there twice"
+    for looks, write in SLIPS if len(line) <= MAX_SAID else ():
+        if looks.search(line):
+            return f", line {number}: {as_plain(line.strip())}: {write}"
+    return f": not a TOML file: {_cut(message)}"
+
+
+def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
+    """Return where a section that is there twice is first, and what to write."""
+    found = (_SECTION.match(one) for one in lines[: number - 1])
+    first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
+    shown = as_plain(name[:MAX_SAID])
+    where = "" if first is None else f", first in line {first}"
+    write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"
+    return f"[{shown}] is there twice{where}; {write}"
+
+
+def _cut(message: str) -> str:
+    """Return the text of the parser without the middle of a long key; the place comes last."""
+    kept = (
+        message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
+    )
+    return as_plain(kept)

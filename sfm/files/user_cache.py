@@ -1,6 +1,8 @@
 """Folders in the user's cache: files that the program may trust later lie here, where no one else can write.
 
 They may be removed at any time.
+
+Folders in the temporary folder for what a run sets aside; those that a killed run left are removed.
 """
 
 from __future__ import annotations
@@ -8,14 +10,19 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
 from sfm.errors import OutputError
+from sfm.files.open_folders import locked
 
+PREFIX = "kolinear-scratch-"
+LOCK = ".lock"
 KEPT_SECONDS = 90 * 86400  # entries not asked for are removed then
 WRITING_SECONDS = 86400  # what is half-written for longer was left by a killed run
 
@@ -63,3 +70,38 @@ def remove_unused(folder: Path) -> None:
                     shutil.rmtree(path)
             elif age > KEPT_SECONDS:
                 path.unlink()
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make an empty folder of this user alone, which is gone afterwards; after a kill, when the next begins.
+
+    Yields:
+        Path of the folder.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    remove_abandoned()
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX)).resolve()
+    try:
+        with locked(folder / LOCK):
+            (folder / "files").mkdir()
+            yield folder / "files"
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_abandoned() -> None:
+    """Remove this user's scratch folders whose run has ended: their lock is free."""
+    for folder in Path(tempfile.gettempdir()).resolve().glob(f"{PREFIX}*"):
+        with suppress(OSError, OutputError):  # another user's, or at work
+            status = folder.lstat()
+            if not stat.S_ISDIR(status.st_mode) or (hasattr(os, "geteuid") and status.st_uid != os.geteuid()):
+                continue
+            if (folder / LOCK).exists():
+                with locked(folder / LOCK):
+                    shutil.rmtree(folder / "files", ignore_errors=True)
+            elif time.time() - status.st_mtime < WRITING_SECONDS:  # a run is just making it
+                continue
+            shutil.rmtree(folder, ignore_errors=True)

@@ -24,8 +24,7 @@ from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.geometry.functions import joined
-from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of
+from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of, joined
 from sfm.similarity import Similarity, fit_similarity, similarity_motions
 
 ITERATIONS = 50

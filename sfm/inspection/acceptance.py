@@ -19,8 +19,7 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError, UnknownNameError
 from sfm.files.csv_tables import read_table
-from sfm.geometry.functions import distance, point_function
-from sfm.geometry.measured import measured_points
+from sfm.geometry.measured import distance, measured_points, point_function
 from sfm.geometry.tolerance import COVERAGE, OUT, UNDECIDED, UNKNOWN, decide
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge

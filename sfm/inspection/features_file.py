@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError
 
 from sfm.errors import SurveyFileError
-from sfm.files.toml_files import read_toml
+from sfm.files.plain_text import read_toml
 from sfm.geometry.shapes.kinds import KINDS
-from sfm.survey.inputs.checks.settings_errors import first_error
-from sfm.survey.inputs.settings import LARGEST, Length, Name, Section, Value
+from sfm.survey.inputs.settings import LARGEST, Length, Name, Section, Value, first_error
 from sfm.survey.inputs.survey_file import inside
 
 MAX_ENTRIES = 10_000  # of one kind

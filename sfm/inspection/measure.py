@@ -16,17 +16,19 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
-from sfm.geometry.functions import (
+from sfm.geometry.measured import (
+    Function,
+    MeasuredPoints,
     angle_at,
     angle_of_directions,
     difference,
     distance,
     distance_from_axis,
     height,
+    measured_points,
     point_function,
+    with_hidden_point,
 )
-from sfm.geometry.hidden_points import with_hidden_point
-from sfm.geometry.measured import Function, MeasuredPoints, measured_points
 from sfm.geometry.mesh import Mesh
 from sfm.geometry.shapes.fit import ShapeFit, fit_shape
 from sfm.geometry.tolerance import (

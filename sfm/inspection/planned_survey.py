@@ -17,20 +17,19 @@ from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import array_table, read_table
-from sfm.files.json_files import Content, Name, Text, read_json
 from sfm.files.open_folders import refuse_links_out
-from sfm.files.plain_text import csv_text
-from sfm.files.rig_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
+from sfm.files.plain_text import Content, Name, Text, csv_text, read_json
+from sfm.files.result_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
 from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
 from sfm.observations import TABLES
 from sfm.observations.mounts import MountObservations
-from sfm.planning.contributions import open_motions
+from sfm.planning.prediction import simulate_network
 from sfm.planning.stations import Stations
+from sfm.planning.weakness import open_motions
 from sfm.rendering.planned_targets import INK, PAPER, write_planned_photographs
 from sfm.rendering.scene import UNCODED, Optics
 from sfm.result import SurveyResult
 from sfm.similarity import fit_motions, fit_similarity
-from sfm.simulated_network import simulate_network
 from sfm.solution import Solution
 from sfm.survey.observation_tables import ObservationTable, observation_table, with_tables
 from sfm.targets.codes.families import code_family

@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
-from sfm.kernels.options import compiled_fused
+from sfm.kernels.compiling import compiled_fused
 
 MAX_ROOTS = 8  # four roots, each of which may be reported once more as a touching turning point
 TOUCH = 1e-9  # |f| at a turning point over sum |coefficient| below which it counts as a double root

@@ -12,7 +12,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled, compiled_fast, inlined_fast
+from sfm.kernels.compiling import compiled, compiled_fast, inlined_fast
 
 NEAREST, BILINEAR, BICUBIC, SIX_TAP = 0, 1, 2, 3
 INTERPOLATIONS = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC, "six_tap": SIX_TAP}

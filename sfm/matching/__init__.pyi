@@ -20,6 +20,6 @@ from sfm.matching.tracks.correspondence import match_targets as match_targets
 from sfm.matching.tracks.feature_tracks import TiePoints as TiePoints
 from sfm.matching.tracks.feature_tracks import find_tie_points as find_tie_points
 from sfm.matching.tracks.interest import InterestPoints as InterestPoints
+from sfm.matching.tracks.interest import NaturalPoints as NaturalPoints
 from sfm.matching.tracks.interest import foerstner_points as foerstner_points
-from sfm.matching.tracks.natural_points import NaturalPoints as NaturalPoints
-from sfm.matching.tracks.natural_points import natural_points as natural_points
+from sfm.matching.tracks.interest import natural_points as natural_points

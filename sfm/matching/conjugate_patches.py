@@ -14,13 +14,16 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.sampling import AFTER, BEFORE
-from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
-from sfm.matching.correlation.ncc import NccMatches, match_ncc
-from sfm.matching.correlation.warped import match_ncc_warped
-from sfm.matching.lsm.patch_equations import MARGIN
-from sfm.matching.lsm.plane_windows import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
+from sfm.matching.correlation.ncc import (
+    NccMatches,
+    ambiguous,
+    independent_pixels,
+    match_ncc,
+    match_ncc_warped,
+)
+from sfm.matching.lsm.patch_equations import MARGIN, linear_part
+from sfm.matching.lsm.surface_planes import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.lsm.warp import linear_part
 from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
 from sfm.matching.radiometry import equalise_histogram, grey_of
 

@@ -7,7 +7,7 @@ import numpy as np
 from sfm.arguments import check_indices, checked_arguments
 from sfm.camera import project, ray_directions, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, skew
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.network import Estimate
 
 VERTICES = 65  # of a path; between them distortion bends it by less than 0.1 px on ordinary lenses

@@ -13,10 +13,9 @@ from sfm.observations.height_differences import HeightDifferences
 from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import TableKind
 from sfm.observations.level_groups import LevelGroups
-from sfm.observations.lines import Lines
 from sfm.observations.offset_distances import OffsetDistances
 from sfm.observations.planes import Planes
-from sfm.observations.plumb_lines import PlumbLines
+from sfm.observations.plumb_lines import Lines, PlumbLines
 from sfm.observations.relative_orientations import RelativeOrientations
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.zenith_angles import ZenithAngles

@@ -2,12 +2,12 @@
 
 from sfm.orientation.absolute import AbsoluteOrientation as AbsoluteOrientation
 from sfm.orientation.absolute import orient_absolute as orient_absolute
-from sfm.orientation.coplanarity import refine_coplanarity as refine_coplanarity
 from sfm.orientation.incremental.sequence import Orientation as Orientation
 from sfm.orientation.incremental.sequence import orient as orient
 from sfm.orientation.intersection import Intersection as Intersection
 from sfm.orientation.intersection import intersect as intersect
 from sfm.orientation.relative import RelativeOrientation as RelativeOrientation
+from sfm.orientation.relative import refine_coplanarity as refine_coplanarity
 from sfm.orientation.relative import relative_orientations as relative_orientations
 from sfm.orientation.resection.candidates import LineFit as LineFit
 from sfm.orientation.resection.candidates import ResectionSolution as ResectionSolution

@@ -1,4 +1,7 @@
-"""Rays of the image points of a network, and the object points in which they meet."""
+"""Rays of the image points of a network, and the object points in which they meet.
+
+Angles at which the rays of object points meet.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate, ImagePoints, rows_of
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.intersection import Intersection, intersect
+
+MAX_PAIRS = 4_000_000  # of rays that are compared at a time
 
 
 def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera]) -> FloatArray:
@@ -70,3 +75,30 @@ def _along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
     x = np.column_stack([one, 0 * one, u])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.asarray(rotation @ np.stack([x, np.cross(z, x), z], axis=2))
+
+
+def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:
+    """Return the largest angle between two rays of each point, deg, NaN with fewer than two, (n,).
+
+    Rays that meet head on are as parallel as those side by side, so that no angle is above 90 degrees.
+
+    Args:
+        network: of k image points and n points.
+        estimate: of the same, all that is used determined.
+        used: image points whose rays count, (k,).
+    """
+    seen = network.image_points.select(used)
+    order = np.argsort(seen.point, kind="stable")
+    image, point = seen.image[order], seen.point[order]
+    ray = estimate.points[point] - estimate.position[image]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    count = np.bincount(point, minlength=len(network.points))
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    angle = np.full(len(network.points), np.nan)
+    for r in np.unique(count[count >= 2]):
+        points = np.flatnonzero(count == r)
+        for some in np.array_split(points, 1 + len(points) * r * r // MAX_PAIRS):
+            u = ray[first[some][:, None] + np.arange(r)]
+            sine = np.sqrt(np.maximum(1 - np.einsum("nia,nja->nij", u, u) ** 2, 0))
+            angle[some] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))
+    return angle

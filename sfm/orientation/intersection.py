@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.arguments import check_indices, checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_scaled
 
 MAX_STEPS = 20

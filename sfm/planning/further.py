@@ -20,12 +20,10 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
-from sfm.planning.design.candidates import Candidates, StationLimits, candidates
-from sfm.planning.design.gain import gains, image_rows
+from sfm.planning.design.candidates import Candidates, StationLimits, candidates, gains, image_rows
 from sfm.planning.planned_object import PlannedObject
-from sfm.planning.shots import Shot, shots
 from sfm.planning.sight.visibility import Seeing
-from sfm.planning.stations import Stations
+from sfm.planning.stations import Shot, Stations, shots
 from sfm.runtime.progress import report_step
 
 DISTANCES = (0.8, 1.2)  # of those that the survey was photographed from
@@ -73,7 +71,7 @@ def further_photographs(
     Raises:
         GeometryError: fewer than 2 photographs or 3 points, no count, or nothing is seen from there.
 
-    Source: Fedorov (1972); limiting error propagation, see `sfm.planning.design.gain`.
+    Source: Fedorov (1972); limiting error propagation, see `sfm.planning.design.candidates`.
     """
     if count < 1:
         raise GeometryError(f"plan: {counted(count, 'further photograph')}, needed 1 or more")

@@ -6,12 +6,14 @@ with the mean scale number S, k photographs from each station, and q that states
 
 Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
 Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.
+
+A network as it would be measured: image points and observations of every kind from true values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,18 +22,17 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.arguments import checked_arguments
-from sfm.camera import Camera
+from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of, values_of
 from sfm.observations.groups import Group
-from sfm.orientation.ray_angles import ray_angles
+from sfm.orientation.image_rays import ray_angles
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations
 from sfm.similarity import similarity_motions
-from sfm.simulated_network import simulate_network
 
 MIN_POINTS = 4  # that a photograph must show to be oriented
 MAX_OFF_SIGMAS = 5.0  # of what is planned from what its observations state, as of points from a line
@@ -326,3 +327,45 @@ def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBar
         return ScaleBars()
     rows = np.array(found)
     return ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
+
+
+@checked_arguments()
+def simulate_network(
+    network: Network, truth: Estimate, rng: np.random.Generator | None = None
+) -> tuple[Network, Estimate]:
+    """Return a network with the values that a truth gives, and the truth.
+
+    Args:
+        network: gives what is measured, and how precisely; its values do not matter, but for coordinates
+            of rigid frames and offsets, which are near what they will be.
+        truth: true values of all unknowns.
+        rng: source of the errors, normally distributed with the covariances stated; no errors if None.
+
+    Returns:
+        The network, and the truth; its points on lines are moved onto the line and off it by the errors that
+        the observations state, unless there are none.
+    """
+    if rng is not None:
+        for kind in network.kinds:
+            truth = replace(truth, points=kind.displaced(values_of(truth), rng))
+    seen = network.image_points
+    xy = np.empty(seen.xy.shape)
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
+        camera = truth.cameras[network.camera[i]]
+        xy[rows] = project(camera, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+    if rng is not None:
+        root = np.linalg.cholesky(seen.covariance)
+        xy += np.einsum("kab,kb->ka", root, rng.standard_normal(xy.shape))
+    values = values_of(truth)
+    return (
+        replace(
+            network,
+            image_points=replace(seen, xy=xy),
+            control=network.control.simulated(values, rng),
+            scale_bars=network.scale_bars.simulated(values, rng),
+            exterior=network.exterior.simulated(values, rng),
+            interior=network.interior.simulated(values, rng),
+            observations=tuple(kind.simulated(values, rng) for kind in network.observations),
+        ),
+        truth,
+    )

@@ -20,10 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import METRES
+from sfm.conventions import METRES, finer_unit
 from sfm.display import agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
-from sfm.units import finer_unit
 
 # Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
 # coordinates, and where it is the root mean square of all, nothing of a result is right.

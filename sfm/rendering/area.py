@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.rendering.scene import ARC, DISC, RECTANGLE
 
 # An edge counts as straight within this part of a cell; an arc of 4 px radius departs by 1e-3 px there.

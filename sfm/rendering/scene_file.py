@@ -14,7 +14,7 @@ from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
-from sfm.files.toml_files import read_toml
+from sfm.files.plain_text import read_toml
 from sfm.rendering.scene import (
     UNCODED,
     CircularTargets,

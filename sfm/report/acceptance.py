@@ -7,7 +7,7 @@ import numpy as np
 from sfm.display import counted
 from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import Acceptance
-from sfm.report.figures.measurements import length_error_figure
+from sfm.report.figures.comparisons import length_error_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import general, signed, significant
 from sfm.report.page import Column, Note, Page, Section, Table, facts

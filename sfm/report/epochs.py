@@ -11,12 +11,10 @@ import numpy as np
 from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
-from sfm.epochs.blocks import BlockMotion
 from sfm.epochs.displacements import Displacements
-from sfm.epochs.findings import verdict_of_epochs
-from sfm.epochs.series import EpochPair, EpochSeries
+from sfm.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
 from sfm.report.figures.comparisons import difference_figure, plot_series
-from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plot_process import Plot
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import finer_unit, general, significant
 from sfm.report.page import (
@@ -33,7 +31,7 @@ from sfm.report.page import (
     axes,
     values_of,
 )
-from sfm.report.viewer.product_scenes import displacements_viewer
+from sfm.report.viewer.solution_scene import displacements_viewer
 
 MAX_NAMED = 12  # points in a sentence
 PICTURE = (

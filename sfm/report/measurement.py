@@ -16,7 +16,7 @@ from sfm.geometry.alignment import Alignment
 from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
 from sfm.inspection.measure import Measurement
-from sfm.report.figures.measurements import deviation_figure
+from sfm.report.figures.comparisons import deviation_figure
 from sfm.report.figures.plots import plot
 from sfm.report.numbers import fixed, general, signed, significant, with_sigma
 from sfm.report.page import (
@@ -33,7 +33,7 @@ from sfm.report.page import (
     facts,
     values_of,
 )
-from sfm.report.viewer.product_scenes import measurement_viewer
+from sfm.report.viewer.solution_scene import measurement_viewer
 from sfm.solution import Solution
 
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import SUPERSCRIPTS, FloatArray
+from sfm.conventions import finer_unit as finer_unit
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
-from sfm.units import SUPERSCRIPTS
-from sfm.units import finer_unit as finer_unit
 
 MIN_PLAIN_VALUE = 1e-3  # below it parameters are written with an exponent
 ROUNDING = 1e-10  # standard deviation over the value that is none

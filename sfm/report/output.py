@@ -1,30 +1,45 @@
-"""The folder of a result: written beside its place, then put there by one rename, or not at all."""
+"""The folder of a result: written beside its place, then put there by one rename, or not at all.
+
+Survey file and photographs of the result in a folder, which no other survey replaces unseen.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import counted, listed
+from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import ARRAYS, POINTS_NAME, write_covariance
 from sfm.files.covariance_file import NAME as POINT_COVARIANCE
+from sfm.files.csv_tables import read_table
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
-from sfm.files.result_tables import TABLES
-from sfm.files.rig_tables import MOMENTS, MOUNTS
+from sfm.files.plain_text import Content, Name, read_json
+from sfm.files.result_tables import MOMENTS, MOUNTS, TABLES
 from sfm.files.whole_files import whole_folder
+from sfm.kernels.threads import give_back_memory
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
-from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
-from sfm.report.figures.plot_process import PlotProcess, draw_plots
+from sfm.report.figures.plot_process import (
+    EpipolarMap,
+    PlotCamera,
+    PlotData,
+    PlotProcess,
+    ProjectionMap,
+    draw_plots,
+)
 from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.findings import Findings, with_remark
 from sfm.report.findings.precision import adjusted_sigmas, root_mean_square
+from sfm.report.log import LOG, read_log
 from sfm.report.numbers import finer_unit
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
@@ -34,11 +49,9 @@ from sfm.report.viewer.embedded import viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
 from sfm.report.viewer.solution_scene import scene_of_result
 from sfm.result import StageTime
-from sfm.runtime.memory import give_back_memory
 from sfm.runtime.progress import SILENT, Progress
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
-
 WRITTEN = (
     *(
         "summary.json",
@@ -203,3 +216,86 @@ def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
     r = adjustment.redundancy_numbers[used]
     sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
     return np.asarray((adjustment.residuals[used] / sigma).ravel())
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of a result: the files that it was computed from."""
+
+    file: Path  # the survey file
+    images: Path  # folder of the photographs
+
+    def written(self, out: Path) -> dict[str, str]:
+        """Return the paths from the folder of the result, which stay true where all are moved together."""
+        return {"survey_at": path_from(out, self.file), "images_at": path_from(out, self.images)}
+
+
+def read_origin(out: Path) -> Origin | None:
+    """Return of what the result in a folder is; None without a result that states it."""
+    try:
+        lines = read_log(out / LOG)
+    except OSError:
+        return None
+    begun = next((line for line in lines if line.get("event") == "start"), {})
+    file, images = begun.get("survey_at"), begun.get("images_at")
+    if not isinstance(file, str) or not isinstance(images, str):
+        return None
+    return Origin(out / file, out / images)
+
+
+class _Summary(Content):
+    """The part of summary.json that is read."""
+
+    survey: Name
+
+
+def refuse_other_origin(out: Path, origin: Origin, *, survey: str = "", photographs: bool = True) -> None:
+    """Raise OutputError where a folder has the result of another survey file or of other photographs.
+
+    A result that does not state its origin, as one that a script wrote, is another's if it has another name,
+    or none of the photographs.
+
+    Args:
+        out: the folder.
+        origin: of what is to be written there.
+        survey: its name, where it is known.
+        photographs: whether it is of photographs.
+    """
+    earlier = read_origin(out)
+    if earlier is None:
+        try:
+            name = read_json(out / "summary.json", _Summary, "the summary of a result").survey
+        except SurveyFileError:
+            return  # no result
+        try:
+            images = read_table(out / "images.csv", ("image",), (), ignored=None).texts[0]
+        except SurveyFileError:
+            images = ()
+        other_name = bool(survey) and name != survey
+        present = any((origin.images / one).is_file() for one in images)
+        if other_name or (photographs and not present):
+            of = f"{counted(len(images), 'photograph')} ({listed(images)})"
+            what = of if images else "no table of photographs"
+            raise OutputError(
+                f"{out}: has the result of survey {name} with {what}, which --overwrite replaces; "
+                "--out names another folder"
+            )
+        return
+    for what, there, here in (
+        ("the survey", earlier.file, origin.file),
+        ("the photographs in", earlier.images, origin.images),
+    ):
+        if os.path.realpath(there) != os.path.realpath(here):
+            raise OutputError(
+                f"{out}: has the result of {what} {os.path.normpath(there)}, which --overwrite replaces; "
+                "--out names another folder"
+            )
+
+
+def path_from(folder: Path, path: Path) -> str:
+    """Return a path from a folder, which stays true where both are moved together."""
+    folder, path = Path(os.path.realpath(folder)), Path(os.path.realpath(path))
+    try:
+        return os.path.relpath(path, folder)
+    except ValueError:  # on another drive
+        return str(path)

@@ -1,17 +1,55 @@
-"""The pages of the program: a row for each, and how one is written with its files."""
+"""The pages of the program: a row for each, and how one is written with its files.
+
+A declared page as HTML, with everything that it shows inside it, and its Content-Security-Policy.
+
+Names, reasons and remarks in a page come from files of strangers. The template escapes them; should that ever
+fail somewhere, a browser still refuses any script, style or address that is not in the policy.
+
+Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
+
+A declared page as plain text: tables in columns, facts and sentences in lines, the first rows of each.
+
+Figures, notes, and what a click unfolds on the page are left out, unless it is declared to be in texts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import base64
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, cast
+from urllib.parse import quote
 
-from sfm.files.folder_lock import locked
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from sfm.display import NO_BREAK, bound
+from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_folder
-from sfm.report.html import html
-from sfm.report.page import Page
+from sfm.report.figures.plot_process import Plot
+from sfm.report.numbers import is_number
+from sfm.report.page import (
+    Cards,
+    FoldedParts,
+    Heading,
+    Note,
+    Page,
+    Paragraph,
+    Part,
+    Subheading,
+    Table,
+    one_line,
+)
 
+WIDTH = 100
+MAX_ROWS = 10  # of a table
+NAME_WIDTH = 36  # of what a fact is about, at most
+MARGIN = "  "
+NOTHING = "'none'"
 PAGES: Mapping[str, str] = {
     "Acceptance": "sfm.report.acceptance",
     "EpochSeries": "sfm.report.epochs",
@@ -75,3 +113,140 @@ def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None
             if also is not None:
                 also(folder)
     return out / page.path
+
+
+def html(page: Page) -> str:
+    """Return a page as HTML."""
+    style, script = source("report.css"), source("tables.js")
+    policy = content_policy(
+        [style, page.viewer.style] if page.viewer else [style],
+        [page.viewer.script, script] if page.viewer else [script],
+        pictures_beside=page.pictures_beside,
+    )
+    parts = {"style": Markup(style), "tables_script": Markup(script), "policy": policy}
+    return _template().render(page=page, **parts)
+
+
+def data_url(data: bytes, kind: str) -> str:
+    """Return a picture as an address that contains it."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+@cache
+def source(name: str) -> str:
+    """Return the style sheet or the script of all pages."""
+    return files("sfm.report").joinpath(f"templates/{name}").read_text(encoding="utf-8")
+
+
+@cache
+def _template() -> Template:
+    """Return the template of all pages: it escapes texts, and a name that is not defined is an error."""
+    made = Environment(
+        loader=PackageLoader("sfm.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"bound": bound, "data_url": data_url, "quoted": quote}
+    made.tests["numeric"] = lambda cell: is_number(str(cell))
+    return made.get_template("page.html")
+
+
+def content_policy(
+    styles: Sequence[str], scripts: Sequence[str] = (), *, pictures_beside: bool = False
+) -> str:
+    """Return the policy of a page with these style sheets and scripts inside it, and pictures as data URLs.
+
+    Attributes `style` and `on...` are allowed nowhere: they would need 'unsafe-inline'.
+
+    Args:
+        styles: content of each style element, to the letter.
+        scripts: content of each script element that is run, to the letter.
+        pictures_beside: whether it shows pictures that lie beside it, which the policy calls 'self'.
+    """
+    allowed = {
+        "default-src": [NOTHING],
+        "img-src": ["data:", "'self'"] if pictures_beside else ["data:"],
+        "style-src": [_hash(text) for text in styles],
+        "script-src": [_hash(text) for text in scripts],
+        "base-uri": [NOTHING],
+        "form-action": [NOTHING],
+    }
+    return "; ".join(" ".join((name, *(sources or [NOTHING]))) for name, sources in allowed.items())
+
+
+def _hash(text: str) -> str:
+    """Return the source expression that allows one element by its content."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def text(page: Page) -> str:
+    """Return a page as text of at most `WIDTH` columns."""
+    lines = [f"KOLINEAR  {one_line(page.title)}"[:WIDTH], "=" * WIDTH]
+    lines += wrapped(one_line(page.verdict.headline), behind=0)
+    for one in page.verdict.lines:
+        lines += wrapped(one_line(f"- {one.severity}: {one.text} {one.remedy}"), behind=2)
+    for section in page.sections:
+        found = list(_lines(section.parts)) if section.in_text else []
+        if found:
+            lines += ["", f"{section.title} ".ljust(WIDTH, "="), *found]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(parts: Iterable[Part]) -> Iterator[str]:
+    heading: list[str] = []  # written before what is below it
+    for part in parts:
+        found: list[str] = []
+        match part:
+            case Plot() | Note() | Cards():
+                continue
+            case Heading():
+                heading = ["", f"{one_line(part.text)} ".ljust(WIDTH, "-")]
+            case Subheading():
+                heading += ["", *wrapped(MARGIN + one_line(part.text), behind=4)]
+            case FoldedParts():
+                found = list(_lines(part.parts)) if part.in_text else []
+            case Paragraph():
+                found = wrapped(MARGIN + one_line(part.text), behind=4)
+            case Table():
+                found = _facts(part) if part.facts else _table(part)
+        if found:
+            yield from (*heading, *found)
+            heading = []
+
+
+def _facts(table: Table) -> list[str]:
+    rows = [[one_line(str(cell)) for cell in row] for row in table.cells]
+    width = min(max((len(name) for name, _ in rows), default=0), NAME_WIDTH)
+    return [
+        line
+        for name, words in rows
+        for line in wrapped(f"{MARGIN}{name:<{width}}  {words}", behind=width + 4)
+    ]
+
+
+def _table(table: Table) -> list[str]:
+    """Return the first rows in columns; each as a sentence where the columns are too wide."""
+    lines = [MARGIN + line for line in table.lines(MAX_ROWS)]
+    if max(map(len, lines)) > WIDTH:
+        before = ["" if one.format is None else f"{one.heading} " for _, one in table.shown]
+        rows = ([one_line(str(cell)) for cell in row] for row in table.first(MAX_ROWS))
+        named = ([b + cell for b, cell in zip(before, row, strict=True) if cell] for row in rows)
+        sentences = (f"{MARGIN}{name}: {'; '.join(cells)}" for name, *cells in named)
+        lines = [line for one in sentences for line in wrapped(one, behind=4)]
+    if len(table.rows) > MAX_ROWS:
+        where = f", in {table.source}" if table.source else ""
+        lines.append(f"{MARGIN}and {len(table.rows) - MAX_ROWS} more{where}")
+    return lines
+
+
+def wrapped(line: str, *, behind: int) -> list[str]:
+    """Return a line broken between words, not before a unit; the others begin behind so many spaces."""
+    lines, rest = [], bound(line.rstrip())
+    while len(rest) > WIDTH:
+        cut = rest.rfind(" ", behind + 1, WIDTH)
+        cut = WIDTH if cut < 0 else cut
+        lines.append(rest[:cut])
+        rest = " " * behind + rest[cut:].strip()
+    return [one.replace(NO_BREAK, " ") for one in (*lines, rest)]

@@ -12,18 +12,15 @@ from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
-from sfm.files.rig_tables import IN_FILES
+from sfm.files.result_tables import IN_FILES
 from sfm.observations import TABLES
 from sfm.observations.mounts import MountObservations
 from sfm.observations.scale_bars import ScaleBars
-from sfm.planning.contributions import Contribution
-from sfm.planning.findings import verdict_of_plan
-from sfm.planning.plan import Plan
-from sfm.planning.shots import Shot
+from sfm.planning.plan import Plan, verdict_of_plan
 from sfm.planning.sight import MIN_PIXELS
-from sfm.planning.stations import Stations
+from sfm.planning.stations import Shot, Stations
 from sfm.planning.wanted import ALPHA, found_displacement
-from sfm.planning.weakness import Calibratability
+from sfm.planning.weakness import Calibratability, Contribution
 from sfm.report.findings.rigs import rigs_of
 from sfm.report.numbers import (
     NOT_DETERMINED,
@@ -53,7 +50,7 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import NORMAL_95, describe_rigs
 from sfm.report.tables.summary import summary_of_rigs
-from sfm.report.viewer.product_scenes import plan_viewer
+from sfm.report.viewer.solution_scene import plan_viewer
 
 MAX_NAMED = 12  # weak points that are listed
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")

@@ -11,7 +11,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
 from sfm.display import agreeing, counted
 from sfm.remarks.verdict import judge
-from sfm.report.findings.given_residuals import given_of
+from sfm.report.findings.bundle_statistics import given_of
 from sfm.report.findings.precision import rms_of_groups, standard_deviations
 from sfm.report.given import given_parts
 from sfm.report.numbers import general, significant

@@ -10,9 +10,9 @@ from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlat
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.files.result_tables import VARIANCE_COMPONENTS
+from sfm.report.findings.bundle_statistics import WEAK_DEG, Coverage, Geometry
+from sfm.report.findings.calibrated_cameras import InteriorParameter
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
-from sfm.report.findings.interior_parameters import InteriorParameter
 from sfm.report.given import given_parts
 from sfm.report.numbers import (
     finer_unit,

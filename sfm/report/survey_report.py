@@ -16,7 +16,7 @@ from sfm.display import agreeing, counted, program_name
 from sfm.files.result_tables import LEFT_OUT
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
-from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plot_process import Plot
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, fixed, or_fixed, significant, to_precision
 from sfm.report.page import (
@@ -38,6 +38,7 @@ from sfm.report.page import (
     columns_of,
     facts,
 )
+from sfm.report.pages import text, wrapped
 from sfm.report.phrases import (
     NORMAL_95,
     describe_calibration,
@@ -47,7 +48,6 @@ from sfm.report.phrases import (
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.tables.csv_files import left_out_rows, table_stems
-from sfm.report.text import text, wrapped
 from sfm.report.viewer.embedded import Viewer
 from sfm.result import likest_first
 

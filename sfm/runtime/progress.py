@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
 
+from sfm.kernels.threads import give_back_memory, share_freed_memory
 from sfm.runtime.faults import working_on
-from sfm.runtime.memory import give_back_memory, share_freed_memory
 
 T = TypeVar("T")
 

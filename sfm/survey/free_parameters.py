@@ -25,7 +25,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.inputs.interior import split_cameras
+from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 

@@ -2,5 +2,5 @@
 
 from sfm.targets.detect import Targets as Targets
 from sfm.targets.detect import find_targets as find_targets
-from sfm.targets.fits.edge_ellipse import EdgeEllipses as EdgeEllipses
-from sfm.targets.fits.edge_ellipse import measure_edge_ellipses as measure_edge_ellipses
+from sfm.targets.fits.centroid import EdgeEllipses as EdgeEllipses
+from sfm.targets.fits.centroid import measure_edge_ellipses as measure_edge_ellipses

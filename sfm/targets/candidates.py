@@ -7,10 +7,9 @@ import math
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import bilinear
-from sfm.targets.codes.ring_reading import UNCODED
-from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.rings import UNCODED, CodeFamily
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.blurred_ellipse import BLUR
 from sfm.targets.fits.undamaged import MIN_RADIUS_PX, unlike_targets

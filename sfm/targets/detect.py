@@ -24,12 +24,10 @@ from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_
 from sfm.targets.codes.dot_plates import name_dots, rings_among
 from sfm.targets.codes.families import TargetFamily, code_family
 from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup, plates_of
-from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
-from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.rings import UNCODED, UNREADABLE, CodeFamily, read_codes
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
-from sfm.targets.fits.centroid import WEIGHTS, measure_centroids
+from sfm.targets.fits.centroid import WEIGHTS, measure_centroids, measure_edge_ellipses
 from sfm.targets.fits.concentric import BACKGROUND, BLUR, CONTRAST
-from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
 from sfm.targets.fits.saddle import Saddles
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_covariance, axes_from_shape, fit_ellipse_model

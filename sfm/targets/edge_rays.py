@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.cholesky import solve_symmetric
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import bilinear
+from sfm.kernels.small_algebra import solve_symmetric
 
 RAYS = 32
 # Spacing of the samples on a ray.

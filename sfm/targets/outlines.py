@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.targets.flags import Flag
 
 # The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is seen up to half of

@@ -15,8 +15,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.orientation.coplanarity import UNKNOWNS, refine_coplanarity, turned_pair
-from sfm.orientation.relative import relative_orientations
+from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
 
 DIFFERENCE = 1e-6  # rad, of central differences: their error is some 1e-12 of the derivative
 NO_BX = 1e-6  # of the base: below it by and bz cannot be counted at a given bx

@@ -15,7 +15,7 @@ from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import MOVED
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.score import Reduced, gain_of, reduce_adjustment
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
+from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray

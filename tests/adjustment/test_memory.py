@@ -14,11 +14,12 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed import observed_of
-from sfm.adjustment.engine.solvers import choice, memory
+from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers import protocol as memory
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.fronts import pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
-from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
@@ -97,7 +98,7 @@ def test_a_container_may_have_less_memory_than_the_computer(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of a process")
 def test_a_process_may_have_less_memory_than_the_computer() -> None:
-    told = "from sfm.adjustment.engine.solvers.memory import available_bytes as a; print(a())"
+    told = "from sfm.adjustment.engine.solvers.protocol import available_bytes as a; print(a())"
     limited = f"ulimit -v 3000000; exec {sys.executable} -c '{told}'"
     done = subprocess.run(["sh", "-c", limited], capture_output=True, text=True, check=True)
     assert float(done.stdout) <= memory.SHARE * 3000000 * 1024

@@ -17,10 +17,9 @@ from sfm.adjustment.engine.normals import MIN_HALVED_POINTS, Equations
 from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
-from sfm.adjustment.engine.solvers.fronts import LEAF, dissect
+from sfm.adjustment.engine.solvers.fronts import LEAF, dissect, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.multifrontal_factor import MultifrontalFactor
-from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import null_motions

@@ -16,10 +16,9 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.report.findings.findings import findings_of
-from sfm.report.pages import html_of
+from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
-from sfm.report.text import WIDTH
 from sfm.result import SurveyResult
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from sfm.adjustment.quality.projection import observed_part, projection_covariance, projection_map
+from sfm.adjustment.quality.correlations import observed_part, projection_covariance, projection_map
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, rotation_from_vector
 from tests.synthetic import seed_of

@@ -12,7 +12,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import rejections
 from sfm.adjustment.hypotheses.rejections import SecondPlace, explain_rejections
-from sfm.adjustment.quality.point_normals import intersected
+from sfm.adjustment.quality.consistency import intersected
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project

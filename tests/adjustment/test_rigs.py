@@ -16,9 +16,8 @@ from sfm.adjustment.engine.normals import normal_equations
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
-from sfm.adjustment.engine.solvers.fronts import fronts_of
+from sfm.adjustment.engine.solvers.fronts import fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
-from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.unknowns import Unknowns, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.covariance import shifted
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import collinearity, new_workspace, residuals
-from sfm.adjustment.engine.local_frame import shifted
 from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment

@@ -10,11 +10,12 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, families, patterns, unchecked
+from sfm.adjustment.hypotheses import alternatives, families, patterns
+from sfm.adjustment.hypotheses import refit as unchecked
 from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
+from sfm.adjustment.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.adjustment.hypotheses.score import reduce_adjustment
-from sfm.adjustment.hypotheses.unchecked import reach_of, unchecked_assumptions
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray

@@ -24,17 +24,16 @@ from dask.distributed import KilledWorker
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
-from sfm.batch.finished import note_finished
-from sfm.batch.job import LOCK, SurveyJob, SurveyRow, reconstruct
-from sfm.batch.pages import batch_page, batch_remarks
+from sfm.batch.job import LOCK, SurveyJob, SurveyRow, note_finished, reconstruct
 from sfm.batch.run import calls_of, find_surveys, run_batch
+from sfm.batch.table import batch_page, batch_remarks
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.files.folder_lock import Owner, locked
 from sfm.files.manifest import MANIFEST, sha256_of
+from sfm.files.open_folders import Owner, locked
 from sfm.files.whole_files import write_manifest
 from sfm.remarks.remark import kinds_of
-from sfm.report.html import html
 from sfm.report.log import read_log
+from sfm.report.pages import html
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
 from tests.places import ROOT

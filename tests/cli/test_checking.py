@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from sfm import cli, warm_up
-from sfm.cli.first_use import compile_first
-from sfm.kernels import warmed
+from sfm.cli.commands.starting import compile_first
+from sfm.kernels import compiling as warmed
 
 
 def doctor(monkeypatch: pytest.MonkeyPatch) -> int:

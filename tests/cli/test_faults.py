@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from sfm.errors import FolderInUseError, OutputError
-from sfm.files.folder_lock import locked, owner_of
+from sfm.files.open_folders import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, read_log
 from sfm.survey.inputs.settings import TargetSettings
@@ -170,7 +170,7 @@ def test_read_only_folder_is_one_line(tmp_path: Path) -> None:
 def test_lock_tells_its_owner_and_is_free_after_death(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "lock"
     hold = (
-        "import sys, time; from pathlib import Path; from sfm.files.folder_lock import locked\n"
+        "import sys, time; from pathlib import Path; from sfm.files.open_folders import locked\n"
         f"with locked(Path({str(path)!r})): print('held', flush=True); time.sleep(60)"
     )
     process = subprocess.Popen([sys.executable, "-c", hold], cwd=ROOT, stdout=subprocess.PIPE, text=True)

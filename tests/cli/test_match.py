@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.cli.commands.matching import match_command
+from sfm.cli.commands.measuring import match_command
 from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
-from sfm.report.figures.patches import LINE, MAX_PICTURES
+from sfm.report.figures.overlays import LINE, MAX_PICTURES
 from tests.textures import random_texture, with_noise
 
 SHIFT = (4.3, -2.6)

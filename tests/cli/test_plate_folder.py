@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from sfm.cli import main
-from sfm.cli.commands import drafting
+from sfm.cli.commands import surveying as drafting
 from sfm.cli.commands.starting import stopped_once
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.survey.drafting.draft import Draft, draft_survey
 
 FOUR_LINES = """
 import sys
-from sfm.cli.streams import guard_streams
+from sfm.cli.console import guard_streams
 guard_streams()
 for k in range(2):
     print(2 * k)

@@ -18,9 +18,8 @@ from sfm.adjustment.solve import adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import compare_results
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.epochs.epoch import Epoch
-from sfm.epochs.findings import verdict_of_epochs
-from sfm.epochs.series import analyse_epochs
+from sfm.epochs.differences import Epoch
+from sfm.epochs.series import analyse_epochs, verdict_of_epochs
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import kinds_of
 from sfm.solution import Solution

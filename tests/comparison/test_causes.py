@@ -10,15 +10,13 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison import causes
-from sfm.comparison.causes import PointPairs, Row, find_cause, is_unrelated
+from sfm.comparison.causes import PointPairs, Row, find_cause, find_pattern, is_unrelated
 from sfm.comparison.findings import remarks_of_cause, verdict_of_comparison
-from sfm.comparison.point_pairs import ROUNDING
-from sfm.comparison.point_patterns import find_pattern
+from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.significance import compare_results
-from sfm.conventions import rotation_from_vector
+from sfm.conventions import UNITS, rotation_from_vector
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import Similarity
-from sfm.units import UNITS
 from tests.comparison.causes import EXPECTED, compared, epochs, expected, pair, transformed
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 

@@ -10,19 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adapters.colmap.adjuster import adjust_with_colmap
-from adapters.colmap.validation_backend import adjust_with_covariance
+from adapters.colmap.adjuster import adjust_with_colmap, adjust_with_covariance
 from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
-from sfm.comparison.point_pairs import ROUNDING
+from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
 from sfm.comparison.two_adjusters import adjusters
 from sfm.comparison.two_adjusters.adjuster_validation import random_network
-from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.comparison.two_adjusters.common_problem import common_problem, grouped_free
+from sfm.comparison.two_adjusters.adjusters import common_problem, compare_adjusters, grouped_free
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import MODELS as CAMERA_MODELS
 from sfm.errors import GeometryError

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from adapters.formats.registry import format_named, read_comparable, write_any
-from sfm.comparison.camera_conversion import convert_cameras
+from sfm.comparison.camera_conversion import convert_cameras, undistort
 from sfm.comparison.pairing import pair_results
 from sfm.comparison.significance import compare_results
-from sfm.comparison.undistortion import undistort
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network

@@ -13,9 +13,8 @@ from adapters.colmap.mapper import MapperBaseline
 from adapters.formats.result_tables import read_result, write_tables
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.comparison.baseline import compare_baseline
 from sfm.comparison.significance import compare_results
-from sfm.comparison.solutions import reprojection
+from sfm.comparison.solutions import compare_baseline, reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfm.camera import tangents_from_pixel
-from sfm.comparison.undistortion import undistort
+from sfm.comparison.camera_conversion import undistort
 from sfm.distortion.models import GENERAL_MODELS
 from sfm.errors import GeometryError
 from tests.synthetic import make_network, seed_of

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from adapters.colmap.adjuster import adjust_with_colmap
-from adapters.colmap.validation_backend import ColmapBackend
+from adapters.colmap.adjuster import ColmapBackend, adjust_with_colmap
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjuster_validation import (
     Validation,

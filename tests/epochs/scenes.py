@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.epochs.epoch import Epoch
+from sfm.epochs.differences import Epoch
 from sfm.network import Estimate, InteriorObservations, Network
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 

@@ -20,7 +20,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import FloatArray
 from sfm.distributions import t_ppf
-from sfm.epochs.epoch import Epoch
+from sfm.epochs.differences import Epoch
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity

@@ -9,9 +9,9 @@ import pytest
 
 from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import FloatArray
-from sfm.epochs.blocks import block_motion
 from sfm.epochs.differences import epoch_differences
 from sfm.epochs.displacements import Displacements, detectable_shift, find_displacements
+from sfm.epochs.series import block_motion
 from sfm.errors import GeometryError
 from tests.epochs.scenes import BAR_SIGMA, POINTS, epoch, scene
 

@@ -12,14 +12,11 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import rotation_from_vector
-from sfm.epochs.differences import epoch_differences
-from sfm.epochs.epoch import Epoch
-from sfm.epochs.findings import verdict_of_epochs
-from sfm.epochs.mounts import mount_changes
-from sfm.epochs.series import analyse_epochs
+from sfm.epochs.differences import Epoch, epoch_differences, mount_changes
+from sfm.epochs.series import analyse_epochs, verdict_of_epochs
 from sfm.errors import GeometryError
+from sfm.planning.prediction import simulate_network
 from sfm.report.pages import write_page
-from sfm.simulated_network import simulate_network
 from tests.rigs import make_rig
 from tests.survey.test_survey_observations import observed
 from tests.synthetic import seed_of, stored_of

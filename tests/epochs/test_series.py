@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from sfm.conventions import FloatArray
-from sfm.epochs.epoch import Epoch
-from sfm.epochs.findings import remarks_of_pair, verdict_of_epochs
-from sfm.epochs.series import EpochSeries, analyse_epochs
+from sfm.epochs.differences import Epoch
+from sfm.epochs.series import EpochSeries, analyse_epochs, remarks_of_pair, verdict_of_epochs
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, kinds_of
 from sfm.report.epochs import describe_stable

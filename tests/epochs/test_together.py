@@ -12,9 +12,8 @@ from sfm.adjustment.solve import adjust
 from sfm.comparison.stable_points import in_datum
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.epochs.differences import Differences, epoch_differences
+from sfm.epochs.differences import Differences, Epoch, epoch_differences
 from sfm.epochs.displacements import find_displacements
-from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import analyse_epochs
 from sfm.epochs.together import adjust_together
 from sfm.errors import GeometryError

@@ -15,8 +15,8 @@ import pytest
 from adapters.colmap.adjuster import reason_of
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
+from adapters.formats.mesh import read_ply
 from adapters.formats.metashape import read_metashape, write_metashape
-from adapters.formats.ply import read_ply
 from adapters.formats.registry import read_any, read_comparable
 from adapters.formats.result_tables import read_result, write_tables
 from sfm.batch.run import find_surveys

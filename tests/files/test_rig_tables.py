@@ -13,7 +13,7 @@ from adapters.formats.registry import read_content, write_content
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.solve import adjust
 from sfm.errors import SurveyFileError
-from sfm.files.rig_tables import write_rigs
+from sfm.files.result_tables import write_rigs
 from sfm.pipeline import run_survey
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from sfm.files.scratch import PREFIX, scratch_folder
+from sfm.files.user_cache import PREFIX, scratch_folder
 
 RUN = """
 import time
-from sfm.files.scratch import scratch_folder
+from sfm.files.user_cache import scratch_folder
 with scratch_folder() as folder:
     (folder / "set-aside").write_text("x")
     print(folder, flush=True)

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from adapters.colmap.camera_models import read_model, write_model
-from adapters.formats.ply import read_ply
+from adapters.formats.mesh import read_ply
 from adapters.formats.registry import read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text

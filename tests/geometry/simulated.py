@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.geometry.shapes.kinds import KINDS
-from sfm.geometry.shapes.shape import Shape
+from sfm.geometry.shapes.kinds import KINDS, Shape
 from sfm.similarity import similarity_motions
 
 FORMS = {

@@ -10,8 +10,7 @@ import pytest
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
-from sfm.geometry.functions import difference, distance, point_function
-from sfm.geometry.measured import MeasuredPoints
+from sfm.geometry.measured import MeasuredPoints, difference, distance, point_function
 from sfm.geometry.shapes.fit import fit_shape
 from sfm.similarity import Similarity
 from tests.geometry.simulated import in_free_datum, random_covariance

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.distributions import t_ppf
-from sfm.geometry.functions import distance, point_function
-from sfm.geometry.measured import measured_points
+from sfm.geometry.measured import distance, measured_points, point_function
 from sfm.geometry.shapes.fit import fit_shape
 from tests.inspection.benches import DIAMETERS, FOCAL_LENGTH, bench_result, object_points
 

@@ -10,7 +10,9 @@ import pytest
 
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import align_321
-from sfm.geometry.functions import (
+from sfm.geometry.measured import (
+    Function,
+    MeasuredPoints,
     angle_at,
     angle_of_directions,
     coordinates_in,
@@ -18,10 +20,11 @@ from sfm.geometry.functions import (
     distance,
     distance_from_axis,
     height,
+    matches,
+    measured_points,
     point_function,
+    with_hidden_point,
 )
-from sfm.geometry.hidden_points import with_hidden_point
-from sfm.geometry.measured import Function, MeasuredPoints, matches, measured_points
 from sfm.geometry.shapes.fit import fit_shape
 from tests.geometry.simulated import in_free_datum, random_covariance
 from tests.inspection.benches import one_bench

@@ -9,8 +9,7 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.measured import MeasuredPoints
 from sfm.geometry.shapes.fit import ShapeFit, fit_shape, parameters_of
-from sfm.geometry.shapes.kinds import KINDS
-from sfm.geometry.shapes.shape import Shape
+from sfm.geometry.shapes.kinds import KINDS, Shape
 from tests.geometry.simulated import (
     design_of,
     in_free_datum,

@@ -10,9 +10,7 @@ import pytest
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import Nominal
-from sfm.geometry.functions import distance, point_function
-from sfm.geometry.hidden_points import with_hidden_point
-from sfm.geometry.measured import MeasuredPoints
+from sfm.geometry.measured import MeasuredPoints, distance, point_function, with_hidden_point
 from sfm.geometry.mesh import Mesh, distances_from_mesh
 from sfm.geometry.shapes.fit import fit_shape
 from sfm.geometry.tolerance import decide, deviations_from_mesh, deviations_from_points, deviations_from_shape

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sfm.kernels import options, sources
+from sfm.kernels import compiling as options
+from sfm.kernels import compiling as sources
 
 
 @pytest.fixture

@@ -7,13 +7,14 @@ import pytest
 
 from sfm.matching.tracks import feature_tracks
 from sfm.matching.tracks.feature_tracks import link_features
-from sfm.matching.tracks.features import Features, sift_features
-from sfm.matching.tracks.overlap import (
+from sfm.matching.tracks.features import (
     MANY_PARTNERS,
+    Features,
     common_features,
     connected_parts,
     connecting_pairs,
     overlapping_pairs,
+    sift_features,
 )
 from tests.synthetic import seed_of
 from tests.textures import random_texture

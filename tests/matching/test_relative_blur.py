@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import FloatArray
 from sfm.matching.conjugate import match_points
-from sfm.matching.relative_blur import difference_of_blur
+from sfm.matching.local_affinity import difference_of_blur
 from tests.textures import natural_texture, with_noise
 
 SIZE = (420, 380)

@@ -31,12 +31,17 @@ from sfm.conventions import (
 )
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.epipolar import epipolar_paths
-from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import MAX_SHARED_FRACTION, CoveredPixels, Windows, first_alike, points_apart
-from sfm.matching.lsm.projected_points import plane_warps
+from sfm.matching.lsm.coverage import (
+    MAX_SHARED_FRACTION,
+    CoveredPixels,
+    Windows,
+    first_alike,
+    plane_warps,
+    points_apart,
+)
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.radiometry import grey_of
+from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.matching.tracks import feature_tracks, interest
 from sfm.matching.tracks.feature_tracks import (
     Matches,
@@ -47,21 +52,20 @@ from sfm.matching.tracks.feature_tracks import (
     link_features,
 )
 from sfm.matching.tracks.features import Features, matched_features, sift_features
-from sfm.matching.tracks.interest import foerstner_points, textured_squares
-from sfm.matching.tracks.natural_points import natural_points
+from sfm.matching.tracks.interest import foerstner_points, natural_points, textured_squares
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.report.log import read_log
 from sfm.similarity import fit_similarity
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.covering_points import _returning, find_covering_points
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
-from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
-from sfm.textbook.along_line import match_along_line
+from sfm.textbook.matching import match_along_line
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
 

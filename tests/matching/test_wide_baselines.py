@@ -14,7 +14,7 @@ from sfm.matching import conjugate
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import ConjugatePoints
 from sfm.matching.local_affinity import affinities_around
-from sfm.matching.lsm.plane_windows import match_where_plane
+from sfm.matching.lsm.surface_planes import match_where_plane
 from sfm.matching.lsm.two_photo import match_lsm
 from tests.textures import MEAN, affine_pairs, random_texture, with_noise
 

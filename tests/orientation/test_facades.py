@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from sfm.camera import project
-from sfm.depth_reversal import reverse_depth
 from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental import poor_photographs
 from sfm.orientation.incremental.growth import residual_lengths
-from sfm.orientation.incremental.other_solutions import bounded_costs
-from sfm.orientation.incremental.poor_photographs import _Resected
+from sfm.orientation.incremental.poor_photographs import _Resected, bounded_costs
 from sfm.orientation.incremental.sequence import orient
-from sfm.similarity import fit_similarity
+from sfm.similarity import fit_similarity, reverse_depth
 from sfm.survey.orientation import refine
 from tests.facades import SIZE_PX, facade_network
 

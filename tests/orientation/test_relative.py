@@ -5,9 +5,14 @@ import pytest
 
 from sfm.conventions import rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.orientation.coplanarity import coplanarity_residuals, refine_coplanarity, turned_pair
 from sfm.orientation.homography import decompose_homography, fit_homography
-from sfm.orientation.relative import model_points, relative_orientations
+from sfm.orientation.relative import (
+    coplanarity_residuals,
+    model_points,
+    refine_coplanarity,
+    relative_orientations,
+    turned_pair,
+)
 from sfm.textbook.pair import orient_dependent, orient_independent
 from tests.synthetic import seed_of
 

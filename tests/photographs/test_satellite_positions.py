@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm.photographs.exif import read_metadata
-from sfm.photographs.satellite_positions import (
+from sfm.photographs.exif import (
     LocalSystem,
     SatellitePosition,
     local_coordinates,
+    read_metadata,
     satellite_position,
 )
 

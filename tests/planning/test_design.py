@@ -10,8 +10,8 @@ import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.planning.target_size import compute_target_size
-from sfm.report.figures.design_diagram import DIAGRAM_PIXELS, design_diagram
+from sfm.planning.sight.visibility import compute_target_size
+from sfm.report.figures.comparisons import DIAGRAM_PIXELS, design_diagram
 
 
 def test_formula_of_document_000() -> None:

@@ -11,14 +11,12 @@ import pytest
 from sfm.camera import camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.planning.design.candidates import StationLimits, candidates
+from sfm.planning.design.candidates import POWER, StationLimits, candidates, gains, image_rows
 from sfm.planning.design.designer import design_network
-from sfm.planning.design.gain import POWER, gains, image_rows
 from sfm.planning.planned_object import PlannedObject, object_of_points, shape_object
 from sfm.planning.prediction import predict_network
-from sfm.planning.shots import choose_coded, roll_deg
 from sfm.planning.sight.visibility import Seeing, sight_of
-from sfm.planning.stations import Stations, arrangement, looking, rolled
+from sfm.planning.stations import Stations, arrangement, choose_coded, looking, roll_deg, rolled
 from sfm.planning.wanted import (
     MIN_RAYS,
     WantedPrecision,

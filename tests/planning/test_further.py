@@ -14,13 +14,11 @@ from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
-from sfm.planning.findings import verdict_of_plan
 from sfm.planning.further import further_photographs
-from sfm.planning.plan import plan_of
+from sfm.planning.plan import plan_of, verdict_of_plan
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import predict_network
-from sfm.planning.sight.image_precision import TargetImage
-from sfm.planning.sight.visibility import Seeing
+from sfm.planning.sight.visibility import Seeing, TargetImage
 from sfm.planning.stations import Stations, arrangement
 from sfm.planning.wanted import WantedPrecision
 from sfm.remarks.remark import of_kind

@@ -17,7 +17,14 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, UnknownNameError
 from sfm.geometry.mesh import Mesh
 from sfm.planning.planned_object import PlannedObject, farthest_points, object_of_points, shape_object
-from sfm.planning.prediction import Prediction, ScaleBarPlan, largest_length_sigma, predict_network, usable
+from sfm.planning.prediction import (
+    Prediction,
+    ScaleBarPlan,
+    largest_length_sigma,
+    predict_network,
+    simulate_network,
+    usable,
+)
 from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import ARRANGEMENTS, Stations, around, arrangement, looking
 from sfm.planning.weakness import calibratability, reason_of, rolled_share, weak_points
@@ -25,7 +32,6 @@ from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
 from sfm.report.viewer.scene import distance_sigmas
 from sfm.similarity import fit_similarity
-from sfm.simulated_network import simulate_network
 from tests.places import DATASETS, SHARED
 from tests.synthetic import make_network, seed_of
 

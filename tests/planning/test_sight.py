@@ -12,10 +12,18 @@ from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
 from sfm.geometry.mesh import Mesh
 from sfm.planning.planned_object import object_of_mesh, object_of_points, open_edges, shape_object
-from sfm.planning.sight.image_precision import TargetImage, centre_covariance
 from sfm.planning.sight.occlusion import box_tree, hidden_points
-from sfm.planning.sight.optics import DepthOfField, Lens, best_focus, depth_of_field
-from sfm.planning.sight.visibility import Seeing, Why, sight_of
+from sfm.planning.sight.visibility import (
+    DepthOfField,
+    Lens,
+    Seeing,
+    TargetImage,
+    Why,
+    best_focus,
+    centre_covariance,
+    depth_of_field,
+    sight_of,
+)
 from sfm.planning.stations import looking
 from tests.synthetic import seed_of
 from tests.targets.test_bound import CONTRAST, NOISE, coverage

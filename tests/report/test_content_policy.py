@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 
 from sfm.batch.job import SurveyRow
-from sfm.batch.pages import batch_page
+from sfm.batch.table import batch_page
 from sfm.comparison.significance import compare_results
 from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
-from sfm.report.html import content_policy, html
 from sfm.report.output import write_result
-from sfm.report.pages import write_page
+from sfm.report.pages import content_policy, html, write_page
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.places import ROOT

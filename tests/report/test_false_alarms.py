@@ -10,9 +10,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark, of_kind
+from sfm.report.findings.bundle_statistics import Given
 from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.findings.given_remarks import given_remarks
-from sfm.report.findings.given_residuals import Given
+from sfm.report.findings.survey_remarks import given_remarks
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 

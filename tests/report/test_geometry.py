@@ -14,15 +14,14 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import ObjectPoints
-from sfm.orientation.ray_angles import ray_angles
+from sfm.orientation.image_rays import ray_angles
+from sfm.report.findings.bundle_statistics import Geometry, geometry_of, hull_area
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.geometry import Geometry, geometry_of, hull_area
-from sfm.report.pages import html_of
+from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text import WIDTH
 from sfm.result import SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_points
 from tests.places import SHARED

@@ -16,7 +16,6 @@ from sfm.conventions import FloatArray
 from sfm.files.result_tables import GIVEN
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
-from sfm.report.html import html
 from sfm.report.numbers import significant
 from sfm.report.page import (
     MAX_ROWS,
@@ -41,10 +40,9 @@ from sfm.report.page import (
     columns_of,
     facts,
 )
-from sfm.report.pages import PAGES, page_of, write_page
-from sfm.report.text import MAX_ROWS as MAX_TEXT_ROWS
-from sfm.report.text import WIDTH
-from sfm.report.text import text as text_of
+from sfm.report.pages import MAX_ROWS as MAX_TEXT_ROWS
+from sfm.report.pages import PAGES, WIDTH, html, page_of, write_page
+from sfm.report.pages import text as text_of
 
 EVIL = "<img src=x onerror=alert(1)>"
 

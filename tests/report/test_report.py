@@ -31,8 +31,8 @@ from sfm.remarks.verdict import lines_of
 from sfm.report import survey_report
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
+from sfm.report.findings.bundle_statistics import geometry_of
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.geometry import geometry_of
 from sfm.report.numbers import (
     alike,
     finer_unit,
@@ -44,12 +44,11 @@ from sfm.report.numbers import (
 )
 from sfm.report.output import WRITTEN, plot_data, write_result
 from sfm.report.page import Paragraph, Section
-from sfm.report.pages import html_of, page_of
+from sfm.report.pages import WIDTH, html_of, page_of, wrapped
 from sfm.report.phrases import describe_precision, words_left_out
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.report.text import WIDTH, wrapped
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import LIKEST_FIRST, Flag

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from sfm.cli.commands.measuring import read_task
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.report.resection import comparison_table, resection_json, resection_text
-from sfm.survey.inputs.resection_points import read_task
+from sfm.report.measuring import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS
 from sfm.textbook.resection.by_method import resect, resect_by_all
 from tests.orientation.resection.test_least_squares import LAB2, TRUTH

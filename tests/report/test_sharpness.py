@@ -12,7 +12,7 @@ from sfm.adjustment.quality.consistency import Consistency, Uneven
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.remarks.remark import remark
-from sfm.report.findings.sharpness import edges_of, larger_than_the_others, sharpness_remarks
+from sfm.report.findings.camera_remarks import edges_of, larger_than_the_others, sharpness_remarks
 from sfm.result import FailedImage, PhotographTargets, SurveyResult
 from tests.synthetic import make_network, seed_of
 

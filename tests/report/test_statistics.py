@@ -32,7 +32,8 @@ from sfm.conventions import angles_from_rotation
 from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
-from sfm.report.findings.bundle_statistics import statistics_of
+from sfm.report.findings.bundle_statistics import given_of, statistics_of
+from sfm.report.findings.calibrated_cameras import families, interior_parameters
 from sfm.report.findings.checks import (
     MAX_LISTED,
     count_observations,
@@ -41,12 +42,10 @@ from sfm.report.findings.checks import (
     sigma0_of,
 )
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.given_residuals import given_of
-from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
 from sfm.report.numbers import signed, to_precision
 from sfm.report.output import plot_data
-from sfm.report.pages import html_of
+from sfm.report.pages import WIDTH, html_of
 from sfm.report.phrases import (
     describe_check,
     describe_fixed,
@@ -57,7 +56,6 @@ from sfm.report.phrases import (
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text import WIDTH
 from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.synthetic import make_network, seed_of
 

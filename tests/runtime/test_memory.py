@@ -12,7 +12,7 @@ IN_TURN = f"""
 from pathlib import Path
 from threading import Event, Thread
 import numpy as np
-from sfm.runtime.memory import keep_freed_memory
+from sfm.kernels.threads import keep_freed_memory
 from sfm.runtime.progress import SILENT, StageClock
 StageClock(SILENT)
 keep_freed_memory()

@@ -12,8 +12,8 @@ from rich.console import Console
 from sfm.pipeline import run_survey
 from sfm.runtime.progress import Silent, StageClock, report_step, reported
 from sfm.runtime.progress_bar import drawn_progress
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.other_programs import OtherPrograms
 from tests.other_adjuster import in_house_adjuster
 from tests.surveys import write_photograph_survey
 

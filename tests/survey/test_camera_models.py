@@ -15,11 +15,11 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity
-from sfm.survey.camera_models import FISHEYE, orient_with_models
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.orientation import FISHEYE, orient_with_models
 from tests.survey.texture_scenes import Plane, upright, wall
 from tests.synthetic import seed_of
 

@@ -18,8 +18,8 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.other_programs import OtherPrograms
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 TURN = Similarity(30.0, rotation_from_vector(np.array([0.4, 1.0, -0.2])), np.array([5.0, -2.0, 8.0]))

@@ -14,7 +14,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
-from sfm.survey.inputs.interior import split_cameras
+from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

@@ -21,8 +21,8 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
 from sfm.result import SurveyResult
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.other_programs import OtherPrograms
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 IMAGES = 8

@@ -14,14 +14,13 @@ import pytest
 
 from sfm.conventions import IntArray
 from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
-from sfm.photographs.exif import Metadata
-from sfm.photographs.satellite_positions import SatellitePosition
+from sfm.photographs.exif import Metadata, SatellitePosition
 from sfm.remarks.remark import of_kind
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.survey.measuring import tie_points
-from sfm.survey.measuring.neighbours import NONE, neighbours_by_position, neighbours_in_sequence
+from sfm.survey.measuring.tie_points import NONE, neighbours_by_position, neighbours_in_sequence
 from tests.satellite import state_position
 from tests.synthetic import seed_of
 from tests.textures import natural_texture

@@ -11,7 +11,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
-from sfm.survey.diagnosis.no_base import MIN_PARALLAX, refuse_no_base
+from sfm.survey.diagnosis.lost_photographs import MIN_PARALLAX, refuse_no_base
 from tests.synthetic import seed_of
 
 SIGMA_PX, C_PX, SIZE_PX = 0.1, 600.0, (640, 480)

@@ -18,16 +18,16 @@ from adapters.colmap.model_files import MODELS
 from adapters.colmap.reconstruction import colmap_parameters
 from adapters.colmap.refined_model import open_model
 from datasets.textured import render
-from sfm.adjustment.quality import error_correlation
+from sfm.adjustment.quality import correlations as error_correlation
 from sfm.adjustment.result import ErrorCorrelation
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
-from sfm.matching.grey_photographs import GreyPhotographs
+from sfm.matching.radiometry import GreyPhotographs
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
-from sfm.survey.refining import model_photographs
+from sfm.survey.refining import windows as model_photographs
 from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
 from sfm.survey.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family

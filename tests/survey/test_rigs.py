@@ -17,12 +17,12 @@ from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vect
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
+from sfm.planning.prediction import simulate_network
 from sfm.report.figures.plots import epipolar_figure
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.rigs import rigs_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
-from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs
 from tests.rigs import make_rig

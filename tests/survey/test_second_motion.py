@@ -10,7 +10,7 @@ import pytest
 from sfm.camera import project
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation, orient
-from sfm.survey.diagnosis.second_object import MOTION_POINTS, find_second_motion
+from sfm.survey.diagnosis.lost_photographs import MOTION_POINTS, find_second_motion
 from sfm.survey.orientation import refine
 from tests.synthetic import make_network, seed_of
 

@@ -21,7 +21,7 @@ from sfm.rendering.scene import Optics
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
-from sfm.survey.diagnosis.second_object import find_second_objects
+from sfm.survey.diagnosis.lost_photographs import find_second_objects
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey

@@ -17,8 +17,8 @@ from sfm.remarks.remark import of_kind
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.placing import object_scale
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of

@@ -29,11 +29,10 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.batch.run import run_batch
 from sfm.errors import OutputError
-from sfm.files.folder_lock import locked
+from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
-from sfm.kernels.compiling import COMPILING
-from sfm.kernels.sources import sources_of
-from sfm.matching.tracks.natural_points import natural_points
+from sfm.kernels.compiling import COMPILING, sources_of
+from sfm.matching.tracks.interest import natural_points
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name

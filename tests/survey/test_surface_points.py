@@ -13,8 +13,8 @@ import pytest
 
 from sfm.camera import project
 from sfm.conventions import AnyArray
-from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import CoveredPixels, Windows
+from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks import feature_tracks
 from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation

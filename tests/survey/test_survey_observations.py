@@ -30,18 +30,17 @@ from sfm.observations.groups import Group
 from sfm.observations.height_differences import HeightDifferences
 from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
-from sfm.observations.lines import Lines
 from sfm.observations.mounts import MountObservations
 from sfm.observations.offset_distances import OffsetDistances
-from sfm.observations.plumb_lines import PlumbLines
+from sfm.observations.plumb_lines import Lines, PlumbLines
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
+from sfm.planning.prediction import simulate_network
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity
-from sfm.simulated_network import simulate_network
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
 from tests.rigs import make_rig

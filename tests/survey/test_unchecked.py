@@ -17,7 +17,7 @@ from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given import judge_given
-from sfm.survey.hypotheses.given_groups import remarks_on_unchecked
+from sfm.survey.hypotheses.given_scales import remarks_on_unchecked
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar

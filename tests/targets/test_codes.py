@@ -12,10 +12,12 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
 from sfm.targets.codes import rings
 from sfm.targets.codes.families import FAMILIES, code_family
-from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import (
+    UNCODED,
+    UNREADABLE,
     CodeFamily,
     read_code_table,
+    read_codes,
     ring_family,
     ring_patterns,
     smallest_rotation,

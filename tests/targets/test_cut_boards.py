@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.codes.cut_boards import name_cut_board
+from sfm.targets.codes.boards import name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import find_targets
 from tests.synthetic import seed_of

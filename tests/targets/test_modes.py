@@ -9,8 +9,7 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.targets.detect import CENTRES, find_targets
-from sfm.targets.fits.centroid import measure_centroids
-from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
+from sfm.targets.fits.centroid import measure_centroids, measure_edge_ellipses
 from sfm.targets.measure import axes_from_shape, fit_ellipse_model, shape_from_axes
 
 SUPER, SIZE, COUNT, NOISE = 5, 40, 14, 2.0

@@ -16,10 +16,20 @@ from sfm.rendering.render import render_photographs
 from sfm.targets.candidates import find_duplicates
 from sfm.targets.detect import find_targets
 from sfm.targets.edge_rays import RAYS
-from sfm.targets.fits import damage, goodness, undamaged
-from sfm.targets.fits.damage import MIN_POPULATION, common_shape, find_damage, gap_shifts, harmonics
+from sfm.targets.fits import goodness, undamaged
+from sfm.targets.fits import outline_noise as damage
 from sfm.targets.fits.ellipse_fit import fit_ellipses
-from sfm.targets.fits.outline_noise import OutlineShape, judge_outlines, moderate, rise_to_first
+from sfm.targets.fits.outline_noise import (
+    MIN_POPULATION,
+    OutlineShape,
+    common_shape,
+    find_damage,
+    gap_shifts,
+    harmonics,
+    judge_outlines,
+    moderate,
+    rise_to_first,
+)
 from sfm.targets.fits.undamaged import _stands_out
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit

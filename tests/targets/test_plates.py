@@ -18,8 +18,7 @@ from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes import dot_plates
 from sfm.targets.codes.boards import FLAGS, REDUCED_PX, reduced
-from sfm.targets.codes.dot_plates import name_dots, placements
-from sfm.targets.codes.lattice import Lattice
+from sfm.targets.codes.dot_plates import Lattice, name_dots, placements
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.fits.saddle import measure_saddles

@@ -5,7 +5,6 @@ import pytest
 
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.textbook.fiducials import orient_fiducials
 from sfm.textbook.photo_coordinates import (
     PhotoCorrections,
     RadialTable,
@@ -13,6 +12,7 @@ from sfm.textbook.photo_coordinates import (
     correct_photo_coordinates,
     curvature_displacement,
     distort_photo_coordinates,
+    orient_fiducials,
     photo_from_pixel,
     pixel_from_photo,
     radial_from_table,

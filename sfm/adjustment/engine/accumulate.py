@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.options import compiled, inlined, kernel
+from sfm.kernels.compiling import compiled, inlined, kernel
 
 SINGULAR_PIVOT = 1e-13  # share of the normal equation of a point left below which its rays are parallel
 STIFFENING = 1e10  # factor on the pivot that fixes such a direction of a point

@@ -22,7 +22,7 @@ from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray, IntArray
-from sfm.kernels.options import kernel
+from sfm.kernels.compiling import kernel
 from sfm.observations.pose import exterior_jacobian
 
 # Variance over its limiting value below which a coordinate is one that the datum fixes.

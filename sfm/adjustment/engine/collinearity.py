@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, observe
-from sfm.kernels.options import compiled, inlined, kernel
+from sfm.kernels.compiling import compiled, inlined, kernel
 
 CAMERA_UNKNOWNS = MAX_PARAMETERS + 6  # interior parameters and the mount of a camera
 

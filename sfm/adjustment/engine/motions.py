@@ -23,7 +23,7 @@ from sfm.adjustment.engine.observed import ObservedKind, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.kernels.options import kernel
+from sfm.kernels.compiling import kernel
 
 TINY = float(np.finfo(float).tiny)
 SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 but for rounding

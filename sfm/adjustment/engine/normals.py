@@ -33,7 +33,7 @@ from sfm.adjustment.engine.observed import ObservedKind, Terms, terms_of
 from sfm.adjustment.engine.ordering import by_photograph
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
-from sfm.kernels.options import kernel
+from sfm.kernels.compiling import kernel
 from sfm.kernels.threads import at_once
 
 # Image points from which two halves of the photographs are summed by themselves; another thread takes 0.1 ms

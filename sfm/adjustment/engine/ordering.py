@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 
 
 def by_point(image: IntArray, point: IntArray, pose_of: IntArray, n: int) -> tuple[IntArray, IntArray]:

@@ -23,7 +23,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import turn
 from sfm.network import Estimate, Mounts, Network
 from sfm.observations.kind import POINT

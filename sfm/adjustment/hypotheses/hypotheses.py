@@ -27,14 +27,13 @@ from sfm.adjustment.hypotheses.alternatives import (
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
 from sfm.adjustment.hypotheses.patterns import MIN_GROUP
-from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
+from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of, unchecked_assumptions
 from sfm.adjustment.hypotheses.score import (
     Reduced,
     log_likelihood_gain,
     reduce_adjustment,
     squares_gained,
 )
-from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.hypotheses.alternatives import ALPHA
-from sfm.adjustment.quality.point_normals import intersected
+from sfm.adjustment.quality.consistency import intersected
 from sfm.adjustment.result import Adjustment
 from sfm.camera import project
 from sfm.conventions import IntArray

@@ -5,6 +5,28 @@ angles: the standard deviations of both are then large together, while distances
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlations in self-calibration);
 Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
+
+How far the errors of neighbouring image points agree, from the residuals of an adjustment.
+
+A lens that breathes, a shutter that rolls and a surface that is curved inside of windows move neighbouring
+image points together. Sums of residuals over cells of a photograph, from single image points to half of
+it, show that: for independent errors their squares grow with the number of image points, for common ones with
+its square. Object points, orientations and cameras take a part of either, of long waves the most. How much
+is left is found by simulation: random fields of known length go through the linearised adjustment. A field
+moves precise image points by as many px as others.
+
+Source: variance components by quadratic forms and their expectations, Koch (1999), sec. 3.6; nested cells,
+Webster and Oliver (2007), Geostatistics for Environmental Scientists, sec. 6.3; random fields of a given
+covariance, Rahimi and Recht (2007), Adv. Neural Inf. Process. Syst. 20.
+
+Projection uncertainty: how well a calibrated camera knows where a direction is seen in the photograph.
+
+The covariance of the interior orientation moves the picture of a distant point. The part that equals a
+rotation of the camera is no error of the camera, since every use of it finds the rotation anew: it is taken
+out by the small rotation that fits best to the image points of the calibration. Between these the camera is
+known, beyond them the uncertainty grows.
+
+Source: law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
 """
 
 from __future__ import annotations
@@ -12,16 +34,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.sparse import csr_matrix
+from scipy.spatial import ConvexHull, QhullError
 
-from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.covariance import marginal_of, with_error_correlation
+from sfm.adjustment.engine.correlated import linearise
 from sfm.adjustment.engine.unknowns import interior_names
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION
-from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
+from sfm.arguments import checked_arguments
+from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.kernels.threads import own_threads
+from sfm.network import rows_of
 from sfm.observations.pose import exterior_jacobian
 
+CELLS = 24  # of the grid along the longer side of the photograph
+HALVINGS = 7  # of the longer side of the photographs, to the smallest cells and to the shortest correlation
+DRAWS = 16  # fields of each length
+WAVES = 64  # of a field in one photograph
+ROUNDS = 5  # of weighting by the expectations; the second hardly changes them
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 
@@ -131,3 +165,179 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
     square = exterior[:, :, None] * interior
     known = square > 0
     return names, np.asarray(np.where(known, C / np.sqrt(np.where(known, square, 1.0)), 0.0))
+
+
+@checked_arguments()
+def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | None:
+    """Return the correlation of the errors of neighbouring image points that fits the residuals best.
+
+    Lengths from the longer side of the photographs down, halved in turn, are tried.
+
+    Args:
+        adjustment: the adjustment, with its covariance or without.
+
+    Returns:
+        None where the errors of neighbours do not agree.
+    """
+    m = marginal_of(adjustment, cross=False)
+    o = m.layout.observations
+    weight = np.ascontiguousarray(adjustment.weights[m.layout.order])
+    linear = linearise(m.optimum, m.layout, weight)
+    used = weight > 0
+    size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
+    cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
+    v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]
+    v[~used] = 0.0
+    found = _squares(v, cells)
+    count = np.array([used.sum(), *(one.shape[0] for one in cells)])
+    rng = np.random.default_rng(0)
+
+    def left_of(errors: FloatArray) -> FloatArray:
+        """Return what the adjustment is expected to leave of errors with unit variance."""
+        errors[~used] = 0.0
+        return _squares(linear.residuals(errors.reshape(2 * len(used), -1)), cells)
+
+    relative = adjustment.usual_px * linear.whitening
+    alone = left_of(rng.standard_normal((len(used), 2, DRAWS)))
+    best, least = None, np.inf
+    for length in size / 2.0 ** np.arange(HALVINGS):
+        common = left_of(relative @ _fields(o.image, o.xy, length, rng))
+        expected = found
+        for _ in range(ROUNDS):
+            sigma = expected / np.sqrt(count)  # of the sum of squares of so many pairs x, y
+            parts, misfit = nnls(np.column_stack([alone, common]) / sigma[:, None], found / sigma)
+            expected = parts[0] * alone + parts[1] * common
+        if misfit < least:
+            best, least = (parts / adjustment.sigma0**2, length), misfit
+    if best is None or best[0][1] == 0:
+        return None
+    (of_each, of_neighbours), length_px = best
+    return ErrorCorrelation(float(of_each), float(of_neighbours), float(length_px))
+
+
+@checked_arguments()
+def with_neighbours(adjustment: Adjustment) -> Adjustment:
+    """Return the adjustment with the covariance of errors that neighbours have in common by the residuals."""
+    found = estimate_error_correlation(adjustment)
+    return adjustment if found is None else with_error_correlation(adjustment, found)
+
+
+def _cells(image: IntArray, xy: FloatArray, used: BoolArray, side_px: float) -> csr_matrix:
+    """Return which image points are in each cell of the photographs that has some, (cells, k)."""
+    of_cell = np.column_stack([image, np.floor(xy / side_px)])[used]
+    cell = np.unique(of_cell, axis=0, return_inverse=True)[1].ravel()
+    return csr_matrix((np.ones(len(cell)), (cell, np.flatnonzero(used))), shape=(cell.max() + 1, len(used)))
+
+
+def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:
+    """Return the sums of squares of residuals, and of their sums over cells of each size, of a draw."""
+    v = v.reshape(cells[0].shape[1], -1)
+    draws = v.shape[1] / 2
+    return np.array([float((v**2).sum()), *(float(((one @ v) ** 2).sum()) for one in cells)]) / draws
+
+
+def _fields(image: IntArray, xy: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
+    """Return random fields in each photograph with covariance exp(-d / length), (k, 2, DRAWS).
+
+    Wave numbers are drawn from its spectrum, that of a bivariate Cauchy distribution.
+    """
+    field = np.empty((len(xy), 2, DRAWS))
+    for rows in rows_of(image, int(image.max()) + 1):
+        waves = rng.standard_normal((2, WAVES)) / np.abs(rng.standard_normal(WAVES)) / length_px
+        phase = xy[rows] @ waves
+        amplitude = rng.standard_normal((2, WAVES, 2 * DRAWS)) / np.sqrt(WAVES)
+        drawn = np.cos(phase) @ amplitude[0] + np.sin(phase) @ amplitude[1]
+        field[rows] = drawn.reshape(len(rows), 2, DRAWS)
+    return field
+
+
+def projection_map(
+    camera: Camera, covariance: FloatArray, seen: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the projection uncertainty over the whole photograph.
+
+    Args:
+        camera: interior orientation.
+        covariance: of its free parameters, (f, f).
+        seen: image points that calibrated it, px, (k, 2).
+
+    Returns:
+        Columns (c,) and rows (r,) of a grid, px, and the root mean square standard deviation of both
+        coordinates at its crossings, px, (r, c); NaN where the camera model folds over.
+    """
+    width, height = camera.size_px
+    cell = max(width, height) / CELLS
+    x = np.linspace(0, width - 1, max(2, round(width / cell) + 1))
+    y = np.linspace(0, height - 1, max(2, round(height / cell) + 1))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    Q = projection_covariance(camera, covariance, seen, grid)
+    sigma = np.sqrt(np.einsum("kii->k", Q) / 2)
+    return x, y, sigma.reshape(len(y), len(x))
+
+
+def observed_part(seen: FloatArray, xy: FloatArray) -> tuple[float, BoolArray]:
+    """Return the area that image points cover, their convex hull, px^2, and which places are in it.
+
+    Args:
+        seen: image points, px, (k, 2).
+        xy: places, px, (n, 2).
+
+    Returns:
+        The area, 0 of image points on one line, and whether each place is inside, (n,).
+    """
+    try:
+        hull = ConvexHull(seen)
+    except (QhullError, ValueError):  # on one line, or fewer than three
+        return 0.0, np.zeros(len(xy), dtype=bool)
+    inside = (xy @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)
+    return float(hull.volume), np.asarray(inside)
+
+
+def projection_covariance(
+    camera: Camera, covariance: FloatArray, seen: FloatArray, xy: FloatArray
+) -> FloatArray:
+    """Return the covariance of the places at which directions are seen, rotations taken out.
+
+    Args:
+        camera: interior orientation.
+        covariance: of its free parameters, (f, f).
+        seen: image points to which the rotation is fitted, px, (k, 2).
+        xy: where the directions are seen, px, (n, 2).
+
+    Returns:
+        px^2, (n, 2, 2); NaN where the camera model cannot be inverted, infinite where a parameter is not
+        determined.
+    """
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    if np.isinf(sigma).any():
+        return np.full((len(xy), 2, 2), np.inf)
+    known = np.flatnonzero(sigma > 0)
+    if not len(known):
+        return np.zeros((len(xy), 2, 2))
+    correlation = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
+    steps = np.zeros((len(known), len(camera.parameters)))
+    steps[np.arange(len(known)), np.flatnonzero(camera.free)[known]] = sigma[known]
+    moved_seen, turned_seen = _moved(camera, steps, seen), _turned(camera, seen)
+    sound = np.isfinite(moved_seen).all(axis=(1, 2)) & np.isfinite(turned_seen).all(axis=(1, 2))
+    of_rotation = turned_seen[sound].reshape(-1, 3)
+    rotation = np.linalg.lstsq(of_rotation, moved_seen[sound].reshape(-1, len(known)), rcond=None)[0]
+    J = _moved(camera, steps, xy) - _turned(camera, xy) @ rotation
+    return np.asarray(np.einsum("nis,st,njt->nij", J, correlation, J))
+
+
+def _moved(camera: Camera, steps: FloatArray, xy: FloatArray) -> FloatArray:
+    """Return by how much steps of the parameters (s, p) move pictures of distant points, px, (n, 2, s)."""
+    uv = tangents_from_pixel(camera, xy)
+    columns = []
+    for step in steps:
+        ahead = pixel_from_tangents(camera.with_parameters(camera.parameters + step / 2), uv)
+        columns.append(ahead - pixel_from_tangents(camera.with_parameters(camera.parameters - step / 2), uv))
+    return np.stack(columns, axis=-1)
+
+
+def _turned(camera: Camera, xy: FloatArray) -> FloatArray:
+    """Return how small rotations of the rays about the image axes move their pictures, px/rad, (n, 2, 3)."""
+    u, v = tangents_from_pixel(camera, xy).T
+    # of rays (u, v, -1): w x ray, divided by its depth again
+    turned = np.array([[u * v, -1 - u**2, -v], [1 + v**2, -u * v, u]])
+    return np.asarray(np.einsum("nij,jkn->nik", pixel_jacobian(camera, xy), turned))

@@ -22,9 +22,8 @@ from math import comb, log
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
-from sfm.units import SWELLING
 
 LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be distinguished from them

@@ -25,11 +25,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
-from sfm.depth_reversal import reverse_depth
 from sfm.distributions import f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
-from sfm.similarity import fit_similarity
+from sfm.similarity import fit_similarity, reverse_depth
 
 STEP = 1.3  # from one principal distance that is tried to the next
 STEPS = 6  # in each direction: c from a fifth to the fivefold

@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.commands.starting import FAILED, loading
+from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.cli.commands.surveying import AllowOutside, PicturesMb, Verbose
-from sfm.cli.first_use import compile_first
 from sfm.errors import KolinearError
 from sfm.runtime.faults import FAULT
 
 if TYPE_CHECKING:
+    from sfm.survey.assembly import OtherPrograms
     from sfm.survey.inputs.survey import Survey
-    from sfm.survey.other_programs import OtherPrograms
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import ModuleType

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from sfm.cli.commands.starting import FAILED, loading
-from sfm.cli.first_use import compile_first
+from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.display import counted
 from sfm.errors import KolinearError, MissingLibraryError
 
@@ -45,9 +44,8 @@ def doctor() -> None:
     """
     with loading():
         from sfm.files.user_cache import user_folder
-        from sfm.kernels.options import KEPT
-        from sfm.kernels.warmed import is_warm
-        from sfm.runtime.cores import cores
+        from sfm.kernels.compiling import KEPT, is_warm
+        from sfm.kernels.threads import cores
 
     console = Console(highlight=False)
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))

@@ -13,7 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.epochs.epoch import Epoch
+    from sfm.epochs.differences import Epoch
 
 
 def epochs(
@@ -68,8 +68,7 @@ def epochs(
     """
     with loading():
         from sfm.cli.console import print_verdict
-        from sfm.epochs.findings import verdict_of_epochs
-        from sfm.epochs.series import analyse_epochs
+        from sfm.epochs.series import analyse_epochs, verdict_of_epochs
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.epochs import describe_block, describe_stable
         from sfm.report.pages import write_page
@@ -112,7 +111,7 @@ def _epoch(path: Path) -> Epoch:
     from adapters.formats.given_table import read_given
     from adapters.formats.result_tables import read_result
     from sfm.cli.commands.surveying import run_file
-    from sfm.epochs.epoch import Epoch
+    from sfm.epochs.differences import Epoch
 
     folder = run_file(path) if path.is_file() else path
     with working_on(str(folder)):

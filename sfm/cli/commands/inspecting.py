@@ -145,7 +145,7 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
     import numpy as np
 
     from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
-    from sfm.files.ply import write_ply
+    from sfm.files.csv_tables import write_ply
     from sfm.report.measurement import point_sigma, write_point_covariance
 
     points = found.points

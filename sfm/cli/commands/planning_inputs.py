@@ -1,4 +1,9 @@
-"""Input of the commands of planning: object, camera, stations, and lists of numbers in one option."""
+"""Input of the commands of planning: object, camera, stations, and lists of numbers in one option.
+
+Cameras by their sensor, for plans made before one is bought or calibrated; the lens comes on top.
+
+Source: sizes of sensors and photographs as the makers state them; Nikon D60 as in document 000, sec. 2.5.1.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sfm.camera import Camera, camera_from_values
 from sfm.display import counted, listed
-from sfm.errors import SurveyFileError
+from sfm.errors import GeometryError, SurveyFileError
 
 if TYPE_CHECKING:
     from sfm.camera import Camera
@@ -21,7 +27,17 @@ if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
     from sfm.survey.observation_tables import ObservationTable
 
-
+SENSORS = {
+    "full-frame-24": ((6000, 4000), (36.0, 24.0)),
+    "full-frame-45": ((8192, 5464), (36.0, 24.0)),
+    "full-frame-61": ((9504, 6336), (35.7, 23.8)),
+    "aps-c-24": ((6000, 4000), (23.5, 15.6)),
+    "four-thirds-20": ((5184, 3888), (17.3, 13.0)),
+    "one-inch-20": ((5472, 3648), (13.2, 8.8)),
+    "machine-vision-5": ((2448, 2048), (8.446, 7.066)),
+    "machine-vision-12": ((4096, 3000), (14.131, 10.35)),
+    "nikon-d60": ((3872, 2592), (23.6, 15.8)),
+}
 NORMALS = ("nX", "nY", "nZ")
 
 
@@ -78,8 +94,6 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
         KolinearError: what was found, and what was expected.
     """
     import numpy as np
-
-    from sfm.planning.cameras import listed_camera
 
     path = Path(text)
     if path.is_dir():
@@ -276,7 +290,7 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     from sfm.survey.inputs.survey import read_survey
     from sfm.survey.observation_tables import with_tables
     from sfm.survey.rigs import planned_mounts
-    from sfm.survey.survey_network import with_given_mounts
+    from sfm.survey.target_network import with_given_mounts
 
     survey = read_survey(path)
     if survey.unit != unit:
@@ -298,3 +312,29 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
 
     bars = tuple(ScaleBarPlan(bar.start, bar.end, bar.sigma) for bar in survey.scale_bars)
     return PlannedSetup(cameras, rig, bars, given, survey)
+
+
+"""width and height of the photographs, px, and of the sensor, mm"""
+FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+"""what a self-calibrating adjustment usually determines"""
+
+
+def listed_camera(name: str, c_mm: float | None) -> Camera:
+    """Return a camera of the list with a lens without distortion, its interior orientation to be adjusted.
+
+    Args:
+        name: in SENSORS.
+        c_mm: principal distance, mm.
+
+    Raises:
+        GeometryError: another name, or no principal distance.
+    """
+    if name not in SENSORS:
+        raise GeometryError(
+            f"camera '{name:.60}': expected a survey file, a result folder or one of {', '.join(SENSORS)}"
+        )
+    if c_mm is None:
+        raise GeometryError(f"camera {name}: no focal length, needed --c-mm")
+    size, sensor = SENSORS[name]
+    pixel = (sensor[0] / size[0], sensor[1] / size[1])
+    return camera_from_values(name, "brown", size, pixel, c_mm=c_mm, free=FREE)

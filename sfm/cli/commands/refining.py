@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.commands.starting import FAILED, loading
-from sfm.cli.first_use import compile_first
+from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.runtime.faults import working_on
 
 

@@ -29,8 +29,7 @@ def validate(
     Exit code 1 if the in-house adjuster was ever the worse one.
     """
     with loading():
-        from adapters.colmap.adjuster import load_pycolmap
-        from adapters.colmap.validation_backend import ColmapBackend
+        from adapters.colmap.adjuster import ColmapBackend, load_pycolmap
         from sfm.cli.console import print_verdict
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
@@ -144,8 +143,7 @@ def convert(
             write_content,
             written,
         )
-        from sfm.comparison.camera_conversion import Conversion, convert_cameras
-        from sfm.comparison.undistortion import undistort
+        from sfm.comparison.camera_conversion import Conversion, convert_cameras, undistort
 
     ending = target.suffix.lower()
     if to_format is None and ending and ending not in ENDINGS:

@@ -1,4 +1,7 @@
-"""The first second of a command, and Ctrl-C at any moment."""
+"""The first second of a command, and Ctrl-C at any moment.
+
+The first command of an installation, which compiles the kernels, all cores at it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,6 @@ INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
 INTERRUPTED_TEXT = "kolinear: interrupted, nothing half-done is left (batch --resume goes on)"
 AT_ONCE_TEXT = "kolinear: ended at once; the next run into the same folder clears what is half-done"
 SAME_PRESS_SECONDS = 1.0  # `timeout` sends the signal of one Ctrl-C twice
-
 _running = ExitStack()
 """what lasts as long as the command"""
 _listening: list[bool] = []
@@ -86,3 +88,17 @@ def _announce_compiling() -> None:
         _running.enter_context(
             when_compiling(lambda: print(f"kolinear: the {COMPILING}", file=sys.stderr, flush=True))
         )
+
+
+def compile_first() -> None:
+    """Compile the kernels of a survey unless it was done for these sources, and report it on stderr."""
+    from sfm.kernels.compiling import is_warm
+
+    if is_warm():
+        return
+    from sfm import warm_up
+    from sfm.runtime.progress_bar import drawn_progress
+
+    print("kolinear: compiling the kernels, once, a minute or two", file=sys.stderr, flush=True)
+    with drawn_progress() as drawn:
+        warm_up.main(drawn)

@@ -60,12 +60,12 @@ def view(
         import webbrowser
 
         from adapters.formats.registry import format_of, read_comparable
-        from adapters.formats.targets_table import read_targets
+        from adapters.formats.result_tables import read_targets
         from sfm.files.globs import why_no_folder
+        from sfm.kernels.threads import cores
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.view_page import photographs_in, refuse_foreign_page, write_view
         from sfm.report.viewer.solution_scene import scene_of_stored
-        from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
 
     place = Path(os.path.abspath(source))  # through no link, as pages are written

@@ -10,6 +10,13 @@ all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is 
 result in both adjusters, and the comparison reports it.
 
 Cameras that share single parameters, for adjusters that know no such sharing.
+
+The network that two adjusters are given alike: one model, equal weights, free datum, the same unknowns.
+
+Whether the other adjuster's camera fits the image points better than that of the survey, and what to free.
+
+COLMAP frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
+that has more free than the survey's; that they agree then proves nothing about the survey.
 """
 
 from __future__ import annotations
@@ -22,20 +29,40 @@ from typing import Literal, Protocol
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
-from sfm.comparison.camera_conversion import Conversion
+from sfm.comparison.camera_conversion import Conversion, convert_camera, corresponding_free
 from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
-from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
-from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted, program_name
 from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf
-from sfm.network import Estimate, Network
+from sfm.distributions import chi2_isf, f_isf
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.reduced_network import reduce_network, supported
 from sfm.runtime.progress import report_step
 
+CAMERA_ALPHA = 0.001  # probability of the F-test where both cameras fit alike
+MIN_RMS_RATIO = 1.1  # times; below it the difference is not seen in the coordinates
+
+
+@dataclass(frozen=True)
+class BetterFit:
+    """A camera with more free parameters that fits the image points significantly better."""
+
+    own_rms_px: float  # per coordinate, the survey's camera, equal weights, px
+    rms_px: float  # the camera of the comparison, px
+    free: tuple[str, ...]  # what of the survey's cameras is held and should be free: "b1", clearest first
+
+    @property
+    def times(self) -> float:
+        """How many times smaller the residuals are."""
+        return self.own_rms_px / self.rms_px if self.rms_px > 0 else np.inf
+
+
+MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
 # The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
 # does not show whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
 MAX_ITERATIONS = 200
@@ -224,3 +251,112 @@ def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tu
         if names
     )
     return tuple(alone), words
+
+
+def common_problem(
+    adjustment: Adjustment, *, model: str | None = None
+) -> tuple[Network, Estimate, tuple[Conversion, ...], tuple[str, ...]]:
+    """Return the network, start values, conversions and changes of free parameters of a comparison.
+
+    Left are photographs that are oriented and show three points, points in two photographs, and accepted
+    image points, each with the covariance sigma_px^2 I. Parameters of a group that COLMAP frees as a
+    whole (focal lengths, principal point, distortion) are all free if one of them is, and in all cameras
+    that are not fixed.
+
+    Raises:
+        GeometryError: fewer than two photographs with accepted image points.
+    """
+    estimate = adjustment.estimate
+    cameras = estimate.cameras
+    if model is None:
+        one = {camera.model for camera in cameras}
+        model = one.pop() if len(one) == 1 and not cameras[0].in_mm else "full_opencv"
+    conversions = tuple(convert_camera(camera, model) for camera in cameras)
+    converted = tuple(conversion.camera for conversion in conversions)
+    grouped = grouped_free(converted)
+    freed = tuple(
+        f"{camera.name}: " + ", ".join(np.array(camera.names)[now.free & ~camera.free])
+        for camera, now in zip(converted, grouped, strict=True)
+        if (now.free & ~camera.free).any()
+    )
+    accepted = ~adjustment.rejected
+    images, points = supported(
+        adjustment.network, estimate, accepted, min_points=MIN_POINTS, min_rays=MIN_RAYS
+    )
+    if images.sum() < 2:
+        raise GeometryError("comparison: fewer than two photographs with accepted image points are left")
+    network, start = reduce_network(
+        adjustment.network, replace(estimate, cameras=grouped), images, points, accepted
+    )
+    seen = network.image_points
+    unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))
+    # Nothing but image points: no control, scale bars or other observations.
+    network = Network(
+        network.images,
+        network.camera,
+        network.points,
+        ImagePoints(seen.image, seen.point, seen.xy, unit),
+        moment=network.moment,
+    )
+    return network, start, conversions, freed
+
+
+def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
+    """Return cameras whose free parameters are whole groups, the same in all that are not fixed."""
+    free = [any(camera.free[camera.parts[g]].any() for camera in cameras) for g in range(3)]
+    out = []
+    for camera in cameras:
+        flags: BoolArray = np.zeros(len(camera.names), dtype=bool)
+        if camera.free.any():
+            for group, is_free in zip(camera.parts, free, strict=True):
+                flags[group] = is_free
+        out.append(replace(camera, free=flags))
+    return tuple(out)
+
+
+def distortion_held(camera: Camera) -> Camera:
+    """Return a camera with its distortion fixed."""
+    return replace(camera, free=camera.free & ~camera.parts[2])
+
+
+def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> BetterFit | None:
+    """Return by how much the camera of the comparison fits better; None where it does not.
+
+    Args:
+        survey: adjustment of the survey, with its cameras.
+        network: image points with equal weights, as both adjusters had them.
+        compared: the in-house adjustment of that network with the cameras of the comparison.
+    """
+    own_cameras = survey.estimate.cameras
+    more = _held_there(own_cameras, compared.estimate.cameras)
+    if not more or not compared.converged:
+        return None
+    start = replace(compared.estimate, cameras=own_cameras)
+    freer = _adjusted_freely(network, start, survey.sigma_px, covariance=False)
+    freed = freer.redundancy - compared.redundancy
+    if not freer.converged or freed <= 0 or compared.redundancy <= 0:
+        return None
+    F = (freer.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
+    found = BetterFit(freer.rms_px, compared.rms_px, more)
+    if f_isf(CAMERA_ALPHA, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
+        return None
+    tested = contradicted_parameters(
+        _adjusted_freely(network, freer.estimate, survey.sigma_px, covariance=True)
+    )
+    clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
+    return replace(found, free=clear or more)
+
+
+def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
+    """Return the parameters that the survey holds fixed and the comparison has free under another name."""
+    names: dict[str, None] = {}
+    for ours, theirs in zip(cameras, compared, strict=True):
+        free = corresponding_free(theirs, ours.model) & ~ours.free
+        names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
+    return tuple(names)
+
+
+def _adjusted_freely(network: Network, start: Estimate, sigma_px: float, *, covariance: bool) -> Adjustment:
+    return adjust(
+        network, start, datum=Datum("free"), sigma_px=sigma_px, reject="none", covariance=covariance
+    )

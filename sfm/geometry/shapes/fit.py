@@ -20,12 +20,9 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
-from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_weighted
-from sfm.geometry.shapes.kinds import KINDS, Kind
-from sfm.geometry.shapes.orthogonal import refine_orthogonal
-from sfm.geometry.shapes.robust import robust_shape, with_held
-from sfm.geometry.shapes.shape import Shape
-from sfm.geometry.shapes.start import start_shapes
+from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_orthogonal, refine_weighted
+from sfm.geometry.shapes.kinds import KINDS, Kind, Shape
+from sfm.geometry.shapes.start import robust_shape, start_shapes, with_held
 
 WITH_DIAMETER = ("circle", "sphere", "cylinder")
 

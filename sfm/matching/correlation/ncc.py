@@ -4,6 +4,12 @@ The coefficient r is that of equation (2.6) of document 002; cv2.matchTemplate d
 refined by a parabola, which is good to a tenth of a pixel where the patches differ by a shift only. The sigma
 includes the misfit of the parabola: errors are 0.5 to 1.9 times as large on the textures tried, 2.6 times on
 a smooth one without noise at whole pixels, as nine values do not show the third powers.
+
+Significance of correlation: whether the best place beats the second-best by more than chance.
+
+The peak of a surface of correlation: best and second-best place, regression, parabola, precision.
+
+Correlation of a template with a window of the other photograph that is turned and scaled beforehand.
 """
 
 from __future__ import annotations
@@ -17,24 +23,20 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.matching.correlation.peak import (
-    CXX,
-    CXY,
-    CYY,
-    FLAG,
-    GAIN,
-    NOT_COMPARED,
-    OFFSET,
-    OUTPUTS,
-    SECOND,
-    R,
-    X,
-    Y,
-    read_peak,
-)
+from sfm.kernels.compiling import compiled, compiled_fast
 from sfm.matching.match_flags import NccFlag
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
+PEAK_ZONE = 2  # a second peak is at least this many pixels farther from the first in a row or column, px
+# Columns of what is read from a surface: x and y in it with their covariances, r, second r, gain, offset.
+OUTPUTS = 10
+FLAG, X, Y, CXX, CXY, CYY, R, SECOND, GAIN, OFFSET = range(OUTPUTS)
+NOT_COMPARED = np.array([int(NccFlag.OUTSIDE)] + [np.nan] * (OUTPUTS - 1))
+FLAT, BORDER, LOW, DOUBT = (
+    int(f) for f in (NccFlag.FLAT_TEXTURE, NccFlag.AT_BORDER, NccFlag.LOW_CORRELATION, NccFlag.AMBIGUOUS)
+)
+QUANTILE = 1.645  # of the normal distribution, one-sided, 5 %
+MAX_R = 1.0 - 1e-12  # above it Fisher's z is infinite
 # Standard deviation below which a template is flat, part of the full scale of 8 bit (of 16 bit alike).
 MIN_CONTRAST = 1.0 / 255.0
 
@@ -173,3 +175,263 @@ def _confirm(
     flag[lost] |= int(NccFlag.NOT_CONFIRMED)
     xy[lost] = np.nan
     return replace(matches, flag=flag, xy=xy)
+
+
+def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Return whether the second-best place may be as good as the best.
+
+    The difference of their Fisher's z is compared with its standard error, that of independent coefficients
+    of so many pixels. Of 3 independent pixels or less nothing can be concluded, and any second place counts.
+
+    Args:
+        best: coefficients r of the best places, (k,).
+        second: those of the second-best places, -1 where there is none, (k,).
+        pixels: pixels of the template that are independent of one another, (k,).
+
+    Source: Fisher (1921), Metron 1, pp. 3-32.
+    """
+    z = np.arctanh(np.clip([best, second], -MAX_R, MAX_R))
+    deviates = (z[0] - z[1]) * np.sqrt(np.maximum(pixels - 3.0, 0.0) / 2.0)
+    return np.asarray((second > -1.0) & ~(deviates >= QUANTILE))
+
+
+def independent_pixels(grey: AnyArray, xy: FloatArray, template_px: int) -> FloatArray:
+    """Return how many independent pixels are worth as much as a template, whose neighbours are alike, (k,).
+
+    Args:
+        grey: photograph, one channel, (H, W).
+        xy: centres of the templates, px, (k, 2); NaN is returned for those that reach outside or are flat.
+        template_px: odd side of the templates.
+
+    Source: Clifford, Richardson and Hemon (1989), Biometrics 45, pp. 123-134: 1 + n over the sum of the
+    squared autocorrelations. Those estimated from one template have noise, which makes the number up to a
+    half too small, and the test the more cautious, where neighbours are not alike at all.
+    """
+    wide = 2 * template_px  # of the transform, so that the template does not meet itself around the border
+    out = np.full(len(xy), np.nan)
+    for k, (x, y) in enumerate(template_corners(xy, template_px // 2, grey.shape).tolist()):
+        if x < 0:
+            continue
+        d = grey[y : y + template_px, x : x + template_px].astype(float)
+        d -= d.mean()
+        if not d.any():
+            continue
+        rho = np.fft.irfft2(np.abs(np.fft.rfft2(d, (wide, wide))) ** 2, (wide, wide))
+        out[k] = 1.0 + d.size / ((rho / rho[0, 0]) ** 2).sum()
+    return out
+
+
+@compiled
+def read_peak(
+    template: AnyArray,
+    window: AnyArray,
+    surface: AnyArray,
+    whole: AnyArray,
+    least: tuple[float, float],
+    min_r: float,
+    max_second: float,
+    out: FloatArray,
+) -> None:
+    """Fill best and second-best peak of a surface of r, its parabola and the regression of intensities.
+
+    Args:
+        template: intensities, float32, (s, s); contiguous, as all of these: there is one compiled form.
+        window: intensities of the search window, float32, (H, W).
+        surface: r where a match is allowed, else -1, float32, (H - s + 1, W - s + 1).
+        whole: r everywhere, for the parabola; same shape.
+        least: standard deviations below which a template, and a window, are flat.
+        min_r: smallest r of a match.
+        max_second: largest ratio of the second-best r to the best.
+        out: receives the columns FLAG to OFFSET.
+    """
+    rows, cols = surface.shape
+    side = template.shape[0]
+    n = side * side
+    highest = np.empty(rows, np.float32)  # of each row: most rows need no second look
+    bi, bj = 0, 0
+    for i in range(rows):
+        highest[i] = _largest(surface[i])
+        if highest[i] > highest[bi]:
+            bi = i
+    while bj < cols - 1 and surface[bi, bj] < highest[bi]:
+        bj += 1
+    # the sums of cv2 are in float32: the best place in double precision
+    tm, wm = 0.0, 0.0
+    for i in range(side):
+        for j in range(side):
+            tm += template[i, j]
+            wm += window[bi + i, bj + j]
+    tm, wm = tm / n, wm / n
+    tt, ww, tw = 0.0, 0.0, 0.0
+    for i in range(side):
+        for j in range(side):
+            t, w = template[i, j] - tm, window[bi + i, bj + j] - wm
+            tt += t * t
+            ww += w * w
+            tw += t * w
+    out[X], out[Y] = bj, bi
+    if tt < n * least[0] ** 2 or ww < n * least[1] ** 2:
+        out[FLAG] = FLAT
+        return
+    r = tw / np.sqrt(tt * ww)
+    out[R], out[GAIN], out[OFFSET] = r, tw / tt, wm - tw / tt * tm
+    second = np.float32(-1.0)
+    for i in range(rows):
+        if highest[i] <= second:
+            continue
+        for j in range(cols):
+            r2 = surface[i, j]
+            if r2 <= second or (abs(i - bi) <= PEAK_ZONE and abs(j - bj) <= PEAK_ZONE):
+                continue
+            top = True  # of its neighbours, or it is only the slope of a peak
+            for u in range(max(0, i - 1), min(rows, i + 2)):
+                for v in range(max(0, j - 1), min(cols, j + 2)):
+                    top = top and surface[u, v] <= r2
+            if top:
+                second = r2
+    out[SECOND] = second
+    if r < min_r:
+        out[FLAG] = LOW
+    elif bi == 0 or bj == 0 or bi == rows - 1 or bj == cols - 1:
+        out[FLAG] = BORDER
+    elif second > max_second * r:
+        out[FLAG] = DOUBT
+    if out[FLAG] != 0:
+        return
+    # least squares parabola through the nine coefficients around the peak (their weights in closed form)
+    gx, gy, hxx, hyy, hxy = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            s = whole[bi + i, bj + j]
+            gx += j * s / 6.0
+            gy += i * s / 6.0
+            hxy += i * j * s / 4.0
+            hxx += (j * j - 2.0 / 3.0) * s
+            hyy += (i * i - 2.0 / 3.0) * s
+    det = hxx * hyy - hxy * hxy
+    if not (hxx < 0.0 and det > 0.0):
+        out[FLAG] = DOUBT
+        return
+    dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
+    out[X] += min(1.0, max(-1.0, dx))
+    out[Y] += min(1.0, max(-1.0, dy))
+    # least squares of the shift has N = sum g g^T = -r'' sum f^2 / r, sigma^2 = (1 - r^2) sum f^2 / (n - 4)
+    c = (1.0 - r * r) * r / (n - 4) / det
+    # r is no parabola: what the nine coefficients miss it by, of 9 - 6 degrees of freedom, is in the gradient
+    mean = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            mean += whole[bi + i, bj + j] / 9.0
+    misfit = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            bend = hxx * (j * j - 2.0 / 3.0) / 2.0 + hyy * (i * i - 2.0 / 3.0) / 2.0 + hxy * i * j
+            misfit += (whole[bi + i, bj + j] - mean - gx * j - gy * i - bend) ** 2
+    m = misfit / 3.0 / 6.0 / (det * det)
+    out[CXX] = -hyy * c + m * (hyy * hyy + hxy * hxy)
+    out[CXY] = hxy * c - m * hxy * (hxx + hyy)
+    out[CYY] = -hxx * c + m * (hxx * hxx + hxy * hxy)
+
+
+@compiled_fast
+def _largest(row: AnyArray) -> float:
+    """Return the largest of some numbers."""
+    largest: float = row[0]
+    for value in row:
+        largest = max(largest, value)
+    return largest
+
+
+def match_ncc_warped(
+    left: AnyArray,
+    right: AnyArray,
+    xy_left: FloatArray,
+    xy_right: FloatArray,
+    linear: FloatArray,
+    *,
+    reach_px: IntArray,
+    template_px: int = 19,
+    min_correlation: float = 0.5,
+    max_second: float = 1.0,
+) -> NccMatches:
+    """Look for templates in windows of the right photograph that are resampled by an affine map each.
+
+    Args:
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
+        xy_left: points in the left photograph, px, (k, 2).
+        xy_right: where they are expected in the right one, px, (k, 2).
+        linear: right px per left px around each point, (k, 2, 2).
+        reach_px: how far from there they may be along a row and a column, left px, (k,).
+        template_px: odd side of the template.
+        min_correlation: smallest r of a match.
+        max_second: largest ratio of the second-best r to the best.
+
+    Returns:
+        One result for each point, places and covariances in the right photograph.
+
+    Raises:
+        GeometryError: an even template, no reach, or points that do not go in threes with place and map.
+
+    Source: as `match_ncc`; the window is resampled by bilinear interpolation.
+    """
+    side = odd_window("NCC template", template_px)
+    a, b = np.asarray(xy_left, dtype=float).reshape(-1, 2), np.asarray(xy_right, dtype=float).reshape(-1, 2)
+    A = np.asarray(linear, dtype=float)
+    if (reach_px < 1).any():
+        raise GeometryError(f"NCC: a reach of {reach_px.min()} px, needed at least 1 px")
+    if len(a) != len(b) or A.shape != (len(a), 2, 2):
+        raise GeometryError(
+            f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(b), 'place')} in the "
+            "right and maps of shape "
+            f"{A.shape}, needed one of each for every point"
+        )
+    grey_left, grey_right = grey_of(left), grey_of(right)
+    least = least_deviations(left, right)
+    half = side // 2
+    out = np.zeros((len(a), OUTPUTS))
+    corners = template_corners(a, half, grey_left.shape)
+    usable = (corners[:, 0] >= 0) & np.isfinite(b).all(axis=1) & np.isfinite(A).all(axis=(1, 2))
+    fraction = a - np.rint(a)
+    for k in range(len(a)):
+        reach = int(reach_px[k])
+        inside = _inside(A[k], b[k], fraction[k], half, reach, grey_right.shape) if usable[k] else None
+        if inside is None or not inside.any():
+            out[k] = NOT_COMPARED
+            continue
+        x, y = corners[k].tolist()
+        first = b[k] - A[k] @ (fraction[k] + half + reach)  # where the window's first pixel comes from
+        window = cv2.warpAffine(
+            grey_right,
+            np.column_stack([A[k], first]),
+            (side + 2 * reach, side + 2 * reach),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])  # as windows are
+        surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+        allowed = np.where(inside, surface, np.float32(-1.0))
+        read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
+    around = np.repeat(-(half + reach_px)[:, None], 2, axis=1)  # of the windows, as seen from their middles
+    matches = matches_of(out, around, np.zeros_like(a), half)
+    return replace(
+        matches,
+        xy=b + np.einsum("kij,kj->ki", A, matches.xy),
+        peak=b + np.einsum("kij,kj->ki", A, matches.peak),
+        covariance=A @ matches.covariance @ A.transpose(0, 2, 1),
+    )
+
+
+def _inside(
+    A: FloatArray, b: FloatArray, fraction: FloatArray, half: int, reach: int, shape: tuple[int, ...]
+) -> BoolArray:
+    """Return at which places of the window the whole template is inside the right photograph, (n, n)."""
+    at = np.arange(-reach, reach + 1.0)
+    x, y = at[None, :] - fraction[0], at[:, None] - fraction[1]
+    inside = np.ones((len(at), len(at)), dtype=bool)
+    for row in (-half, half):
+        for col in (-half, half):
+            u = A[0, 0] * (x + col) + A[0, 1] * (y + row) + b[0]
+            v = A[1, 0] * (x + col) + A[1, 1] * (y + row) + b[1]
+            inside &= (u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)
+    return inside

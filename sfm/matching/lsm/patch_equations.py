@@ -3,6 +3,10 @@
 Observations are the intensities of the window; unknowns are 2, 6 or 8 geometric parameters, offset and gain,
 and, where the photographs may be blurred differently, three of the difference of their blur.
 The template is in single precision, the sums are in double.
+
+Windows: the intensities of a photograph on the grid of a window, shifted or warped.
+
+The warp of a patch: homography H from its window to pixels of the right photograph.
 """
 
 from __future__ import annotations
@@ -12,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.cholesky import factorise
-from sfm.kernels.options import compiled, compiled_fast
-from sfm.kernels.sampling import TAPS
-from sfm.matching.lsm.window import resample_window
+from sfm.kernels.compiling import compiled, compiled_fast
+from sfm.kernels.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, sample
+from sfm.kernels.small_algebra import factorise
 from sfm.matching.match_flags import FLAT_TEXTURE, MATCHED, OUTSIDE
 
+MAX_STRETCH = 3.0  # ratio of lengths, of a patch in both photographs, that is a match no more
 MODELS = {"shift": 2, "affine": 6, "projective": 8}  # geometric parameters
 RADIOMETRIC = 2  # offset and gain
 # Differences of the second moments of blur, px^2: xx, xy, yy. A blur changes intensities by half the products
@@ -151,3 +155,127 @@ def dot(a: AnyArray, b: AnyArray) -> float:
     for p in range(len(a)):
         total += np.float64(a[p]) * np.float64(b[p])
     return total
+
+
+@compiled
+def resample_window(
+    grey: AnyArray, x: float, y: float, reach: int, kind: int, wx: AnyArray, wy: AnyArray, grid: AnyArray
+) -> bool:
+    """Fill `grid` with the intensities at (x + j, y + i), |i|, |j| <= reach; False outside the photograph."""
+    height, width = grey.shape
+    if not (x >= reach and y >= reach and x <= width - 1.0 - reach and y <= height - 1.0 - reach):
+        return False
+    col, row = int(np.floor(x)), int(np.floor(y))
+    fx, fy = x - col, y - row
+    if fx == 0.0 and fy == 0.0:
+        for i in range(-reach, reach + 1):
+            for j in range(-reach, reach + 1):
+                grid[reach + i, reach + j] = grey[row + i, col + j]
+        return True
+    before, after = reach + BEFORE, reach + AFTER
+    if col < before or row < before or col + after > width - 1 or row + after > height - 1:
+        return False
+    kernel_weights(kind, np.float32(fx), wx)
+    kernel_weights(kind, np.float32(fy), wy)
+    flat, step = grey.reshape(-1), np.uintp(width)
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            at = np.uintp((row + i - BEFORE) * width + col + j - BEFORE)
+            grid[reach + i, reach + j] = sample(flat, at, step, wx, wy)
+    return True
+
+
+@compiled_fast
+def resample_patch(
+    grey: AnyArray, H: FloatArray, half: int, kind: int, wx: AnyArray, wy: AnyArray, patch: AnyArray
+) -> bool:
+    """Fill `patch` with S(H x) for x in the window; False where it reaches beyond the photograph."""
+    height, width = grey.shape
+    for b in (-half, half):
+        for a in (-half, half):
+            w = H[2, 0] * a + H[2, 1] * b + H[2, 2]
+            if not w > 0.0:
+                return False
+            x = (H[0, 0] * a + H[0, 1] * b + H[0, 2]) / w
+            y = (H[1, 0] * a + H[1, 1] * b + H[1, 2]) / w
+            if not (x >= BEFORE and y >= BEFORE and x < width - AFTER and y < height - AFTER):
+                return False
+    flat, step = grey.reshape(-1), np.uintp(width)
+    perspective = H[2, 0] != 0.0 or H[2, 1] != 0.0
+    p = 0
+    for b in range(-half, half + 1):
+        x0, y0, w0 = H[0, 1] * b + H[0, 2], H[1, 1] * b + H[1, 2], H[2, 1] * b + H[2, 2]
+        for a in range(-half, half + 1):
+            x, y = x0 + H[0, 0] * a, y0 + H[1, 0] * a
+            if perspective:
+                w = w0 + H[2, 0] * a
+                x, y = x / w, y / w
+            col, row = int(x), int(y)
+            fx, fy = np.float32(x - col), np.float32(y - row)
+            if kind == BILINEAR:
+                q = row * width + col
+                top, low = flat[q], flat[q + width]
+                top += fx * (flat[q + 1] - top)
+                low += fx * (flat[q + width + 1] - low)
+                patch[p] = top + fy * (low - top)
+            else:
+                kernel_weights(kind, fx, wx)
+                kernel_weights(kind, fy, wy)
+                at = np.uintp((row - BEFORE) * width + col - BEFORE)
+                patch[p] = sample(flat, at, step, wx, wy)
+            p += 1
+    return True
+
+
+@compiled
+def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int) -> float:
+    """Put the step q on H, H <- H dH^-1; return the shift in px, inf if the patch is turned inside out."""
+    beta = q[geometric + 1]
+    if not beta > 0.0:
+        return np.inf
+    x, y = H[0, 2], H[1, 2]
+    d00, d01, d02 = 1.0, 0.0, half * q[0] / beta
+    d10, d11, d12 = 0.0, 1.0, half * q[1] / beta
+    d20, d21 = 0.0, 0.0
+    if geometric > 2:
+        d00 += q[2] / beta
+        d01 += q[3] / beta
+        d10 += q[4] / beta
+        d11 += q[5] / beta
+    if geometric > 6:
+        d20, d21 = q[6] / (beta * half), q[7] / (beta * half)
+    # adjugate of dH; its determinant is only a scale, which the norm H[2, 2] = 1 takes out
+    a00, a01, a02 = d11 - d12 * d21, d02 * d21 - d01, d01 * d12 - d02 * d11
+    a10, a11, a12 = d12 * d20 - d10, d00 - d02 * d20, d02 * d10 - d00 * d12
+    a20, a21, a22 = d10 * d21 - d11 * d20, d01 * d20 - d00 * d21, d00 * d11 - d01 * d10
+    if not d00 * a00 + d10 * a01 + d20 * a02 > 1e-3:
+        return np.inf
+    for i in range(3):
+        h0, h1, h2 = H[i, 0], H[i, 1], H[i, 2]
+        H[i, 0] = h0 * a00 + h1 * a10 + h2 * a20
+        H[i, 1] = h0 * a01 + h1 * a11 + h2 * a21
+        H[i, 2] = h0 * a02 + h1 * a12 + h2 * a22
+    if not H[2, 2] > 0.0:
+        return np.inf
+    scale = 1.0 / H[2, 2]
+    for i in range(3):
+        for j in range(3):
+            H[i, j] *= scale
+    det = area_ratio(H)
+    if not (det > MAX_STRETCH**-2 and det < MAX_STRETCH**2):
+        return np.inf
+    return float(np.hypot(H[0, 2] - x, H[1, 2] - y))
+
+
+@compiled
+def area_ratio(H: FloatArray) -> float:
+    """Return the right area of a unit area at the point: the determinant of d(H x)/dx at x = 0."""
+    xx, xy = H[0, 0] - H[0, 2] * H[2, 0], H[0, 1] - H[0, 2] * H[2, 1]
+    yx, yy = H[1, 0] - H[1, 2] * H[2, 0], H[1, 1] - H[1, 2] * H[2, 1]
+    ratio: float = xx * yy - xy * yx
+    return ratio
+
+
+def linear_part(warp: FloatArray) -> FloatArray:
+    """Return d(H x)/dx at x = 0 of homographies (k, 3, 3) whose H[2, 2] is 1, (k, 2, 2)."""
+    return np.asarray(warp[:, :2, :2] - warp[:, :2, 2:] * warp[:, 2:, :2])

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.cholesky import factorise, solve_factorised
-from sfm.kernels.options import compiled, compiled_fast
+from sfm.kernels.compiling import compiled, compiled_fast
 from sfm.kernels.sampling import TAPS, kernel_weights
-from sfm.matching.lsm.patch_equations import BLUR_NOISE, RADIOMETRIC, SLOPE_NOISE, Workspace, dot
-from sfm.matching.lsm.warp import area_ratio
+from sfm.kernels.small_algebra import factorise, solve_factorised
+from sfm.matching.lsm.patch_equations import BLUR_NOISE, RADIOMETRIC, SLOPE_NOISE, Workspace, area_ratio, dot
 from sfm.matching.match_flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 
 # Texture is flat in a direction in which the gradients of the window together have no more energy than noise

@@ -24,10 +24,19 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.kernels.cholesky import solve_factorised
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import BILINEAR, interpolation_index
-from sfm.matching.lsm.patch_equations import BLUR, MODELS, Workspace, dot, new_workspace, prepare_template
+from sfm.kernels.small_algebra import solve_factorised
+from sfm.matching.lsm.patch_equations import (
+    BLUR,
+    MODELS,
+    Workspace,
+    dot,
+    new_workspace,
+    prepare_template,
+    put_step,
+    resample_patch,
+)
 from sfm.matching.lsm.patch_precision import (
     CXX,
     CXY,
@@ -43,8 +52,6 @@ from sfm.matching.lsm.patch_precision import (
     Y,
     judge,
 )
-from sfm.matching.lsm.warp import put_step
-from sfm.matching.lsm.window import resample_patch
 from sfm.matching.match_flags import DIVERGED, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
 from sfm.matching.radiometry import Grey, grey_of, odd_window
 

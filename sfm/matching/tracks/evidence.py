@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_three
 from sfm.matching.epipolar import epipolar_distance
 

@@ -18,18 +18,19 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.threads import in_threads
-from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.tracks.features import Features, matched_features
-from sfm.matching.tracks.natural_points import NaturalPoints
-from sfm.matching.tracks.overlap import (
+from sfm.matching.radiometry import GreyPhotographs
+from sfm.matching.tracks.features import (
+    Features,
     common_features,
     connected_parts,
     connecting_pairs,
+    matched_features,
     overlapping_pairs,
 )
+from sfm.matching.tracks.interest import NaturalPoints
 from sfm.network import rows_of
 from sfm.runtime.progress import reported
 

@@ -2,6 +2,8 @@
 
 Where gradients of all directions meet in a window, a match is precise in all directions: the normal
 equations N = sum g g^T of a shift are large (weight w) and round (roundness q).
+
+Natural points of one photograph, found before any other photograph is read.
 """
 
 from __future__ import annotations
@@ -16,9 +18,11 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import grey_of, odd_window
+from sfm.matching.tracks.features import Features, sift_features
 
+DETECTORS = ("foerstner", "sift")
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75 and w >= 0.5 to 1.5 times its mean over the photograph.
 MIN_ROUNDNESS = 0.5
 WEIGHT_OF_MEAN = 0.5
@@ -242,3 +246,33 @@ def _intersect_edges(
         place[k, 1] = row[k] + (dy if inside else 0.0)
         covariance[k, 0, 0], covariance[k, 1, 1] = variance * yy / det, variance * xx / det
         covariance[k, 0, 1] = covariance[k, 1, 0] = -variance * xy / det
+
+
+@dataclass(frozen=True)
+class NaturalPoints(Features):
+    """SIFT features of a photograph, and the places in it at which matching is the most precise."""
+
+    corners: FloatArray  # px, the strongest first, (c, 2); none where features stay where they are
+
+
+@checked_arguments()
+def natural_points(
+    photograph: AnyArray, *, detector: str = "foerstner", max_features: int = 2000
+) -> NaturalPoints:
+    """Find what photographs of natural texture are linked and measured by, in one of them.
+
+    Args:
+        photograph: (H, W), 8 or 16 bit, grey or colour.
+        detector: foerstner finds places for the points, sift leaves them on their features.
+        max_features: the strongest ones of all parts of the photograph.
+
+    Raises:
+        GeometryError: an unknown detector.
+
+    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places.
+    """
+    if detector not in DETECTORS:
+        raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
+    found = sift_features(photograph, max_features=max_features)
+    corners = foerstner_points(photograph).xy if detector == "foerstner" else np.zeros((0, 2))
+    return NaturalPoints(found.xy, found.scale, found.angle, found.descriptor, corners)

@@ -7,6 +7,13 @@ points, intersection of all points, and adjustment by a function of the caller, 
 orientation is learnt while the network grows. At last photographs that the others contradict leave. Given
 values are start values: they are completed and adjusted as they are, and only where the image points do not
 fit the result are photographs oriented anew, with them or, if they lead nowhere, without them.
+
+Given start values of a network: completed and adjusted as they are, judged afterwards.
+
+A photograph is oriented anew only where most of its image points do not fit the others after the adjustment;
+where most photographs do not, the given values are wrong, and the caller starts without them.
+
+Points that no photograph was oriented on: intersected at last, at whatever angle, or named.
 """
 
 from __future__ import annotations
@@ -18,27 +25,37 @@ import numpy as np
 
 from sfm.arguments import checked_arguments
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
-from sfm.orientation.incremental.given_values import start_from_given
-from sfm.orientation.incremental.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
-from sfm.orientation.incremental.other_solutions import (
+from sfm.orientation.incremental.growth import (
+    FIRST_ADJUSTMENT,
+    MIN_SHARE,
+    Growth,
+    Refine,
+    has_given_values,
+    residual_lengths,
+)
+from sfm.orientation.incremental.poor_photographs import (
     SMALLER_TOLERANCES,
     bounded_costs,
     casts_doubt,
+    judge_misfits,
     reversed_growth,
     worst_photographs,
 )
-from sfm.orientation.incremental.poor_photographs import judge_misfits
-from sfm.orientation.incremental.remaining_points import intersect_remaining
 from sfm.orientation.incremental.starting_pair import Start
+from sfm.orientation.intersection import intersect
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 
+PARALLEL_SIGMAS = 4.0  # standard deviations of its angle by which two rays must differ from parallel ones
+MAX_COMPLETIONS = 50  # rounds of resection and intersection of what no values were given for
+KEPT_SHARE = 0.5  # of the photographs must fit, each with most of its image points, for given values to stay
+KEPT_TOLERANCE = 2.0  # times the final tolerance, that the residuals from given values may need
+ROUNDS = 3  # of adjustment, while image points come or go
 Judge = Callable[[Estimate], float]
-
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
@@ -322,3 +339,140 @@ def _list_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
         of_reason.setdefault(reason.text.rstrip("."), []).append(name)
     words = (f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items())
     return listed(words, most=10, separator="; ")
+
+
+@dataclass(frozen=True)
+class GivenStart:
+    """Given values that stay, with what was oriented and intersected beside them."""
+
+    estimate: Estimate  # before the adjustment that judges them
+    replaced: tuple[Remark, ...]  # given orientations of single photographs that did not fit
+
+
+def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> GivenStart | None:
+    """Complete given values and adjust them; None where they do not fit the image points.
+
+    Args:
+        growth: begun with given values; contains the adjusted network afterwards.
+        refine: the caller's adjustment.
+        final_tolerance_px: below this no image point is put aside, px.
+    """
+    control = growth.network.control.complete
+    held = control.point[growth.fixed[control.point]]
+    _complete(growth)
+    start = growth.estimate
+    if start.oriented.sum() < 2:
+        return None
+    rough = bool(np.median(growth.share_fitting()[start.oriented]) < KEPT_SHARE)
+    replaced: tuple[Remark, ...] = ()
+    for _ in range(ROUNDS):
+        changed = growth.refined(refine, everything=rough)
+        growth.adapt_tolerance(final_tolerance_px)
+        if not replaced:
+            replaced = _replace_misfits(growth)
+        growth.intersect(only_missing=True)
+        if not changed and not replaced:
+            break
+        rough = False
+    fitting = growth.share_fitting()[growth.estimate.oriented] >= KEPT_SHARE
+    if fitting.mean() <= KEPT_SHARE or (growth.tolerance_px > KEPT_TOLERANCE * final_tolerance_px).any():
+        return None
+    return GivenStart(start, replaced) if _near_control(growth, start, held) else None
+
+
+def _complete(growth: Growth) -> None:
+    """Orient and intersect what no values were given for; what was given stays as it is."""
+    for _ in range(MAX_COMPLETIONS):
+        growth.intersect(only_missing=True)
+        if not growth.resect_next():
+            break
+
+
+def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
+    """Resect the photographs most of whose image points do not fit; return what was replaced."""
+    before = growth.share_fitting()
+    wrong = np.flatnonzero(growth.estimate.oriented & (before < MIN_SHARE)).tolist()
+    if not wrong:
+        return ()
+    growth.resect(wrong)
+    after = growth.share_fitting()
+    count = np.bincount(growth.network.image_points.image, minlength=len(after))
+    return tuple(
+        remark(
+            "orientation_replaced",
+            photograph=growth.network.images[i],
+            before=round(before[i] * count[i]),
+            after=round(after[i] * count[i]),
+            image_points=int(count[i]),
+        )
+        for i in wrong
+        if after[i] >= MIN_SHARE
+    )
+
+
+def _near_control(growth: Growth, start: Estimate, held: IntArray) -> bool:
+    """Return whether most rays of control that is held to its coordinates meet it from the given stations."""
+    seen = growth.network.image_points
+    rows = np.isin(seen.point, held) & start.oriented[seen.image]
+    if not rows.any():
+        return True
+    limit = growth.start_tolerance_px[growth.network.camera[seen.image]]
+    lengths = residual_lengths(
+        growth.network, Estimate(growth.estimate.cameras, start.position, start.rotation, start.points)
+    )
+    return bool((lengths <= limit)[rows].mean() >= KEPT_SHARE)
+
+
+def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[str, Remark], ...]:
+    """Intersect the points that are still missing; return (name, reason) of those that have no place.
+
+    Nothing is oriented on them any more, so that a small angle does no harm: their standard deviations
+    show it. Rays that are parallel within their precision, or within the tolerance of the orientation,
+    have no point of intersection.
+
+    Args:
+        growth: all photographs oriented that can be; gets the points.
+        contradicting: whether points whose rays do not meet within the tolerance get a place, too.
+    """
+    network, estimate = growth.network, growth.estimate
+    seen, n = network.image_points, len(network.points)
+    missing = ~estimate.determined
+    rows = missing[seen.point]
+    if not rows.any():
+        return _reasons(growth, np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool))
+    oriented = rows & estimate.oriented[seen.image]
+    rays = np.bincount(seen.point[oriented], minlength=n)
+    uv = np.where(rows[:, None], growth.tangents(), np.nan)
+    c = np.array([camera.c_px for camera in estimate.cameras])[network.camera[seen.image]]
+    sigma = np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2) / 2) / c
+    worst = np.zeros(n)
+    np.maximum.at(worst, seen.point[oriented], sigma[oriented])
+    points, parallel = estimate.points.copy(), np.zeros(n, dtype=bool)
+    tolerance = float(growth.tolerance().max())
+    for limit in (tolerance, np.inf) if contradicting else (tolerance,):
+        found = intersect(
+            uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=limit
+        )
+        # beyond the precision of the rays and what the orientation is known to; False where NaN
+        clear = found.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)
+        parallel |= np.isfinite(found.angle) & ~clear
+        points = np.where((missing & clear & ~np.isfinite(points[:, 0]))[:, None], found.points, points)
+    growth.estimate = replace(estimate, points=points)
+    return _reasons(growth, rays, parallel)
+
+
+def _reasons(growth: Growth, rays: np.ndarray, parallel: np.ndarray) -> tuple[tuple[str, Remark], ...]:
+    """Say why points have no coordinates, of whose rays so many are from oriented photographs, (n,)."""
+    measured = growth.network.rays()
+    out = []
+    for j in np.flatnonzero(~growth.estimate.determined & (measured > 0)):
+        if measured[j] < 2:
+            reason = remark("point_with_few_rays", rays=1, needed=2)
+        elif rays[j] < 2:
+            reason = remark("point_of_lost_photographs", measured=int(measured[j]), needed=2)
+        elif parallel[j]:
+            reason = remark("point_with_parallel_rays", rays=int(rays[j]))
+        else:
+            reason = remark("point_with_rays_apart", rays=int(rays[j]))
+        out.append((growth.network.points[j], reason))
+    return tuple(out)

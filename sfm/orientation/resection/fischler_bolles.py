@@ -9,7 +9,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled_fused
+from sfm.kernels.compiling import compiled_fused
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
 

@@ -10,7 +10,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_scaled, turn
 
 UNKNOWNS = 6

@@ -14,7 +14,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
     DONE,

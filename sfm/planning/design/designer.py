@@ -21,8 +21,15 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Network
-from sfm.planning.design.candidates import COUNT, Candidates, StationLimits, candidates
-from sfm.planning.design.gain import cost_of, gains, image_rows
+from sfm.planning.design.candidates import (
+    COUNT,
+    Candidates,
+    StationLimits,
+    candidates,
+    cost_of,
+    gains,
+    image_rows,
+)
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.sight.visibility import Seeing

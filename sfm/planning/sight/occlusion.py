@@ -15,7 +15,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.geometry.mesh import Mesh
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 
 LEAF = 4  # triangles in a box that is not halved any more
 OFF_SURFACE = 1e-4  # of the size of the mesh: what is nearer to the point does not hide it

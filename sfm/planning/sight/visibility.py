@@ -2,10 +2,29 @@
 
 Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
 Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution).
+
+Depth of field of a lens.
+
+Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 3.1.1.3; with the hyperfocal distance
+H = f^2 / (N c) + f, near s (H - f) / (H + s - 2 f) and far s (H - f) / (H - s).
+
+Precision of a target in a photograph from its size, contrast, blur and noise.
+
+An edge blurred by a Gaussian of standard deviation s contains, per length, the information
+A^2 / (2 s sqrt(pi)) / noise^2 on a shift across it. Summed round an ellipse that is the Cramer-Rao bound of
+its centre, which the measurement of targets reaches within some 5 % where the background is even.
+
+    information = A^2 / (2 s sqrt(pi) noise^2) * integral of n n' dl
+    circle of radius R: sigma^2 = 2 s noise^2 / (sqrt(pi) R A^2)
+
+Source: Cramer-Rao bound; Foerstner and Wrobel (2016), sec. 4.2.
+
+Design of a network: how large targets must be, before anything is photographed.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
@@ -16,9 +35,34 @@ from sfm.camera import Camera, pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject
-from sfm.planning.sight.image_precision import TargetImage, centre_covariance
 from sfm.planning.sight.occlusion import hidden_points
-from sfm.planning.sight.optics import DepthOfField
+
+STEEPEST_DEG = 75.0  # beyond, a target is not recognised
+STEPS = 24  # round an ellipse; the integrand is smooth and periodic
+
+
+@dataclass(frozen=True)
+class TargetImage:
+    """How well targets stand out in the photographs."""
+
+    contrast: float = 120.0  # step of intensity between target and surroundings
+    noise: float = 2.0  # standard deviation of an intensity, same scale
+    blur_px: float = 0.8  # standard deviation of the edge, the box of a pixel included
+
+    def __post_init__(self) -> None:
+        for name, value in (("contrast", self.contrast), ("noise", self.noise), ("blur", self.blur_px)):
+            if not (math.isfinite(value) and value > 0):
+                raise GeometryError(f"target: {name} is {value:g}, needed more than 0")
+
+
+@dataclass(frozen=True)
+class DepthOfField:
+    """Distances along the optical axis between which points are sharp."""
+
+    near: float
+    far: float  # infinite beyond the hyperfocal distance
+    focus: float  # distance in focus
+
 
 MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
 MIN_DIAMETER_PX = 5.0  # shorter axis of a target from which on it is measured
@@ -201,3 +245,118 @@ def _outlines(
     )
     plane = np.stack([a, b], axis=2)
     return np.asarray(pixel_jacobian(camera, xy) @ of_tangents @ rotation.T @ plane * diameter / 2)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens with its setting; lengths in mm."""
+
+    f_number: float  # focal length over the diameter of the aperture
+    focus_mm: float  # distance of the plane in focus from the projection centre
+    confusion_mm: float  # diameter of the circle of confusion that still counts as sharp
+
+
+@checked_arguments()
+def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
+    """Return between which distances a lens is sharp, mm.
+
+    Args:
+        lens: the lens and its setting.
+        f_mm: focal length.
+
+    Raises:
+        GeometryError: a number that is not positive, or a focus within the focal length.
+
+    Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 3.1.1.3.
+    """
+    for name, value in (
+        ("f-number", lens.f_number),
+        ("focus distance", lens.focus_mm),
+        ("circle of confusion", lens.confusion_mm),
+        ("focal length", f_mm),
+    ):
+        if not (math.isfinite(value) and value > 0):
+            raise GeometryError(f"depth of field: {name} is {value:g}, needed more than 0")
+    s = lens.focus_mm
+    if s <= f_mm:
+        raise GeometryError(
+            f"depth of field: focus at {s:g} mm, needed farther than the focal length {f_mm:g} mm"
+        )
+    H = f_mm**2 / (lens.f_number * lens.confusion_mm) + f_mm
+    return DepthOfField(
+        s * (H - f_mm) / (H + s - 2 * f_mm), s * (H - f_mm) / (H - s) if s < H else math.inf, s
+    )
+
+
+def best_focus(near: float, far: float) -> float:
+    """Return the focus distance that is as sharp at the nearest as at the farthest point: 2 n f / (n + f)."""
+    return 2 * near * far / (near + far)
+
+
+@checked_arguments(axes="k 2 2")
+def centre_covariance(axes: FloatArray, target: TargetImage) -> FloatArray:
+    """Return the covariance of the centres of ellipses, px^2, (k, 2, 2).
+
+    Args:
+        axes: J of each ellipse: its outline is J (cos t, sin t)', px, (k, 2, 2).
+        target: contrast, noise and blur.
+
+    Source: Cramer-Rao bound of a blurred edge, summed round the outline.
+    """
+    t = 2 * np.pi * np.arange(STEPS) / STEPS
+    along = axes @ np.stack([-np.sin(t), np.cos(t)])  # (k, 2, steps)
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    length = np.linalg.norm(along, axis=1)
+    turned = np.einsum("kat,kbt,kt->kab", across, across, 1 / np.maximum(length, 1e-300)) * (t[1] - t[0])
+    factor = target.contrast**2 / (2 * target.blur_px * math.sqrt(math.pi) * target.noise**2)
+    return np.asarray(np.linalg.inv(factor * turned))
+
+
+@dataclass(frozen=True)
+class TargetSize:
+    """The size of targets for a camera and a distance."""
+
+    diameter: float  # of the dot, unit of the distance
+    ring: float  # outer diameter of a coded ring around it, unit of the distance
+    pixel: float  # side of a pixel at the object, unit of the distance
+
+
+@checked_arguments()
+def compute_target_size(
+    *,
+    p: float,
+    w_mm: float,
+    d: float,
+    c_mm: float,
+    n: int,
+    tilt_deg: float = 0.0,
+    ring_per_dot: float = 3.0,
+) -> TargetSize:
+    """Return how large a target must be to show so many pixels: r = p w d / (c n).
+
+    A target that is seen obliquely is shorter in one direction by the cosine of the tilt; its diameter is
+    larger by as much, so that it still shows p pixels there.
+
+    Args:
+        p: pixels across the target, at least.
+        w_mm: width of the sensor, mm.
+        d: farthest distance of the camera from the object, in any unit.
+        c_mm: principal distance (focal length), mm.
+        n: pixels along the width of the photograph.
+        tilt_deg: largest angle between the ray and the normal of a target, deg.
+        ring_per_dot: outer diameter of the code's ring in diameters of the dot.
+
+    Raises:
+        GeometryError: a number that is not positive, or a tilt at which targets are not recognised.
+
+    Source: document 000, eq. 2.88 (manual of PhotoModeler), there r = p fw d / (f pw).
+    """
+    given = {"pixels": p, "sensor width": w_mm, "distance": d, "principal distance": c_mm, "photograph": n}
+    for name, value in given.items():
+        if not (math.isfinite(value) and value > 0):
+            raise GeometryError(f"target size: {name} is {value:g}, needed more than 0")
+    if not 0 <= tilt_deg <= STEEPEST_DEG:
+        raise GeometryError(f"target size: tilt is {tilt_deg:g} deg, needed 0 to {STEEPEST_DEG:g} deg")
+    pixel = w_mm * d / (c_mm * n)
+    diameter = p * pixel / math.cos(math.radians(tilt_deg))
+    return TargetSize(diameter, ring_per_dot * diameter, pixel)

@@ -9,38 +9,30 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from sfm.remarks.catalogue import (
-    adjustment,
-    batches,
     cameras,
     comparisons,
-    datum,
-    drafting,
     given_values,
     hypotheses,
-    inputs,
     measuring,
-    other_programs,
     photographs,
     plans,
-    points,
-    refining,
 )
 from sfm.remarks.kind import Kind
 
 SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
     {
-        "The adjustment": adjustment.ROWS,
+        "The adjustment": hypotheses.ADJUSTMENT,
         "Causes and assumptions": hypotheses.ROWS,
         "Cameras": cameras.ROWS,
         "Photographs": photographs.ROWS,
-        "Points and image points": points.ROWS,
-        "Datum and scale": datum.ROWS,
+        "Points and image points": measuring.POINTS,
+        "Datum and scale": given_values.DATUM,
         "Scale bars, control and observed orientation": given_values.ROWS,
-        "Other programs": other_programs.ROWS,
-        "Refining": refining.ROWS,
-        "Drafts of survey files": drafting.ROWS,
-        "Batches and validation": batches.ROWS,
-        "Input": inputs.ROWS,
+        "Other programs": comparisons.OTHER_PROGRAMS,
+        "Refining": comparisons.REFINING,
+        "Drafts of survey files": photographs.DRAFTS,
+        "Batches and validation": plans.BATCHES,
+        "Input": photographs.INPUT,
         "Comparisons and epochs": comparisons.ROWS,
         "Measuring and acceptance": measuring.ROWS,
         "Plans": plans.ROWS,

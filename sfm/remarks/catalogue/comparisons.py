@@ -1,9 +1,91 @@
-"""Remarks on a comparison of two results or of two epochs."""
+"""Remarks on a comparison of two results or of two epochs.
+
+Refining the models of other programs.
+
+Other programs: whether another adjuster or pipeline agrees.
+"""
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Kind
+from sfm.remarks.kind import Grade, Kind
 
+OTHER_PROGRAMS = (
+    Kind(
+        "adjuster_differs",
+        "warning",
+        "{program} does not agree with the adjustment.",
+        "one of the two has not reached the minimum",
+        "Read the comparison in the report.",
+    ),
+    Kind(
+        "adjuster_fits_alike",
+        "note",
+        "The image points do not separate the solutions of Kolinear and {program}: v'Pv differs by {gap} "
+        "variances.",
+        "the network hardly determines the camera model of the comparison",
+        "The survey is valid; photograph from more directions and distances for a comparison of cameras.",
+    ),
+    Kind(
+        "adjuster_fits_better",
+        "warning",
+        "The camera of {program} with {parameters} free fits {times} times better: {rms} in place of "
+        "{before} RMS.",
+        "the camera model of the survey does not suit the lens",
+        "Free these parameters.",
+    ),
+    Kind(
+        "adjuster_failed",
+        "warning",
+        "The comparison with another adjuster failed: {reason}.",
+        "the other program refused the network",
+        "The survey is valid without it.",
+    ),
+    Kind(
+        "pipeline_failed",
+        "warning",
+        "The comparison with another pipeline failed: {reason}.",
+        "the other program refused the photographs",
+        "The survey is valid without it.",
+    ),
+    Kind(
+        "adjuster_not_compared",
+        "note",
+        "Not compared with another adjuster: {reason}.",
+        "a library is not installed",
+        "Install it to compare.",
+    ),
+    Kind(
+        "pipeline_not_compared",
+        "note",
+        "Not compared with another pipeline: {reason}.",
+        "a library is not installed",
+        "Install it to compare.",
+    ),
+)
+REFINING = (
+    Kind(
+        "refinement_hardly_better",
+        "warning",
+        "The RMS is {times} times that before, expected far less.",
+        "a camera model that does not suit the lens, something that moved, or little texture",
+        "Use another camera model; mask what moved.",
+    ),
+    Kind(
+        "photographs_not_adjusted",
+        "warning",
+        "{photographs:photograph} {photographs:was|were} not adjusted: {photographs}.",
+        "too few of {photographs:its|their} key points could be measured anew",
+        "See the reasons beside the key points; {photographs:the photograph keeps|the photographs keep} the "
+        "orientation of the model.",
+    ),
+    Kind(
+        "key_points_not_measured",
+        Grade("missing", warning=0.5),  # more than half: photographs or windows are wrong
+        "Only {measured} of {total} key points {measured:was|were} measured anew.",
+        "photographs of another size or state than those of the model, or little texture",
+        "Give the photographs of the model; see the reasons beside the key points.",
+    ),
+)
 ROWS = (
     Kind(
         "lengths_differ",

@@ -1,9 +1,192 @@
-"""Remarks on measuring a result: shapes, tolerances, and acceptance tests against calibrated lengths."""
+"""Remarks on measuring a result: shapes, tolerances, and acceptance tests against calibrated lengths.
+
+Object points and image points: rays that are lost, points that are not in the result, copies.
+"""
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Kind
+from sfm.remarks.kind import Grade, Kind
 
+POINTS = (
+    Kind(
+        "rays_rejected",
+        "warning",
+        "More rays of {points:point} were rejected than chance makes: {points}.",
+        "a point moved, was misidentified, or is hard to measure",
+        "Look at {points:its|their} rejected image points in the report.",
+    ),
+    Kind(
+        "two_rays",
+        "note",
+        "{two:point} of {total} {two:has|have} two rays, so that errors along the epipolar line are not "
+        "found.",
+        "two photographs show {two:it|them}",
+        "Add a photograph of {two:this point|these points}.",
+    ),
+    Kind(
+        "points_not_determined",
+        "note",
+        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "determine {points:it|them}: {points}.",
+        "a point is in fewer photographs than it needs, or its rays are almost parallel",
+        "Add photographs of {points:this point|these points}, if you need {points:it|them}.",
+    ),
+    Kind(
+        "points_contradicted",
+        "warning",
+        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "meet: {points}.",
+        "a point moved, or was misidentified in a photograph",
+        "Look at the reasons in left_out.csv; correct {points:its|their} image points, or do without "
+        "{points:it|them}.",
+    ),
+    Kind(
+        "point_with_few_rays",
+        "note",
+        "It has {rays:ray}; {needed} are needed.",
+        "the point is in fewer photographs than it needs",
+        "Add photographs of the point, if you need it.",
+    ),
+    Kind(
+        "point_of_lost_photographs",
+        "note",
+        "Fewer than {needed} of its {measured} rays are from photographs in the result.",
+        "photographs that show it are not in the result",
+        "See the reasons of these photographs.",
+    ),
+    Kind(
+        "point_with_parallel_rays",
+        "note",
+        "Its {rays} rays are parallel within their precision.",
+        "the point is far away, or its photographs are from one place",
+        "Add photographs from other places.",
+    ),
+    Kind(
+        "point_with_rays_apart",
+        "warning",
+        "Its {rays} rays do not meet in front of their photographs.",
+        "the point moved, or was misidentified in a photograph",
+        "Correct its image points, or do without it.",
+    ),
+    Kind(
+        "point_with_rays_rejected",
+        "warning",
+        "{accepted} of its {measured} rays {accepted:was|were} accepted; {needed} are needed.",
+        "the point moved, was misidentified in a photograph, or its rays are almost parallel",
+        "Correct its image points, or do without it.",
+    ),
+    Kind(
+        "points_doubtful",
+        "warning",
+        "{points:point} {points:has|have} doubtful coordinates, as either of two rays may be wrong: "
+        "{points}.",
+        "too few rays to decide which one is wrong",
+        "Add photographs of {points:this point|these points}.",
+    ),
+    Kind(
+        "points_with_large_residuals",
+        "warning",
+        "The residuals of {points:point} are together larger than chance: {points}.",
+        "a point moved a little, is damaged, or is seen at a flat angle",
+        "Look at {points:it|them} in the photographs; leave out what you do not trust.",
+    ),
+    Kind(
+        "image_points_identical",
+        "note",
+        "{image_points:image point} {image_points:stands|stand} more than once with one position: "
+        "{image_points}. Each counts once.",
+        "rows of the table were written twice",
+        "Remove the copies.",
+    ),
+    Kind(
+        "image_points_averaged",
+        "note",
+        "{image_points:image point} {image_points:was|were} measured more than once and averaged: "
+        "{image_points}.",
+        "the measurements differ by no more than chance",
+        "Nothing needs to be done.",
+    ),
+    Kind(
+        "image_points_contradicting",
+        "warning",
+        "{image_points:image point} {image_points:was|were} measured at different places and left out: "
+        "{image_points}.",
+        "two points of one photograph have one name",
+        "Correct the names.",
+    ),
+    Kind(
+        "code_at_several_places",
+        "warning",
+        "Code {code} is read at several places: {photographs} {photographs:shows|show} it elsewhere than "
+        "{others:other photograph}[[, at {points}]].",
+        "a target was moved, two targets have one number, or a code was misread",
+        "Remove one of the targets, or survey the states by themselves.",
+    ),
+    Kind(
+        "plate_elsewhere",
+        "warning",
+        "A plate is elsewhere in {photographs} than in the others: that of {points:point} {points}.",
+        "a plate slipped between the photographs, or what carries the plates bent",
+        "Fix the plates to one another and photograph them anew, or survey the states by themselves.",
+    ),
+    Kind(
+        "code_rays_apart",
+        "warning",
+        "The rays to code {code} from {photographs} do not meet.",
+        "a target was moved, two targets have one number, or a code was misread",
+        "Remove one of the targets, or survey the states by themselves.",
+    ),
+    Kind(
+        "codes_too_small",
+        "note",
+        "{targets:target} {targets:has a code that is|have codes that are} too small to read: dots are "
+        "{dot} across with "
+        "edges {blur} soft, {needed} are needed.",
+        "targets are too small or too far away, or photographs are not sharp",
+        "Print the targets larger, go nearer or focus better.",
+    ),
+    Kind(
+        "second_motion",
+        # of rendered scenes none without a motion; a twentieth may be the object, hidden by what moves
+        Grade("share", warning=0.01, error=0.05),
+        "{points:tie point}, {share:%} of all, in {photographs} {points:fits|fit} one another and not the "
+        "others: the photographs show two things that moved against each other.",
+        "people, vehicles or leaves that moved together, a pattern that repeats, or a reflection",
+        "See which points are in the result; those of what moved may be. Photograph the object without it.",
+    ),
+    Kind(
+        "windows_disagree",
+        # 0.04 to 0.09 on stone and rendered surfaces; of windows at random within 3 px of where they are
+        # looked for 0.33 agree by chance (ten photographs of a telephone)
+        Grade("share", warning=0.3, error=0.6),
+        "{share:%} of the matched windows do not agree with each other, and some of the others do so by "
+        "chance.",
+        "the surface looks different from photograph to photograph: shine, steps, angles beyond 25 degrees",
+        "Add photographs at smaller angles; coordinates may be worse than their standard deviations.",
+    ),
+    Kind(
+        "diameter_differs",
+        "warning",
+        "The stated diameter of {targets:target} is {stated}, but the ellipses show {found}.",
+        "the diameter is that of a ring, or in another unit, or the scale is wrong",
+        "State the diameter of the dot in the object unit, and check the scale bars.",
+    ),
+    Kind(
+        "diameters_differ",
+        "warning",
+        "The ellipses of {differing} of {total} targets differ by more than {limit} from the stated "
+        "{differing:diameter|diameters}, most that of {target}: {stated} stated, {found} found.",
+        "diameters are those of rings, or in another unit, or of other targets",
+        "State the diameters of the dots in the object unit, by the ids of the targets.",
+    ),
+    Kind(
+        "diameters_of_unknown",
+        "warning",
+        "Diameters are stated of targets that are not in the survey: {targets}.",
+        "ids that no target has",
+        "Correct the ids in the table of diameters.",
+    ),
+)
 ROWS = (
     Kind(
         "out_of_tolerance",

@@ -1,8 +1,17 @@
-"""Pictures of comparisons: differences of two results, and the time of two adjusters."""
+"""Pictures of comparisons: differences of two results, and the time of two adjusters.
+
+Design diagram of targets: how large they must be at which distance.
+
+Pictures of measured results: deviations with their limits, errors of length measurement.
+"""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Sequence
+
 import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
@@ -10,10 +19,29 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import program_name
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochSeries
-from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import ALONE_IN, BLUE, RED, alone, plan_axes, plot
+from sfm.geometry.tolerance import IN, OUT, Deviations
+from sfm.inspection.acceptance import Acceptance
+from sfm.planning.sight import MIN_PIXELS
+from sfm.planning.sight.visibility import compute_target_size
+from sfm.report.figures.plot_process import Plot
+from sfm.report.figures.plots import (
+    ALONE_IN,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    alone,
+    panelled,
+    plan_axes,
+    plot,
+)
 from sfm.report.numbers import finer_unit, significant
 
+BINS = 30
+COLOURS = ((IN, GREEN), (OUT, RED))
+SIZE_IN = (7.0, 4.5)
+DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # lines of the diagram
 MAX_DRAWN = 12  # points of a series that are drawn, those that moved farthest
 BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
@@ -144,3 +172,117 @@ def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[flo
         length.append(float(one.displacement[k] @ direction))
         sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
     return length, sigma
+
+
+def design_diagram(
+    *,
+    w_mm: float,
+    d: float,
+    c_mm: float,
+    n: int,
+    unit: str,
+    tilt_deg: float = 0.0,
+    lines: Sequence[float] = DIAGRAM_PIXELS,
+) -> bytes:
+    """Return the design diagram as SVG: diameter of the dot over the distance, a line for each least size.
+
+    Args:
+        w_mm: width of the sensor, mm.
+        d: farthest distance of the camera from the object, which the diagram ends at.
+        c_mm: principal distance (focal length), mm.
+        n: pixels along the width of the photograph.
+        unit: of the distance and the diameter.
+        tilt_deg: largest angle between the ray and the normal of a target, deg.
+        lines: pixels across the target, at least, of each line.
+
+    Raises:
+        GeometryError: a number that is not positive, or a tilt at which targets are not recognised.
+
+    Source: document 000, fig. 2.11, there for 7 px and a camera of 18 mm.
+    """
+    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    for pixels in lines:
+        end = compute_target_size(p=pixels, w_mm=w_mm, d=d, c_mm=c_mm, n=n, tilt_deg=tilt_deg).diameter
+        axes.plot([0, d], [0, end], gid=f"{pixels:g} px")  # in proportion
+        axes.annotate(f"{pixels:g} px", (d, end), xytext=(4, 0), textcoords="offset points", va="center")
+    axes.set(
+        xlim=(0, d),
+        ylim=(0, None),
+        xlabel=f"distance [{unit}]",
+        ylabel=f"diameter of the dot [{unit}]",
+        title=f"c = {c_mm:g} mm, sensor {w_mm:g} mm wide, {n} px, tilt up to {tilt_deg:g} deg",
+    )
+    axes.minorticks_on()
+    axes.grid(which="both", alpha=0.3)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def deviation_figure(found: Deviations, unit: str) -> Figure:
+    """Draw the histogram of deviations, and each with its uncertainty, in the order of their size."""
+    limits = [x for x in (found.lower, found.upper) if np.isfinite(x)]
+    largest = float(np.abs([*found.value, *limits]).max())
+    factor, fine = finer_unit(unit, largest)
+    value, U = found.value * factor, found.coverage * np.nan_to_num(found.sigma) * factor
+    picture = panelled(3.6)
+    left, right = picture.subplots(1, 2)
+    left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
+    left.set_xlabel(f"deviation [{fine}]")
+    left.set_ylabel("points")
+    order = np.argsort(value, kind="stable")
+    decision = np.array(found.decision)[order]
+    x = np.arange(1, len(order) + 1)
+    for name in dict.fromkeys(decision.tolist()):
+        rows = decision == name
+        colour = dict(COLOURS).get(name, ORANGE)
+        right.errorbar(
+            x[rows],
+            value[order][rows],
+            yerr=U[order][rows],
+            fmt="o",
+            ms=3,
+            lw=0.8,
+            color=colour,
+            label=f"{name} ({rows.sum()})",
+        )
+    for limit in limits:
+        left.axvline(limit * factor, color=GREY, lw=1, ls="--")
+        right.axhline(limit * factor, color=GREY, lw=1, ls="--")
+    right.set_xlabel("points in order of their deviation")
+    right.set_ylabel(f"deviation and U [{fine}]")
+    right.legend(fontsize=8, loc="upper left")
+    return picture
+
+
+def length_error_figure(found: Acceptance) -> Figure:
+    """Draw the errors of length measurement over the length, with their limit."""
+    length, error = found.lengths.length, found.error
+    U = found.coverage * np.nan_to_num(found.lengths.sigma)
+    factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
+    picture = alone(4.2)
+    axes = picture.subplots()
+    x = np.linspace(0, 1.05 * float(length.max()), 200)
+    limit = np.minimum(found.a + found.k * x, found.b) * factor
+    axes.plot(x, limit, color=GREY, lw=1.2)
+    axes.plot(x, -limit, color=GREY, lw=1.2)
+    axes.axhline(0, color=GREY, lw=0.6)
+    decision = np.array(found.decision)
+    for name in dict.fromkeys(found.decision):
+        rows = decision == name
+        axes.errorbar(
+            length[rows],
+            error[rows] * factor,
+            yerr=U[rows] * factor,
+            fmt="o",
+            ms=4,
+            lw=0.8,
+            color=dict(COLOURS).get(name, ORANGE),
+            label=f"{name} ({rows.sum()})",
+        )
+    axes.set_xlabel(f"calibrated length [{found.unit}]")
+    axes.set_ylabel(f"measured minus calibrated [{fine}]")
+    axes.legend(fontsize=8, loc="upper left")
+    return picture

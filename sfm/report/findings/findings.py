@@ -15,9 +15,21 @@ import numpy as np
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.remarks.remark import Remark
 from sfm.remarks.verdict import Verdict, judge
-from sfm.report.findings.bundle_statistics import Statistics, statistics_of
-from sfm.report.findings.calibrated_cameras import CalibratedCamera, calibrated_cameras
-from sfm.report.findings.camera_remarks import camera_remarks
+from sfm.report.findings.bundle_statistics import (
+    Geometry,
+    Given,
+    Statistics,
+    geometry_of,
+    given_of,
+    statistics_of,
+)
+from sfm.report.findings.calibrated_cameras import (
+    CalibratedCamera,
+    InteriorOrientation,
+    calibrated_cameras,
+    interior_of,
+)
+from sfm.report.findings.camera_remarks import camera_remarks, edges_of, sharpness_remarks
 from sfm.report.findings.checks import (
     LongestResidual,
     ObservationCounts,
@@ -27,18 +39,14 @@ from sfm.report.findings.checks import (
     longest_residual,
     sigma0_of,
 )
-from sfm.report.findings.geometry import Geometry, geometry_of
-from sfm.report.findings.given_remarks import given_remarks
-from sfm.report.findings.given_residuals import Given, given_of
-from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
 from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.protocol import Protocol, check_coordinates, protocol_of
 from sfm.report.findings.rigs import Rig, rigs_of
-from sfm.report.findings.sharpness import edges_of, sharpness_remarks
 from sfm.report.findings.survey_remarks import (
     adjustment_remarks,
     comparison_remarks,
     consistency_remarks,
+    given_remarks,
     headlines_of,
     other_solution_remarks,
     photograph_remarks,

@@ -21,7 +21,7 @@ from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import f_sf
-from sfm.report.findings.given_residuals import Given
+from sfm.report.findings.bundle_statistics import Given
 from sfm.report.findings.precision import standard_deviations
 from sfm.result import ControlCheck, SurveyResult
 

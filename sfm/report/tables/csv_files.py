@@ -17,9 +17,9 @@ from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
+from sfm.files.csv_tables import write_ply
 from sfm.files.plain_text import BLOCK
-from sfm.files.ply import write_ply
-from sfm.files.rig_tables import MOMENTS, MOUNTS, write_rigs
+from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.given_residuals import given_rows
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics

@@ -18,9 +18,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.report.findings.bundle_statistics import Spread, spread
+from sfm.report.findings.bundle_statistics import Given, Spread, spread
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.given_residuals import Given
 from sfm.report.findings.precision import point_sigma
 from sfm.report.findings.rigs import Rig
 from sfm.report.page import plain, values_of

@@ -23,18 +23,18 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.depth_reversal import reverse_depth
 from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed
-from sfm.orientation.ray_angles import ray_angles
+from sfm.orientation.image_rays import ray_angles
 from sfm.reduced_network import determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.similarity import reverse_depth
 from sfm.survey.diagnosis.photograph_cameras import PhotographCameras, find_photograph_cameras
-from sfm.survey.inputs.interior import without_idle_cameras
+from sfm.survey.inputs.cameras import without_idle_cameras
 from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.survey import Survey
 

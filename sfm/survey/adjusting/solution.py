@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
+from sfm.adjustment.hypotheses.moved import bump_remarks
 from sfm.adjustment.hypotheses.rejections import explain_rejections
-from sfm.adjustment.hypotheses.rig_bumps import bump_remarks
-from sfm.adjustment.quality.error_correlation import estimate_error_correlation, with_neighbours
+from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -47,9 +47,8 @@ from sfm.survey.adjusting.solution_remarks import (
 )
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.free_parameters import choose_free_parameters
-from sfm.survey.hypotheses.given import JudgedGiven, judge_given
-from sfm.survey.hypotheses.given_mounts import judge_mount_scales, judge_mounts
-from sfm.survey.inputs.interior import split_cameras
+from sfm.survey.hypotheses.given import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
+from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
@@ -69,7 +68,7 @@ from sfm.survey.placing import (
     scale_to_bars,
 )
 from sfm.survey.rigs import hold_mounts, split_blocks
-from sfm.survey.survey_network import with_given_mounts
+from sfm.survey.target_network import with_given_mounts
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")

@@ -1,4 +1,28 @@
-"""Photographs that are not oriented or fit badly: which are not connected, and whether c is the reason."""
+"""Photographs that are not oriented or fit badly: which are not connected, and whether c is the reason.
+
+Photographs that a camera took while it turned at one place: rotations alone fit, and no point has a depth.
+
+An adjustment of such photographs has no minimum: it goes along a valley in which the base is as small as the
+errors, takes wherever that ends for a solution, and with a wrong principal distance it even converges. The
+parallax is what rotations leave between conjugate rays, with the principal distance and the first radial
+distortion that make it least. A wall photographed from the front looks like a rotation with a lens without
+end; where the least parallax is at the end of what is tried, nothing is refused.
+
+Source: Hartley (1997), Self-calibration of stationary cameras, IJCV 22(1); Foerstner and Wrobel (2016),
+Photogrammetric Computer Vision, sec. 13.3.6 (critical configurations).
+
+Parts of a survey that do not fit the rest: a second object of the same codes, a mirror image, a motion.
+
+Photographs without orientation are oriented by themselves, both parts are adjusted, and the points that they
+have in common are compared as those of any two results (`sfm.comparison`): what a camera explains, that bends
+the whole, is no other object, nor is what agrees but for single points.
+
+The orientation of tie points is that of the larger part of them. Where walkers or vehicles hide the most of
+an object, it is theirs, and as precise as any other. Tie points that it does not explain are oriented by
+themselves; errors by chance have no orientation, another rigid body has one.
+
+Source: Torr (1998), Geometric motion segmentation, Phil. Trans. R. Soc. A 356.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +31,42 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import ALPHA
-from sfm.conventions import BoolArray, IntArray
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
+from sfm.comparison.significance import compare_results
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.orientation.homography import rays_of
+from sfm.orientation.image_rays import image_tangents
+from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
-from sfm.remarks.remark import Remark, remark
+from sfm.reduced_network import reduce_network, supported
+from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.similarity import mean_distance, nearest_rotation
+from sfm.solution import Solution
 from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
+MIN_RAYS = 2
+MOTION_RAYS = 3  # of a point that shows a motion: two meet by chance
+MOTION_POINTS = 20  # in three photographs and more: with fewer an orientation may fit what moves at random
+MIN_PARALLAX = 10.0  # standard deviations of image points, below which a depth is known to a tenth at best
+# Part of the points of a pair that may have no depth, as distant hills behind a near object;
+# a smaller rest may be wrong matches.
+MAX_DISTANT_FRACTION = 0.9
+MIN_COMMON = 20  # points of a pair of photographs: rotation and camera take five coordinates of them
+SCALES = np.geomspace(0.5, 2.0, 15)  # of c that are tried, 10 % apart; the best is improved
+TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
+MAX_RADIAL = 0.2  # first radial distortion that is tried, of the squared tangent: that of telephones is
+# a few hundredths
+STEP = 0.02  # of it
+EVALUATIONS = 80  # of the parallax by the simplex method of Nelder and Mead
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
 MISFIT = 3.0  # standard deviations of image points, of residuals that another minimum may explain
 
@@ -240,3 +289,204 @@ def _points_of(network: Network, images: IntArray | list[int]) -> IntArray:
     """Return the points that photographs show."""
     seen = network.image_points
     return np.unique(seen.point[np.isin(seen.image, images)])
+
+
+def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
+    """Refuse photographs whose conjugate rays fit rotations alone, but for gross errors.
+
+    Args:
+        network: image points with their standard deviations.
+        cameras: start values.
+
+    Raises:
+        GeometryError: the parallax of every pair of photographs that hold the network together is below
+            MIN_PARALLAX standard deviations of its image points.
+    """
+    pairs = _conjugate_points(network)
+    if not pairs:
+        return
+    needed = MIN_PARALLAX * network.image_points.median_sigma_px
+    parallax = _least_parallax(network, cameras, pairs)
+    if parallax is None or not parallax.max() < needed:
+        return
+    raise GeometryError(
+        f"orientation: no base: the {len(network.images)} photographs were taken from one place; rotations "
+        f"alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, and depths "
+        f"need {needed:.2g} px; photograph from several places"
+    )
+
+
+def _conjugate_points(network: Network) -> list[tuple[IntArray, IntArray]]:
+    """Return the image points, by twos, of the pairs of photographs with most in common that connect all."""
+    seen, m = network.image_points, len(network.images)
+    every = np.ones(len(seen), dtype=bool)
+    found = [
+        (i[common >= MIN_COMMON], j[common >= MIN_COMMON], common[common >= MIN_COMMON])
+        for i, j, common in network.common_points(every)
+    ]
+    first, second, common = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if not len(first):
+        return []
+    tree = minimum_spanning_tree(csr_matrix((1.0 / common, (first, second)), shape=(m, m))).tocoo()
+    rows = rows_of(seen.image, m)
+    pairs = []
+    for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+        _, a, b = np.intersect1d(seen.point[rows[i]], seen.point[rows[j]], return_indices=True)
+        pairs.append((rows[i][a], rows[j][b]))
+    return pairs
+
+
+def _least_parallax(
+    network: Network, cameras: tuple[Camera, ...], pairs: list[tuple[IntArray, IntArray]]
+) -> FloatArray | None:
+    """Return the parallax of each pair with c and radial distortion that make it least, px.
+
+    None where these are at the end of what is tried.
+    """
+    seen = network.image_points
+    given = image_tangents(seen, network.camera, cameras)
+    c_px = np.array([one.c_px for one in cameras])[network.camera[seen.image]]
+
+    def parallax(x: FloatArray) -> FloatArray:
+        uv = given / np.exp(x[0])
+        rays = rays_of(uv * (1 + x[1] * (uv**2).sum(axis=1, keepdims=True)))
+        return np.array([c_px[a[0]] * np.exp(x[0]) * _parallax(rays[a], rays[b]) for a, b in pairs])
+
+    def cost(x: FloatArray) -> float:
+        if not (SCALES[0] <= np.exp(x[0]) <= SCALES[-1] and abs(x[1]) <= MAX_RADIAL):
+            return np.inf
+        return float(np.log(np.maximum(parallax(x), np.finfo(float).tiny)).mean())
+
+    start = min((np.array([np.log(scale), 0.0]) for scale in SCALES), key=cost)
+    simplex = start + np.array([[0.0, 0.0], [np.log(SCALES[1] / SCALES[0]), 0.0], [0.0, STEP]])
+    options = {"initial_simplex": simplex, "maxfev": EVALUATIONS}
+    best = minimize(cost, start, method="Nelder-Mead", options=options).x
+    inside = SCALES[1] < np.exp(best[0]) < SCALES[-2] and abs(best[1]) < MAX_RADIAL - STEP
+    return parallax(best) if inside else None
+
+
+def _parallax(first: FloatArray, second: FloatArray) -> float:
+    """Return the angle that most conjugate rays do not exceed after the rotation that fits most, rad.
+
+    Args:
+        first: rays of one photograph, (k, 3).
+        second: those of the other, (k, 3).
+    """
+    known = np.isfinite(first + second).all(axis=1)  # of wide angles some have no ray
+    if known.sum() < MIN_COMMON:
+        return np.inf
+    first = first[known] / np.linalg.norm(first[known], axis=1, keepdims=True)
+    second = second[known] / np.linalg.norm(second[known], axis=1, keepdims=True)
+    apart = np.zeros(len(first))
+    for _ in range(TRIMMINGS):
+        near = apart <= np.median(apart)
+        R = nearest_rotation(second[near].T @ first[near])
+        apart = np.linalg.norm(first @ R.T - second, axis=1)
+    return float(np.quantile(apart, MAX_DISTANT_FRACTION))
+
+
+def find_second_objects(
+    network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
+) -> dict[str, Remark]:
+    """Return why photographs fail that orient one another on points of the others, by their names.
+
+    Args:
+        network: image points that have names.
+        found: its orientation, in which some photographs are missing.
+        orient: returns the orientation of a network from start values; GeometryError where there is none.
+    """
+    seen, names = network.image_points, np.array(network.images, dtype=object)
+    left = ~found.estimate.oriented
+    left &= np.array([len(rows) for rows in rows_of(seen.image, len(names))]) >= MIN_POINTS
+    reasons: dict[str, Remark] = {}
+    while left.sum() >= 2:
+        points = np.isin(np.arange(len(network.points)), seen.point[left[seen.image]])
+        every = np.ones(len(seen), dtype=bool)
+        start = empty_estimate(network, found.estimate.cameras)
+        part = reduce_network(network, start, left, points, every)[0]
+        part = replace(part, control=type(part.control)(), exterior=type(part.exterior)())
+        try:
+            other = orient(part, empty_estimate(part, found.estimate.cameras))
+        except GeometryError:
+            break
+        images = np.flatnonzero(left)[other.estimate.oriented]
+        left[images] = False
+        try:
+            reason = _reason(_adjusted(network, found), _adjusted(part, other), tuple(names[images]))
+        except (GeometryError, np.linalg.LinAlgError):  # too little is determined to compare
+            continue
+        if reason is not None:
+            reasons |= dict.fromkeys(names[images], reason)
+    return reasons
+
+
+def _adjusted(network: Network, found: Orientation) -> Solution | None:
+    """Return the image points that fit in an orientation adjusted by themselves; None without a solution."""
+    alone = Network(network.images, network.camera, network.points, network.image_points)
+    images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
+    part, start = reduce_network(alone, found.estimate, images, points, found.fits)
+    a = adjust(part, start, datum=Datum("free"), reject="tau")
+    if not a.converged or a.undetermined:
+        return None
+    return a.solution.with_joint_covariance
+
+
+def _reason(others: Solution | None, group: Solution | None, images: tuple[str, ...]) -> Remark | None:
+    """Return why photographs do not fit the others; None where they show the same object or too little."""
+    if others is None or group is None:
+        return None
+    both = compare_results(others, group)
+    cause, size = both.cause, mean_distance(others.estimate.points[both.pairing.points[:, 0]])
+    if cause is not None and cause.row.mirror:
+        return remark("photograph_of_mirror_image", photographs=images, points=len(both.points))
+    if both.majority if cause is None else cause.row.strain or cause.row.bending:
+        return None
+    rms = float(np.sqrt((both.point_difference**2).sum(axis=1).mean()))
+    return remark(
+        "photograph_of_second_object", photographs=images, points=len(both.points), misfit=rms / size
+    )
+
+
+def find_second_motion(
+    network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
+) -> tuple[Remark, ...]:
+    """Return the remark on tie points that have another orientation than the others, if there are such.
+
+    Args:
+        network: tie points.
+        found: its orientation.
+        orient: returns the orientation of a network from start values; GeometryError where there is none.
+    """
+    images = found.estimate.oriented
+    on = images[network.image_points.image]
+    tolerance_px = TOLERANCE_FACTOR * found.rms_px
+    fits = residual_lengths(network, found.estimate) <= tolerance_px
+    rays, fitting = _rays(network, on), _rays(network, on & fits)
+    left = (rays >= MOTION_RAYS) & (fitting < MIN_SHARE * rays)
+    if left.sum() < MOTION_POINTS:
+        return ()
+    held = tuple(replace(one, free=np.zeros_like(one.free)) for one in found.estimate.cameras)
+    part, start = reduce_network(network, empty_estimate(network, held), images, left, on)
+    try:
+        other = orient(part, start)
+    except GeometryError:
+        return ()
+    moved = _rays(part, residual_lengths(part, other.estimate) <= tolerance_px) >= MOTION_RAYS
+    if moved.sum() < MOTION_POINTS:
+        return ()
+    seen = part.image_points
+    of_moved = np.unique(seen.image[moved[seen.point]])
+    others = int(((rays >= MOTION_RAYS) & (fitting >= MIN_SHARE * rays)).sum())
+    return unless_note(
+        remark(
+            "second_motion",
+            share=float(moved.sum() / (moved.sum() + others)),
+            points=int(moved.sum()),
+            photographs=[part.images[i] for i in of_moved],
+        )
+    )
+
+
+def _rays(network: Network, rows: BoolArray) -> IntArray:
+    """Return how many of some image points each object point has, (n,)."""
+    return np.bincount(network.image_points.point[rows], minlength=len(network.points))

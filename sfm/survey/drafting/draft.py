@@ -15,16 +15,15 @@ from sfm.display import agreeing, counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
-from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, read_metadata
 from sfm.photographs.file_checks import conversion_of
-from sfm.photographs.satellite_positions import USUAL_SIGMAS_M
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.camera_models import FISHEYE
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.orientation import FISHEYE
 from sfm.targets.codes.families import FAMILIES
 from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
 

@@ -19,12 +19,11 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
-from sfm.targets.codes.april_grids import read_april_tags
-from sfm.targets.codes.boards import find_crossings, reduced
+from sfm.targets.codes.boards import find_crossings, read_april_tags, reduced
 from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
 from sfm.targets.codes.concentric import read_resolved
+from sfm.targets.codes.dot_plates import find_lattice
 from sfm.targets.codes.families import code_family
-from sfm.targets.codes.lattice import find_lattice
 from sfm.targets.codes.plate_search import (
     KALIBR_TAGS,
     MIN_DOTS_OF_PLATE,
@@ -38,8 +37,7 @@ from sfm.targets.codes.plate_search import (
     shows_a_lattice,
 )
 from sfm.targets.codes.plates import PlateFamily, group_plates
-from sfm.targets.codes.ring_reading import read_codes
-from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily
+from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily, read_codes
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,
     TagFamily,

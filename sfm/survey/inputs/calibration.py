@@ -24,7 +24,7 @@ from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
-from sfm.files.json_files import Content, Name, Pixel, Side, read_json
+from sfm.files.plain_text import Content, Name, Pixel, Side, read_json
 from sfm.survey.inputs.settings import CameraSettings
 
 TABLES = ("summary.json", "cameras.csv", "interior_correlations.csv")

@@ -28,9 +28,8 @@ from sfm.conventions import METRES, FloatArray
 from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
-from sfm.files.toml_files import read_toml
+from sfm.files.plain_text import read_toml
 from sfm.result import PlacedEquipment
-from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
     EquipmentSettings,
@@ -40,6 +39,7 @@ from sfm.survey.inputs.settings import (
     Section,
     Temperature,
     Unit,
+    first_error,
 )
 from sfm.survey.observation_tables import ObservationTable, observation_table
 

@@ -13,8 +13,7 @@ from sfm.conventions import METRES
 from sfm.display import counted
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.csv_tables import array_table
-from sfm.photographs.exif import read_metadata
-from sfm.photographs.satellite_positions import LocalSystem, SatellitePosition, local_coordinates
+from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinates, read_metadata
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import AXES

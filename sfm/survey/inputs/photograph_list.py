@@ -16,7 +16,7 @@ from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.survey.inputs.interior import refuse_ungrouped
+from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey_file import inside, is_home_file
 

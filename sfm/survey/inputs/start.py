@@ -24,14 +24,13 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint
-from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
+from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.given import Observations
-from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.survey_network import network_of
+from sfm.survey.target_network import network_of
 
 ALPHA = 0.001  # probability with which measurements that agree are taken for contradicting ones
 

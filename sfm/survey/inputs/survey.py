@@ -15,12 +15,11 @@ from sfm.arguments import checked_arguments
 from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
-from sfm.files.rig_tables import read_moments
+from sfm.files.result_tables import read_moments
 from sfm.observations.mounts import MountObservations
 from sfm.result import PlacedEquipment
 from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
-from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.equipment import GivenEquipment, given_by, read_equipment
 from sfm.survey.inputs.exterior_table import ObservedExterior, mount_observations, read_observed_exterior
 from sfm.survey.inputs.given import (
@@ -57,6 +56,7 @@ from sfm.survey.inputs.settings import (
     Section,
     TargetSettings,
     TiePointSettings,
+    first_error,
 )
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table

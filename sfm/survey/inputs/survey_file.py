@@ -8,11 +8,9 @@ from typing import Annotated, get_origin
 from pydantic import Field, PrivateAttr, ValidationError
 
 from sfm.errors import SurveyFileError
-from sfm.files.plain_text import as_plain, is_plain
-from sfm.files.toml_files import read_toml
+from sfm.files.plain_text import as_plain, is_plain, read_toml
 from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
-from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.equipment import read_equipment
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
@@ -35,6 +33,7 @@ from sfm.survey.inputs.settings import (
     Section,
     TargetSettings,
     TiePointSettings,
+    first_error,
 )
 from sfm.targets.codes.families import is_table
 

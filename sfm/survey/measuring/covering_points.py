@@ -17,18 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.threads import in_threads
-from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import CoveredPixels, Windows
-from sfm.matching.lsm.projected_points import pictures_of, plane_warps
+from sfm.kernels.threads import give_back_memory, in_threads
+from sfm.matching.lsm.coverage import CoveredPixels, Windows, pictures_of, plane_warps
+from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
-from sfm.matching.lsm.warp import linear_part
-from sfm.matching.radiometry import Grey
+from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.runtime.memory import give_back_memory
 from sfm.runtime.progress import reported
 
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point

@@ -24,8 +24,8 @@ import numpy as np
 from sfm.errors import OutputError, PhotographError
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
-from sfm.kernels.sources import sources_of
-from sfm.matching.tracks.natural_points import NaturalPoints
+from sfm.kernels.compiling import sources_of
+from sfm.matching.tracks.interest import NaturalPoints
 from sfm.targets.detect import Targets
 
 Measured = Targets | NaturalPoints
@@ -43,7 +43,7 @@ class Kind(Generic[M]):
 
 
 TARGETS = Kind(Targets, ("sfm.photographs.reading", "sfm.targets.detect"), "rejected")
-TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.natural_points"), "corners")
+TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.interest"), "corners")
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import Windows, first_alike
-from sfm.matching.lsm.projected_points import pictures_of
+from sfm.matching.lsm.coverage import Windows, first_alike, pictures_of
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
@@ -35,7 +34,7 @@ from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
-from sfm.survey.survey_network import network_of
+from sfm.survey.target_network import network_of
 
 # Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
 # several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine

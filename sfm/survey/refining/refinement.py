@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.error_correlation import with_neighbours
+from sfm.adjustment.quality.correlations import with_neighbours
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
@@ -23,8 +23,7 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import MAX_COST_RATIO
-from sfm.matching.lsm.projected_points import pictures_of
+from sfm.matching.lsm.coverage import MAX_COST_RATIO, pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark, unless_note
@@ -32,7 +31,6 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.hypotheses.given import judge_given
-from sfm.survey.refining.model_photographs import outside_masks
 from sfm.survey.refining.oriented_windows import (
     OrientedKeyPoints,
     by_count,
@@ -55,6 +53,7 @@ from sfm.survey.refining.windows import (
     best_size,
     match_reduced,
     match_windows,
+    outside_masks,
 )
 
 # Sides of windows that are tried. Larger ones gain nothing where they cover a photograph, and where the

@@ -20,7 +20,7 @@ from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.targets import targets_in
 from sfm.survey.placing import MIN_CONTROL, object_scale
-from sfm.survey.refining.model_photographs import photograph_paths, read_of_size
+from sfm.survey.refining.windows import photograph_paths, read_of_size
 from sfm.survey.target_network import build_network, min_rays, name_coded
 
 PREFIX = "target "  # of the names of targets among the points of a model, which may have the same numbers

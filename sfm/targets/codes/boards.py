@@ -3,23 +3,58 @@
 A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
 follows from its colours, the first square being the dark one. Of the turns that look alike (see
 `PlateFamily.turns`) the one that is upright in the photograph is taken.
+
+Checkerboards of which a photograph shows a part: named by the borders of the board that it does show.
+
+Crossings are saddles of the intensity: four sectors about a point that are dark and bright by turns. They
+make a lattice. On each side of it the board ends where the next crossings would still be in the photograph,
+or the photograph cuts it. A board that ends on one side at least in both directions is named, with the
+colours of its squares; one whose naming stays uncertain is not.
+
+Source: the determinant of the Hessian as detector of saddles, Chen and Zhang (2005), ICMIT.
+
+AprilGrids: tags in rows, numbered along them from the lower left, and black squares at their corners.
+
+A tag and the squares at its corners touch as squares of a checkerboard do, so that its corners are crossings.
+That hides the tags from finders of outlines: regions darker than where they touch are opened first, which
+parts them, and the tags are read where their measured corners place them. Kalibr prints tags with a border
+of two modules, other programs with one, and turned in different ways: the turn in which the corners of all
+tags are those of one plane is taken.
+
+Source: Kalibr (github.com/ethz-asl/kalibr), calibration targets; Olson (2011), ICRA, for the tags.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.codes.april_grids import name_corners, read_april_tags, windows_beside
-from sfm.targets.codes.cut_boards import name_cut_board
-from sfm.targets.codes.plates import PlateFamily
-from sfm.targets.codes.tags import opencv_dictionary
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.codes.dot_plates import Lattice, find_lattice
+from sfm.targets.codes.plates import APRIL_BORDERS, MAX_OFF_PLACE, PlateFamily, quarter_turn
+from sfm.targets.codes.tags import CORRECTED, WRONG_IN_BORDER, opencv_dictionary
 from sfm.targets.fits.saddle import MAX_HALF_SPACINGS, Saddles, measure_saddles
-from sfm.targets.outlines import as_bytes
+from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, as_bytes, estimate_noise
 
+OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
+WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
+# Of the range of intensities in the window, below which it is dark: midway to the half where squares touch.
+DARK_FRACTION = 0.25
+MIN_MODULE_PX = 2.0  # of a tag that is read: no less separates one black module from one clear one (Nyquist)
+SPACING = 0.2  # of the side of a tag, between crossings at first
+CELL_PX = 8  # side of a module where a tag is read
+MIN_TAGS = 2  # that show how tags are turned
+SMOOTHING_PX = 2.0
+# Saddles below this share of the strong ones are none; the strong ones are those of this rank.
+MIN_SADDLE, STRONG_RANK = 0.15, 20
+APART_PX = 9  # side of the window in which a saddle is the strongest
+RADIUS_PX, DIRECTIONS = 5.0, 32  # of the circle on which the four sectors are counted
+MIN_CROSSINGS = 12
+BORDER_PX = 8.0  # what is nearer to the border than this need not be found
+SHARE_INSIDE = 0.6  # of the next crossings are in the photograph where the board ends
+MIN_CONTRAST_SHARE = 0.15  # between dark and bright squares, of the range of the photograph
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 # Larger side of the photograph in which a checkerboard is sought first. Squares of 9 px are found there, in a
 # tenth of the time that a photograph of 8 million px takes.
@@ -151,3 +186,253 @@ def _spacing(xy: FloatArray) -> FloatArray:
     distance = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
     np.fill_diagonal(distance, np.inf)
     return np.asarray(distance.min(axis=1))
+
+
+def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray, IntArray]:
+    """Return the crossings of a checkerboard that is seen in part and which of the board they are.
+
+    Args:
+        grey: photograph, uint8, shape (H, W).
+        rows: rows of crossings of the whole board.
+        columns: columns of the same.
+
+    Returns:
+        Places, px, (k, 2), and numbers row * columns + column, (k,); none where they are not certain.
+    """
+    none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+    xy = find_saddles(grey)
+    lattice = find_lattice(xy, np.ones(len(xy), dtype=bool)) if len(xy) >= MIN_CROSSINGS else None
+    if lattice is None or len(lattice.rows) < MIN_CROSSINGS:
+        return none
+    dark = _dark_squares(grey, lattice)
+    if dark is None:
+        return none
+    found: list[tuple[int, IntArray]] = []
+    for turn in range(4):
+        turned = quarter_turn(lattice.place, turn)
+        turned = turned - turned.min(axis=0)
+        ends = board_ends(lattice.xy, turned, grey.shape)
+        size = turned.max(axis=0) + 1
+        offsets = [_offset(int(size[k]), (rows, columns)[k], ends[k]) for k in range(2)]
+        if offsets[0] is None or offsets[1] is None:
+            continue
+        moved = turned + np.array(offsets)
+        if (moved[dark].min(axis=1).sum(axis=1) % 2 == 0).all():  # the first square of the board is dark
+            found.append((turn, moved[:, 0] * columns + moved[:, 1]))
+    if len(found) == 2 and (found[0][0] - found[1][0]) % 4 == 2:  # it looks alike upside down
+        found = [one for one in found if _is_upright(lattice.xy, one[1] % columns)]
+    return (lattice.xy, found[0][1]) if len(found) == 1 else none
+
+
+def find_saddles(grey: AnyArray) -> FloatArray:
+    """Return the places about which four sectors are dark and bright by turns, whole px, (k, 2)."""
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
+    xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
+    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1)
+    saddle = np.maximum(np.asarray(xy * xy - xx * yy), 0)
+    highest = cv2.dilate(saddle, np.ones((APART_PX, APART_PX), np.uint8))
+    row, column = np.nonzero((saddle == highest) & (saddle > 0))
+    value = saddle[row, column]
+    if len(value) < STRONG_RANK:
+        return np.zeros((0, 2))
+    strong = value > MIN_SADDLE * np.sort(value)[-STRONG_RANK]
+    places = np.stack([column, row], axis=1)[strong].astype(np.float64)
+    return np.asarray(places[_has_four_sectors(smooth, places)])
+
+
+def _has_four_sectors(smooth: AnyArray, xy: FloatArray) -> BoolArray:
+    """Return about which places the intensity crosses its mean on a circle four times, (k,)."""
+    t = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    x = (xy[:, :1] + RADIUS_PX * np.cos(t)).astype(np.float32)
+    y = (xy[:, 1:] + RADIUS_PX * np.sin(t)).astype(np.float32)
+    ring = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    above = ring > (ring.max(axis=1, keepdims=True) + ring.min(axis=1, keepdims=True)) / 2
+    return np.asarray((above != np.roll(above, 1, axis=1)).sum(axis=1) == 4)
+
+
+def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
+    """Return the crossings at the corners of the dark squares, (m, 4); None where squares are all alike."""
+    at = {(int(r), int(c)): k for k, (r, c) in enumerate(lattice.place)}
+    squares: list[list[list[int]]] = [[], []]
+    value: list[list[float]] = [[], []]
+    for r, c in at:
+        corners = [at[r + i, c + j] for i in (0, 1) for j in (0, 1) if (r + i, c + j) in at]
+        if len(corners) == 4:
+            x, y = lattice.xy[corners].mean(axis=0)
+            squares[(r + c) % 2].append(corners)
+            value[(r + c) % 2].append(float(grey[round(y), round(x)]))
+    if not value[0] or not value[1]:
+        return None
+    even, odd = (float(np.median(one)) for one in value)
+    return None if abs(even - odd) < MIN_CONTRAST_SHARE * np.ptp(grey) else np.array(squares[int(even > odd)])
+
+
+def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[tuple[bool, bool]]:
+    """Return for rows and columns whether the board ends before the first and behind the last of them."""
+    height, width = shape[:2]
+    at = {(int(r), int(c)): k for k, (r, c) in enumerate(place)}
+    found = []
+    for axis in range(2):
+        both = []
+        for outermost, inwards in ((0, 1), (int(place[:, axis].max()), -1)):
+            inside = []
+            for k in np.flatnonzero(place[:, axis] == outermost):
+                before = place[k].copy()
+                before[axis] += inwards
+                j = at.get((int(before[0]), int(before[1])))
+                if j is not None:
+                    x, y = 2 * xy[k] - xy[j]
+                    inside.append(
+                        BORDER_PX < x < width - 1 - BORDER_PX and BORDER_PX < y < height - 1 - BORDER_PX
+                    )
+            both.append(bool(inside) and float(np.mean(inside)) > SHARE_INSIDE)
+        found.append((both[0], both[1]))
+    return found
+
+
+def _offset(seen: int, whole: int, ends: tuple[bool, bool]) -> int | None:
+    """Return which row or column of the board is the first that is seen; None where that is not certain."""
+    before, behind = ends
+    if seen == whole:
+        return 0
+    if seen > whole or before == behind:
+        return None
+    return 0 if before else whole - seen
+
+
+def _is_upright(xy: FloatArray, column: IntArray) -> bool:
+    """Whether columns run to the right."""
+    return float((xy[:, 0] - xy[:, 0].mean()) @ (column - column.mean())) > 0
+
+
+def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArray]:
+    """Return numbers (t,) and corners (t, 4, 2), px, of tags that squares touch, with the border most have.
+
+    Args:
+        grey: intensities, uint8, (H, W).
+        dictionary: of the tags, a name in tags.DICTIONARIES.
+
+    Returns:
+        Tags that were read once; their corners from any one on, the same of all tags.
+    """
+    modules = opencv_dictionary(dictionary).markerSize + 2 * min(APRIL_BORDERS)
+    quads = _unique(np.array(list(_outlines(grey, MIN_MODULE_PX * modules))).reshape(-1, 4, 2))
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
+    xy = measure_saddles(
+        grey, quads.reshape(-1, 2), np.repeat(MAX_HALF_SPACINGS * SPACING * side, 4), noise=1.0
+    ).xy
+    quads = np.where(np.isfinite(xy), xy, quads.reshape(-1, 2)).reshape(-1, 4, 2)
+    best: list[tuple[int, FloatArray]] = []
+    for border in APRIL_BORDERS:
+        read = [_read(grey, quad, opencv_dictionary(dictionary), border) for quad in quads]
+        tags = [(number, np.roll(quad, turn, axis=0))
+                for quad, (number, turn) in zip(quads, read, strict=True) if number >= 0]  # fmt: skip
+        best = max(best, tags, key=len)
+    number = np.array([one for one, _ in best], dtype=np.int64)
+    values, first, times = np.unique(number, return_index=True, return_counts=True)
+    corners = np.array([quad for _, quad in best]).reshape(-1, 4, 2)
+    return values[times == 1], corners[first[times == 1]]
+
+
+def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
+    """Return the corners of dark regions of four sides, clockwise, px, each (4, 2).
+
+    How straight sides are is judged as OpenCV does where it looks for tags.
+    """
+    smooth = cv2.GaussianBlur(grey, (3, 3), 0)
+    min_range = max(STEP_SIGMAS * estimate_noise(grey), 255 * MIN_STEP)
+    straight = cv2.aruco.DetectorParameters().polygonalApproxAccuracyRate
+    for part in WINDOWS:
+        window = max(grey.shape) // part | 1
+        around = np.ones((window, window), np.uint8)
+        low, high = (
+            cv2.erode(smooth, around).astype(np.float32),
+            cv2.dilate(smooth, around).astype(np.float32),
+        )
+        dark = ((smooth < low + DARK_FRACTION * (high - low)) & (high - low > min_range)).astype(np.uint8)
+        for side in OPENED_PX:
+            opened = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+            for outline in cv2.findContours(opened, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
+                length = cv2.arcLength(outline, True)
+                if length < 4 * min_side_px:
+                    continue
+                quad = cv2.approxPolyDP(outline, straight * length, True).reshape(-1, 2)
+                if len(quad) == 4 and cv2.isContourConvex(quad) and cv2.contourArea(quad) > min_side_px**2:
+                    clockwise = cv2.contourArea(quad, True) > 0  # y runs down
+                    yield (quad if clockwise else quad[::-1]).astype(float)
+
+
+def _unique(quads: FloatArray) -> FloatArray:
+    """Return quadrangles without those about the middle of an earlier one of the same size."""
+    kept: list[FloatArray] = []
+    middles = np.zeros((0, 3))
+    for quad in quads:
+        middle = np.append(quad.mean(axis=0), np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
+        if (np.abs(middles - middle).max(axis=1, initial=0) > SPACING * middle[2]).all():
+            kept.append(quad)
+            middles = np.vstack([middles, middle])
+    return np.array(kept).reshape(-1, 4, 2)
+
+
+def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, border: int) -> tuple[int, int]:
+    """Return the number of a tag and its turn in quarters, -1 where it has none."""
+    m = dictionary.markerSize + 2 * border
+    end = m * CELL_PX - 0.5
+    square = np.array([[-0.5, -0.5], [end, -0.5], [end, end], [-0.5, end]], dtype=np.float32)
+    H = cv2.getPerspectiveTransform(quad.astype(np.float32), square)
+    flat = cv2.warpPerspective(grey, H, (m * CELL_PX, m * CELL_PX)).reshape(m, CELL_PX, m, CELL_PX)
+    level = flat[:, CELL_PX // 4 : -CELL_PX // 4, :, CELL_PX // 4 : -CELL_PX // 4].mean(axis=(1, 3))
+    inner = np.zeros((m, m), dtype=bool)
+    inner[border:-border, border:-border] = True
+    dark, bright = float(np.median(level[~inner])), float(np.quantile(level[inner], 0.9))
+    white = level > (dark + bright) / 2
+    if bright <= dark or white[~inner].mean() > WRONG_IN_BORDER:
+        return -1, 0
+    bits = white[border:-border, border:-border].astype(np.uint8)
+    found, number, turn = dictionary.identify(bits, CORRECTED)
+    return (int(number), int(turn)) if found else (-1, 0)
+
+
+def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
+    """Return the corners of the tags of a grid, px, (k, 2), and which point of it each is, (k,).
+
+    Args:
+        number: of the tags in a photograph, (t,).
+        quads: their corners, px, (t, 4, 2), from any one on, the same of all tags.
+        plate: the grid.
+    """
+    count = plate.rows * plate.columns // 4
+    on_plate = (number >= plate.first_tag) & (number < plate.first_tag + count)
+    number, quads = number[on_plate] - plate.first_tag, quads[on_plate]
+    none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+    if len(number) < MIN_TAGS:
+        return none
+    across = plate.columns // 2
+    row, column = plate.rows // 2 - 1 - number // across, number % across
+    # upper left, upper right, lower right, lower left
+    corner = 2 * np.stack([row, column], axis=1)[:, None] + np.array([[0, 0], [0, 1], [1, 1], [1, 0]])
+    code = corner[..., 0] * plate.columns + corner[..., 1]
+    plane = plate.plane(1.0)[:, :2]
+    best, named = MAX_OFF_PLACE, none
+    for turn in range(4):
+        xy, true = np.roll(quads, turn, axis=1).reshape(-1, 2), plane[code.ravel()]
+        H, _ = cv2.findHomography(xy, true, cv2.LMEDS)
+        if H is None:
+            continue
+        off = np.hypot(*(cv2.perspectiveTransform(xy[None], H)[0] - true).T)
+        if float(np.median(off)) < best:
+            near = (off.reshape(-1, 4) < MAX_OFF_PLACE).all(axis=1).repeat(4)
+            best, named = float(np.median(off)), (xy[near], code.ravel()[near])
+    return named
+
+
+def windows_beside(xy: FloatArray, plate: PlateFamily) -> FloatArray:
+    """Return half sides of windows at the corners of tags, four of each in turn, px, (k,).
+
+    They see a part of the square, and of the tag no more than the narrowest border.
+    """
+    quads = xy.reshape(-1, 4, 2)
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)
+    module = 1 / (opencv_dictionary(plate.dictionary).markerSize + 2 * min(APRIL_BORDERS))
+    part = min(MAX_HALF_SPACINGS * (1 / plate.tag_share - 1), min(APRIL_BORDERS) * module)
+    return np.asarray(part * np.minimum(side, np.roll(side, -1, axis=1)).ravel())

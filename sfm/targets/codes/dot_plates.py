@@ -5,20 +5,27 @@ rows one of the bases of the lattice, and moved. With marks each placement that 
 likelihood: dots are as large as perspective makes them but for errors, marks larger by one common ratio, and
 some dots may be anything (damage, shadows). The placement that is certain is taken; what lies beyond the
 plate gets no name. Without marks the whole plate must be seen, and nothing beside it.
+
+Rows and columns of dots in a photograph, grown from dot to dot as the plate is seen in perspective.
 """
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.targets.codes.lattice import Lattice, find_lattice
 from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
-from sfm.targets.fits.damage import BIWEIGHT, MAD, ROUNDS
+from sfm.targets.fits.outline_noise import BIWEIGHT, MAD, ROUNDS
 
+MAX_OFF_FRACTION = 0.25  # of the spacing, within which a dot must be where its neighbours predict it
+MAX_BOX_RATIO = 1.2  # times its dots, the places in the box of a lattice that needs no other beside it
+SEEDS = 8  # dots that are tried to begin with
+MIN_SINE = 0.3  # of the angle between rows and columns
 MIN_DOTS, MIN_BENT_DOTS = 9, 20  # that show a plate, and the bend of the trend of their sizes
 MIN_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
 # A dot is anything with this probability at least, spread over so many standard deviations, and where more of
@@ -165,3 +172,104 @@ def _log_likelihood(z: FloatArray, strange: float) -> FloatArray:
     """Return the logarithm of the density of normal deviates of which this share are anything."""
     normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
     return np.asarray(np.log((1 - strange) * normal + strange / RANGE_SIGMAS))
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Dots in rows and columns; which row is the first, and which way they run, is arbitrary."""
+
+    rows: IntArray  # index of each dot that is in it, (k,)
+    place: IntArray  # row and column, right-handed as in the photograph (x right, y down), (k, 2)
+    xy: FloatArray  # px, (k, 2)
+
+    @property
+    def box(self) -> int:
+        """Number of places between the first and last row and column."""
+        return int((np.ptp(self.place, axis=0) + 1).prod())
+
+
+def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
+    """Return the largest and most compact lattice that grows from a dot near the middle; None without any.
+
+    Where a neighbour is missing, rows may be taken for diagonals, which makes a lattice of a longer box.
+
+    Args:
+        xy: centres, px, (k, 2).
+        is_dot: what the lattice grows along; others take a place in it and end it there, (k,).
+    """
+    dots = np.flatnonzero(is_dot)
+    if len(dots) < 4:
+        return None
+    middle = np.median(xy[dots], axis=0)
+    best: Lattice | None = None
+    for seed in dots[np.argsort(np.hypot(*(xy[dots] - middle).T))][:SEEDS].tolist():
+        steps = _first_steps(xy, seed)
+        if steps is None:
+            continue
+        found = _grown(xy, is_dot, seed, *steps)
+        if best is None or (len(found.rows), -found.box) > (len(best.rows), -best.box):
+            best = found
+        if len(best.rows) > len(dots) / 2 and best.box < MAX_BOX_RATIO * len(best.rows):
+            break
+    return best
+
+
+def _first_steps(xy: FloatArray, seed: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return the steps from a dot to the next column and row: two neighbours with one opposite each."""
+    away = xy - xy[seed]
+    order = np.argsort(np.hypot(*away.T))[1:9]
+    steps = [
+        away[k]
+        for k in order
+        if np.hypot(*(away[order] + away[k]).T).min() < MAX_OFF_FRACTION * np.hypot(*away[k])  # its opposite
+    ]
+    for other in steps[1:]:
+        first = steps[0]
+        cross = first[0] * other[1] - first[1] * other[0]
+        if abs(cross) > MIN_SINE * np.hypot(*first) * np.hypot(*other):
+            return (first, other) if cross > 0 else (first, -other)
+    return None
+
+
+def _grown(xy: FloatArray, is_dot: BoolArray, seed: int, across: FloatArray, down: FloatArray) -> Lattice:
+    """Grow a lattice from a dot: from each to its four neighbours, those that are predicted best first."""
+    place = {seed: (0, 0)}
+    taken = {(0, 0): seed}
+    waiting: list[tuple[float, int, int, int, FloatArray, FloatArray]] = []
+    counter = 0
+
+    def look_from(k: int, across: FloatArray, down: FloatArray) -> None:
+        nonlocal counter
+        row, column = place[k]
+        for d_row, d_column, step in ((0, 1, across), (0, -1, -across), (1, 0, down), (-1, 0, -down)):
+            if (row + d_row, column + d_column) in taken:
+                continue
+            away = np.hypot(*(xy - xy[k] - step).T)
+            j = int(np.argmin(away))
+            error = float(away[j] / np.hypot(*step))
+            if error < MAX_OFF_FRACTION and j not in place:
+                counter += 1
+                heapq.heappush(waiting, (error, counter, k, j, across, down))
+
+    look_from(seed, across, down)
+    while waiting:
+        _, _, k, j, across, down = heapq.heappop(waiting)
+        if j in place:
+            continue
+        step = xy[j] - xy[k]
+        # which of the four steps it was, and the same step as it is here
+        options = ((0, 1, across), (0, -1, -across), (1, 0, down), (-1, 0, -down))
+        d_row, d_column, _ = min(options, key=lambda one: float(np.hypot(*(one[2] - step))))
+        where = place[k][0] + d_row, place[k][1] + d_column
+        if where in taken:
+            continue
+        place[j], taken[where] = where, j
+        if not is_dot[j]:
+            continue
+        if d_column:
+            across = d_column * step
+        else:
+            down = d_row * step
+        look_from(j, across, down)
+    rows = np.array(list(place), dtype=np.int64)
+    return Lattice(rows, np.array([place[int(k)] for k in rows]), xy[rows])

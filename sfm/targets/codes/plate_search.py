@@ -16,11 +16,16 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.targets.codes.april_grids import name_corners, read_april_tags
-from sfm.targets.codes.boards import charuco_patterns, find_crossings, reduced
-from sfm.targets.codes.cut_boards import MIN_CROSSINGS, board_ends
-from sfm.targets.codes.dot_plates import placements, rings_among, size_of_marks
-from sfm.targets.codes.lattice import find_lattice
+from sfm.targets.codes.boards import (
+    MIN_CROSSINGS,
+    board_ends,
+    charuco_patterns,
+    find_crossings,
+    name_corners,
+    read_april_tags,
+    reduced,
+)
+from sfm.targets.codes.dot_plates import find_lattice, placements, rings_among, size_of_marks
 from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
 
 MIN_SIDE, MIN_DOTS_OF_PLATE = 3, 20  # dots or crossings along a side, and dots of a plate

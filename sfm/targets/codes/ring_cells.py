@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.cholesky import invert_symmetric
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import bilinear
+from sfm.kernels.small_algebra import invert_symmetric
 
 # Samples along a cell, and positions of the first cell that are tried.
 SAMPLES, PHASES = 12, 12

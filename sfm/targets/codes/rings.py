@@ -1,4 +1,7 @@
-"""Ring codes: the patterns of the published families, and tables of others in files."""
+"""Ring codes: the patterns of the published families, and tables of others in files.
+
+Reading of ring codes: what is in the ring around each measured dot.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,41 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
+from sfm.kernels.compiling import compiled
+from sfm.kernels.sampling import as_grey, bilinear
+from sfm.targets.codes.ring_cells import fit_cells
+
+UNCODED = -1
+UNREADABLE = -2
+# Sampling of the ring: angles, and radii as fractions between inner and outer radius of the ring. The first
+# lies in the gap between dot and ring, the last outside the ring, the others in the ring.
+ANGLES = 360
+RADII = np.array([-0.45, 0.25, 0.5, 0.75, 1.4])
+# Level between background (0) and dot (1) that separates set from clear, and the least distance from it
+# (both sides) that makes a reading of arcs certain.
+HALF = 0.5
+MARGIN = 0.15
+# A dot has no code where nothing in the ring around it is above this level.
+MIN_SET = 0.3
+# Step from clear to set cells in units of that from background to dot, and the least gap between the levels
+# of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
+MIN_STEP, MAX_STEP, MIN_JUMP = 0.6, 1.5, 0.4
+# Largest deviations, in steps, and the worst of the retro-panel: of a clear cell from the background (0.08),
+# or under glare (0.18) from the mean of what is before and behind it (0.06); of what is beside the ring from
+# the background (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a
+# cell on one radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.04).
+CLEAR_TOLERANCE, GLARE, GLARE_TOLERANCE = 0.1, 0.25, 0.07
+GAP_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.1, 0.15
+RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
+# Part of the circle just behind the ring that other things may cover, and what there may be behind a set
+# cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
+OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
+# Blur of the edge in a sharp photograph, px.
+SHARP_PX = 0.8
+# A ring may be interrupted by less than this angle, and an arc must be longer.
+SHORTEST_ARC_DEG = 12
 
 
 @dataclass(frozen=True)
@@ -173,3 +209,171 @@ def read_code_table(path: Path) -> CodeFamily:
 def _is_number(word: str) -> bool:
     """Whether a word is a number of at most 18 digits, which 64 bits hold."""
     return word.isascii() and word.isdigit() and len(word) <= 18
+
+
+def read_codes(
+    photograph: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    levels: FloatArray,
+    family: CodeFamily,
+    *,
+    blur_px: FloatArray | None = None,
+    noise: FloatArray | None = None,
+) -> tuple[IntArray, FloatArray]:
+    """Read the code around each measured dot.
+
+    The ring is sampled on ellipses similar to the dot's, so that tilt and rotation drop out. Intensities are
+    scaled to 0 = background and 1 = dot, so that dark and bright targets read alike.
+
+    Args:
+        photograph: intensities, shape (H, W).
+        xy: centres of the dots, px, shape (k, 2).
+        shape: (p, q, r) with (p q; q r) turning image vectors into dot radii, 1/px, shape (k, 3).
+        levels: intensity of the background and its step to the dot, shape (k, 2).
+        family: the family of codes.
+        blur_px: standard deviation of the edge of each dot, pixel box included, shape (k,); default is that
+            of a sharp photograph.
+        noise: standard deviation of the intensities about the fit of each dot, shape (k,); default is 0.
+
+    Returns:
+        Code numbers, `UNCODED` where nothing is around the dot and `UNREADABLE` where something is that is
+        no valid code, shape (k,); confidence of the reading, 0 to 1, shape (k,).
+    """
+    radii = family.inner + RADII * (family.outer - family.inner)
+    grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
+    polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
+    if family.cells == 0:
+        return _read_arcs(polar)
+    code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
+    body = polar[:, 1:4]
+    ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
+    code[ring] = UNREADABLE
+    ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
+    blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
+    geometry = xy[ring], shape[ring], levels[ring], blur[ring]
+    cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer)
+    misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
+    for k, found in zip(ring, cells, strict=True):
+        code[k], confidence[k] = _read_cells(found, family, misfit[k])
+    return code, confidence
+
+
+@compiled
+def _sample_rings(
+    image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray, radii: FloatArray, angles: int
+) -> FloatArray:
+    """Return normalised intensities on rings about each dot, (k, radii, angles); nan outside the image."""
+    height, width = image.shape
+    out = np.empty((len(xy), len(radii), angles))
+    for k in range(len(xy)):
+        p, q, r = shape[k]
+        det = p * r - q * q
+        for j in range(angles):
+            t = 2 * np.pi * j / angles  # y is down, so growing angles run clockwise in the image
+            c, s = np.cos(t), np.sin(t)
+            ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
+            for i in range(len(radii)):
+                x, y = xy[k, 0] + radii[i] * ex, xy[k, 1] + radii[i] * ey
+                if x >= 0 and y >= 0 and x < width - 1 and y < height - 1:
+                    out[k, i, j] = (bilinear(image, x, y) - levels[k, 0]) / levels[k, 1]
+                else:
+                    out[k, i, j] = np.nan
+    return out
+
+
+def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the number of arcs in each ring and the confidence."""
+    count = np.full(len(polar), UNCODED, dtype=np.int64)
+    confidence = np.zeros(len(polar))
+    for k, rings in enumerate(polar):
+        gap, body, outside = rings[0], rings[1:4], rings[4]
+        inside = np.isfinite(body).all(axis=0)
+        if not inside.any() or not (body[:, inside] > HALF).any():
+            continue
+        count[k] = UNREADABLE
+        if not inside.all() or np.isnan(gap).any() or gap.max() > HALF:
+            continue
+        state = body[1] > HALF
+        edges = np.flatnonzero(state != np.roll(state, 1))
+        if len(edges) == 0 or np.nanmax(outside) > HALF:
+            continue
+        length = np.diff(np.append(edges, edges[0] + len(state))) * 360 / len(state)
+        # Away from the ends of the arcs all radii must agree.
+        blur = round(SHORTEST_ARC_DEG / 3 * len(state) / 360)
+        sure = np.ones(len(state), dtype=bool)
+        for shift in range(-blur, blur + 1):
+            sure &= np.roll(state, shift) == state
+        certainty = np.abs(body - HALF)[:, sure].min()
+        agree = ((body > HALF) == state)[:, sure].all()
+        if length.min() < SHORTEST_ARC_DEG or not agree or certainty < MARGIN:
+            continue
+        count[k] = len(edges) // 2
+        confidence[k] = min(1.0, 2 * certainty)
+    return count, confidence
+
+
+def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
+    """Return code number and confidence of one ring from the levels of its cells, see `fit_cells`.
+
+    Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
+    the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
+    clear cells, clear ring and what is behind set cells, but for the border of a label, are at the level of
+    the background, set cells at one level but for shading, and each cell is the same on all radii and over
+    its length. A misfit of the model at the dot (in steps), as by halos of sharpening, is a
+    misfit of the samples too.
+    """
+    if not np.isfinite(found).all():
+        return UNREADABLE, 0.0
+    at_radii, (residual, gap, behind, sigma) = found[:3], found[3:7]
+    level = at_radii.mean(axis=0)
+    order = np.sort(level)
+    jump = np.diff(order)
+    at = jump.argmax()
+    bits = level > (order[at] + order[at + 1]) / 2
+    step = level[bits].mean() - level[~bits].mean()
+    if not MIN_STEP <= step <= MAX_STEP or jump[at] < MIN_JUMP * step:
+        return UNREADABLE, 0.0
+    # Shading makes the levels of the set cells a plane, with a prior so that few cells do not fit any plane.
+    angle = 2 * np.pi * np.arange(family.cells) / family.cells
+    A = np.column_stack([np.ones(family.cells), np.cos(angle), np.sin(angle)])[bits]
+    prior = np.diag([0.0, 1.0, 1.0]) * (SET_TOLERANCE / SHADING) ** 2
+    plane = A @ np.linalg.solve(A.T @ A + prior, A.T @ level[bits])
+    noise = NOISE_SIGMAS * sigma * residual
+    # Glare across the ring is seen in a clear cell as it is before and behind it.
+    glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
+    uneven = np.minimum(np.abs(level), glare)
+    uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
+    behind = np.where(_find_border(behind, step), 0.0, behind)
+    clutter = np.abs(behind) > GAP_TOLERANCE * step + noise
+    tests = (
+        np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
+        uneven <= CLEAR_TOLERANCE * step + noise,
+        np.abs(level[~bits]) <= GLARE * step,
+        np.abs(gap) <= GAP_TOLERANCE * step + noise,
+        residual <= np.hypot(RESIDUAL_TOLERANCE * step, misfit),
+        clutter.mean() <= OUTSIDE_CLUTTER,
+        np.abs(behind[bits]) <= BEHIND_SET * step + noise[bits],
+    )
+    value = smallest_rotation(np.array([bits @ (1 << np.arange(family.cells - 1, -1, -1))]), family.cells)[0]
+    entry = np.searchsorted(family.pattern, value)
+    known = entry < len(family.pattern) and family.pattern[entry] == value
+    if not known or not all(np.all(t) for t in tests):
+        return UNREADABLE, 0.0
+    return int(family.number[entry]), float(min(1.0, jump[at] / step))
+
+
+def _find_border(behind: FloatArray, step: float) -> BoolArray:
+    """Return which cells the border of a label is behind, (cells,): what is on all four sides of a square.
+
+    It is about the dot, alike to half a step at each quarter of a turn, with free corners. Other things cover
+    one side or two, and an edge on four sides that reaches into the ring leaves no corner free behind it.
+    Rings whose number of cells is no multiple of four show no border.
+    """
+    if len(behind) % 4:
+        return np.zeros(len(behind), bool)
+    sides, clear = behind.reshape(4, -1), GAP_TOLERANCE * step
+    free_corner = (np.abs(sides.mean(axis=0)) <= clear).any()
+    alike = (np.ptp(sides, axis=0) <= HALF * step).all()
+    on_all_sides = (np.abs(sides) > clear).all(axis=0)
+    return np.tile(on_all_sides & free_corner & alike, 4)

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
+from sfm.kernels.small_algebra import invert_symmetric, solve_symmetric
 from sfm.targets.fits.blurred_ellipse import edge_profile
 from sfm.targets.flags import Flag
 

@@ -15,11 +15,16 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
-from sfm.targets.fits.damage import LEVEL, MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
 from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
 from sfm.targets.fits.outline_noise import (
+    LEVEL,
+    MAD,
+    MIN_POPULATION,
     OutlineNoise,
     OutlineShape,
+    common_shape,
+    find_damage,
+    gap_shifts,
     judge_outlines,
     outline_shape,
     rise_to_first,

@@ -7,7 +7,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
 from sfm.orientation.resection.fischler_bolles import (

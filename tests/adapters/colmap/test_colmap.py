@@ -10,9 +10,8 @@ import pycolmap
 import pytest
 
 from adapters.colmap import adjuster as colmap
-from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.adjuster import adjust_with_colmap, covariance_with_colmap
 from adapters.colmap.camera_models import read_model, write_model
-from adapters.colmap.validation_backend import covariance_with_colmap
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project

@@ -12,8 +12,8 @@ from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.colmap.mapper import map_photographs
 from sfm.errors import BackendError
 from sfm.pipeline import run_survey
+from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.other_programs import OtherPrograms
 from tests.places import ROOT
 
 DATA = ROOT.parent / "shared" / "data"

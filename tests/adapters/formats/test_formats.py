@@ -20,9 +20,9 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab,
 )
+from adapters.formats.mesh import read_ply
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
-from adapters.formats.ply import read_ply
 from adapters.formats.registry import FORMATS as FILE_FORMATS
 from adapters.formats.registry import (
     format_named,
@@ -35,12 +35,11 @@ from adapters.formats.registry import (
 from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
 from sfm.cli.commands.solvers import convert
-from sfm.comparison.camera_conversion import convert_camera, convert_cameras
+from sfm.comparison.camera_conversion import convert_camera, convert_cameras, undistort
 from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection
-from sfm.comparison.undistortion import undistort
 from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.files.ply import write_ply
+from sfm.files.csv_tables import write_ply
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.places import SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
-from adapters.formats.stereo_rectification import rectify
+from adapters.formats.rig_files import rectify
 from sfm.camera import project
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_cameras

@@ -15,11 +15,11 @@ import pytest
 from PIL import ExifTags, Image, ImageFilter
 from PIL.TiffImagePlugin import IFDRational
 
-from adapters.colmap.sensor_widths import sensor_width_mm
+from adapters.colmap.mapper import sensor_width_mm
 from sfm import cli
 from sfm.errors import GeometryError, OutputError
 from sfm.files.manifest import manifest_text, sha256_of
-from sfm.report.origin import Origin, read_origin, refuse_other_origin
+from sfm.report.output import Origin, read_origin, refuse_other_origin
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
 from sfm.targets.codes.families import FAMILIES

@@ -7,8 +7,8 @@ from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.orientation.resection.candidates import choose_by_line, solution_of
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
+from sfm.textbook.resection.by_method import cylinder_distance, cylinder_warning
 from sfm.textbook.resection.church import resect_church
-from sfm.textbook.resection.critical_cylinder import cylinder_distance, cylinder_warning
 from sfm.textbook.resection.dlt import resect_dlt
 from sfm.textbook.resection.p4p import resect_p4p
 from sfm.textbook.resection.rampal import resect_rampal

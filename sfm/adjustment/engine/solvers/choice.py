@@ -16,15 +16,13 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.solvers.dense import BYTES, DenseSolver
-from sfm.adjustment.engine.solvers.fronts import fronts_of
-from sfm.adjustment.engine.solvers.memory import available_bytes, refuse_what_does_not_fit
+from sfm.adjustment.engine.solvers.fronts import fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
-from sfm.adjustment.engine.solvers.pairs import pairs_of
-from sfm.adjustment.engine.solvers.protocol import Solver
+from sfm.adjustment.engine.solvers.protocol import Solver, available_bytes, refuse_what_does_not_fit
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, IntArray
 from sfm.display import counted
-from sfm.kernels.options import compiled
+from sfm.kernels.compiling import compiled
 from sfm.network import Network
 
 # Operations in a second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter

@@ -30,13 +30,13 @@ from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations, times_reduced
-from sfm.adjustment.engine.solvers import memory
-from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares, times_inverse
+from sfm.adjustment.engine.solvers import protocol
+from sfm.adjustment.engine.solvers.fronts import Pairs, subtract_squares, times_inverse
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
 from sfm.display import counted
-from sfm.kernels.options import compiled, kernel
+from sfm.kernels.compiling import compiled, kernel
 from sfm.kernels.threads import at_once
 
 CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time, at least
@@ -79,7 +79,7 @@ class DenseSolver:
     @cached_property
     def limit(self) -> float:
         """Memory that may be taken, bytes, asked for once in an adjustment: files state it."""
-        return memory.available_bytes()
+        return protocol.available_bytes()
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
@@ -89,7 +89,7 @@ class DenseSolver:
         Raises:
             GeometryError: the matrix would not fit in memory.
         """
-        memory.refuse_what_does_not_fit(
+        protocol.refuse_what_does_not_fit(
             self.bytes, f"{counted(self.layout.reduced, 'unknown')} that are all connected", limit=self.limit
         )
         scale = equations.parts.scale

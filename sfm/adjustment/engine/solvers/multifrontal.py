@@ -36,16 +36,15 @@ from scipy.linalg.lapack import dpotrf
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations, times_schur
-from sfm.adjustment.engine.solvers import memory
+from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
-from sfm.adjustment.engine.solvers.fronts import Front, Fronts
+from sfm.adjustment.engine.solvers.fronts import Front, Fronts, subtract_border
 from sfm.adjustment.engine.solvers.multifrontal_factor import EliminatedFront, MultifrontalFactor
-from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.blocks import subtract_pair
-from sfm.kernels.options import kernel
+from sfm.kernels.compiling import kernel
+from sfm.kernels.small_algebra import subtract_pair
 from sfm.kernels.threads import at_once
 
 SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
@@ -82,7 +81,7 @@ class MultifrontalSolver:
     @cached_property
     def limit(self) -> float:
         """Memory that may be taken, bytes, asked for once in an adjustment: files state it."""
-        return memory.available_bytes()
+        return protocol.available_bytes()
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
@@ -92,7 +91,7 @@ class MultifrontalSolver:
         Raises:
             GeometryError: the factor would not fit in memory.
         """
-        memory.refuse_what_does_not_fit(
+        protocol.refuse_what_does_not_fit(
             self.bytes, f"the unknowns of {len(self.layout.pose_free)} photographs", limit=self.limit
         )
         scale = equations.parts.scale

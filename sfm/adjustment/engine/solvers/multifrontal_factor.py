@@ -27,8 +27,8 @@ from sfm.adjustment.engine.solvers.fronts import Front, Fronts
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.blocks import add_product
-from sfm.kernels.options import kernel
+from sfm.kernels.compiling import kernel
+from sfm.kernels.small_algebra import add_product
 
 
 class EliminatedFront(NamedTuple):

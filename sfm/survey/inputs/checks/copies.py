@@ -7,7 +7,7 @@ sum of d is that of both residuals together, with the same errors it is 0:
 
     |d|^2 / (|r_i|^2 + |r_j|^2) = 1 - rho.
 
-Copies by their bytes are found before, see `sfm.survey.measuring.photographs`, and so are those by identical
+Copies by their bytes are found before, see `sfm.survey.measuring.targets`, and so are those by identical
 image points: no two exposures have the same noise, so that image points which are the same to the last digit
 were measured in one picture.
 

@@ -1,0 +1,249 @@
+"""The table of `kolinear match` as text, CSV and JSON, and the files that it may replace.
+
+What `kolinear resect` prints: one method in full as JSON or text, or all methods side by side.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, angles_from_rotation
+from sfm.display import counted
+from sfm.errors import GeometryError, OutputError
+from sfm.files.whole_files import whole_file
+from sfm.matching.conjugate_patches import ConjugatePoints
+from sfm.orientation.resection.candidates import ResectionSolution
+from sfm.report.page import Column, Table, plain
+from sfm.textbook.resection.by_method import ResectionResult
+from sfm.textbook.resection.dlt import DirectLinearTransformation
+
+EXTERIOR = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
+METHODS = (
+    *(Column("method"), Column("no", format=str)),
+    *(Column(name, format=".6f") for name in EXTERIOR[:3]),
+    *(Column(name, format=".5f") for name in ("omega", "phi", "kappa")),
+    Column("rms mm", format=".6f"),
+)
+NO_SECOND = -1.0  # r of the second-best place where there is none
+COLUMNS = (
+    *(Column("point", "point"), Column(None, "x_px"), Column(None, "y_px"), Column("left px", format=str)),
+    *(Column(None, "x_right_px"), Column(None, "y_right_px"), Column("right px", format=str)),
+    *(Column(None, "sx_px"), Column(None, "sy_px"), Column("sigma px", format=str)),
+    Column("r", "r", format=".4f", unknown="-"),
+    Column("second r", "r_second", format=lambda r: f"{r:.2f}" if r > NO_SECOND else "-"),
+    *(Column("steps", "steps", format=str), Column("", "reason")),
+)
+NAMES = tuple(one.name for one in COLUMNS if one.name)
+TABLE_ENDINGS = (".csv", ".json")
+PICTURE_ENDING = ".png"
+PNG_HEAD = 33  # bytes of the signature and the first chunk (PNG specification, sec. 5.2 and 11.2.1)
+MARK = b"Software\0kolinear match"  # text in a picture of this program (PNG specification, sec. 11.3.3)
+LOOKED_AT = 4096  # bytes of an existing file by which it is recognised
+
+
+def matches_table(names: tuple[str, ...], found: ConjugatePoints) -> Table:
+    """Return the results, NaN where there is nothing."""
+    values = np.column_stack([found.left, found.right, found.sigma, found.correlation, found.second])
+    rows = []
+    for name, row, steps, why in zip(names, values.tolist(), found.steps, found.reason, strict=True):
+        x, y, x_right, y_right, sx, sy, r, second = row
+        right, sigma = ("-", "-") if why else (f"{x_right:.3f}, {y_right:.3f}", f"{sx:.4f}, {sy:.4f}")
+        left = f"{x:.2f}, {y:.2f}"
+        rows.append((name, x, y, left, x_right, y_right, right, sx, sy, sigma, r, second, int(steps), why))
+    return Table(COLUMNS, rows)
+
+
+def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
+    """Return the results as JSON, null where there is nothing."""
+    beside = zip(matches_table(names, found).records, found.covariance, found.gain, found.offset, strict=True)
+    entries = [
+        entry | {"covariance_px2": Q if np.isfinite(Q).all() else None, "gain": gain, "offset": offset}
+        for entry, Q, gain, offset in beside
+    ]
+    return json.dumps(plain({"method": found.method, "points": entries}), indent=1, ensure_ascii=False) + "\n"
+
+
+def refuse_outputs(out: Path | None, picture: Path | None, inputs: tuple[Path, ...], as_json: bool) -> None:
+    """Refuse outputs of another ending, and those that would take the place of anything but earlier ones.
+
+    Args:
+        out: table to be written, or None.
+        picture: picture to be written, or None.
+        inputs: files that are read.
+        as_json: whether JSON is asked for.
+
+    Raises:
+        OutputError: with the option at fault, and what was found in its place.
+    """
+    if out is not None:
+        endings = (".json",) if as_json else TABLE_ENDINGS
+        _refuse_ending("--out", out, endings)
+        _refuse_taken("--out", out, inputs, (",".join(NAMES).encode() + b"\n", b'{\n "method": '))
+    if picture is not None:
+        _refuse_ending("--picture", picture, (PICTURE_ENDING,))
+        _refuse_taken("--picture", picture, inputs, ())
+
+
+@contextmanager
+def whole_outputs(out: Path | None, picture: Path | None) -> Iterator[tuple[Path | None, Path | None]]:
+    """Give a table and a picture to write, which take their places when both are finished.
+
+    Raises:
+        OutputError: one of them cannot be written; none is then.
+    """
+    with ExitStack() as stack:
+        yield (
+            None if out is None else stack.enter_context(whole_file(out, replaces=True)),
+            None if picture is None else stack.enter_context(whole_file(picture, replaces=True)),
+        )
+
+
+def picture_file(drawing: AnyArray) -> bytes:
+    """Return a picture as PNG with the mark by which it is known again."""
+    data = cv2.imencode(PICTURE_ENDING, drawing)[1].tobytes()
+    return data[:PNG_HEAD] + _chunk(b"tEXt", MARK) + data[PNG_HEAD:]
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    """Return a chunk of a PNG file with its check sum (PNG specification, sec. 5.3 and 5.5)."""
+    return len(content).to_bytes(4, "big") + kind + content + crc32(kind + content).to_bytes(4, "big")
+
+
+def _refuse_ending(option: str, path: Path, endings: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in endings:
+        found = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
+        raise OutputError(f"{option} {path}: {found}, needed {' or '.join(endings)}")
+
+
+def _refuse_taken(option: str, path: Path, inputs: tuple[Path, ...], heads: tuple[bytes, ...]) -> None:
+    """Refuse an input, by whatever path, and anything that does not begin like an earlier output."""
+    if not path.exists() and not path.is_symlink():
+        return
+    for given in inputs:
+        if path.exists() and given.exists() and path.samefile(given):
+            raise OutputError(f"{option} {path}: is the input {given}, which is not written over")
+    if not path.is_file():
+        raise OutputError(f"{option} {path}: exists and is not a file")
+    with path.open("rb") as file:
+        begin = file.read(LOOKED_AT)
+    earlier = begin.startswith(heads) if heads else begin[PNG_HEAD:].startswith(_chunk(b"tEXt", MARK))
+    if not earlier:
+        raise OutputError(f"{option} {path}: exists and was not written by kolinear match")
+
+
+def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
+    """Return what one method finds, ready for JSON.
+
+    Args:
+        found: by `resection.by_method.resect`.
+        c: principal distance, mm.
+
+    Returns:
+        method, points, solutions (best first: X0, Y0, Z0, omega_deg, phi_deg, kappa_deg, M, rms_mm) and,
+        where they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history, residuals_mm,
+        line_fit, interior, rejected, trials, warning.
+    """
+    unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
+    lines = found.line_fit or ()
+    known = {
+        "method": found.method,
+        "points": found.points,
+        "solutions": [
+            dict(zip(EXTERIOR, _values(one), strict=True)) | {"M": one.rotation.T, "rms_mm": one.rms * c}
+            for one in found.solutions
+        ],
+        "line_fit": [
+            {"slope": one.slope, "intercept_mm": one.intercept * c, "scatter_mm": one.scatter * c}
+            for one in lines
+        ]
+        or None,
+        "sigma0_mm": found.sigma0_mm,
+        "redundancy": None if found.sigma0_mm is None else found.redundancy,
+        "dispersion": None if found.dispersion is None else found.dispersion * np.outer(unit, unit),
+        "history": None if found.history is None else found.history * unit[: found.history.shape[1]],
+        "residuals_mm": found.residuals_mm,
+        "interior": None if found.interior is None else _interior(found.interior),
+        "rejected": found.rejected,
+        "trials": found.trials,
+        "warning": found.warning or None,
+    }
+    return {name: plain(value) for name, value in known.items() if value is not None}
+
+
+def comparison_json(found: dict[str, ResectionResult | GeometryError], c: float) -> list[dict[str, Any]]:
+    """Return what all methods find, or why one finds nothing, ready for JSON; c in mm."""
+    return [
+        {"method": name, "error": str(one)} if isinstance(one, GeometryError) else resection_json(one, c)
+        for name, one in found.items()
+    ]
+
+
+def comparison_table(found: dict[str, ResectionResult | GeometryError], c: float) -> str:
+    """Return what all methods find side by side, and below why others find nothing; c in mm."""
+    rows, remarks = [], []
+    for name, one in found.items():
+        if isinstance(one, GeometryError):
+            remarks.append(f"{name}: {str(one).removeprefix(f'{name}: ')}\n")
+            continue
+        rows += [(name, k, *_values(each), each.rms * c) for k, each in enumerate(one.solutions, start=1)]
+        if one.warning:
+            remarks.append(f"{name}: {one.warning}\n")
+    return (Table(METHODS, rows).text + "".join(remarks)).rstrip("\n")
+
+
+def resection_text(found: ResectionResult, c: float) -> str:
+    """Return what one method finds as text; c in mm."""
+    lines = [f"{found.method}, {counted(found.points, 'point')}"]
+    for k, one in enumerate(found.solutions, start=1):
+        X0, Y0, Z0, omega, phi, kappa = _values(one)
+        lines.append(f"solution {k}: rms {one.rms * c:.6f} mm")
+        lines.append(f"  X0 Y0 Z0        {X0:.8f} {Y0:.8f} {Z0:.8f}")
+        lines.append(f"  omega phi kappa {omega:.7f} {phi:.7f} {kappa:.7f} deg")
+        lines += ["  M " + " ".join(f"{value:12.9f}" for value in row) for row in one.rotation.T]
+    if found.sigma0_mm is not None and np.isfinite(found.sigma0_mm):
+        lines.append(f"sigma0 {found.sigma0_mm:.7g} mm, redundancy {found.redundancy}")
+        if found.dispersion is not None:
+            sigma = np.sqrt(np.diag(found.dispersion))
+            sigma[3:] = np.degrees(sigma[3:])
+            lines.append("standard deviations X0 Y0 Z0 " + " ".join(f"{value:.4g}" for value in sigma[:3]))
+            lines.append("  omega phi kappa (deg)      " + " ".join(f"{value:.4g}" for value in sigma[3:]))
+    if found.interior is not None:
+        interior = _interior(found.interior)
+        lines.append("interior " + ", ".join(f"{key} {value:.6g}" for key, value in interior.items()))
+    if found.rejected is not None:
+        lines.append(
+            f"rejected {len(found.rejected)}: {', '.join(found.rejected)}"
+            if found.rejected
+            else "rejected none"
+        )
+    if found.history is not None:
+        lines.append("history")
+        for unknowns in found.history:
+            values = [*unknowns[:3], *np.degrees(unknowns[3:])]
+            lines.append("  " + " ".join(f"{value:14.8f}" for value in values))
+    if found.warning:
+        lines.append(f"warning: {found.warning}")
+    return "\n".join(lines)
+
+
+def _interior(found: DirectLinearTransformation) -> dict[str, float]:
+    return {
+        "c_mm": found.c,
+        "x0_mm": float(found.principal_point[0]),
+        "y0_mm": float(found.principal_point[1]),
+        "affinity": found.affinity,
+        "shear_deg": float(np.degrees(found.shear)),
+    }
+
+
+def _values(solution: ResectionSolution) -> tuple[float, ...]:
+    """Return X0, Y0, Z0 and omega, phi, kappa in degrees."""
+    return (*solution.position.tolist(), *np.degrees(angles_from_rotation(solution.rotation)).tolist())
