@@ -39,9 +39,8 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
-from sfm.files.user_cache import scratch_folder
+from sfm.files.user_cache import closed_current_folder, scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
-from sfm.runtime.folder_settings import closed_current_folder
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
@@ -239,7 +238,7 @@ class DaskEngine:
         return max(1, sum(threads.values()))
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens, see sfm.runtime.executor.Engine.
+        """Run all work and yield what happens, see sfm.kernels.threads.Engine.
 
         Raises:
             BackendError: the scheduler or all workers are gone, or the workers have no Kolinear.

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.matching.correlation.ncc import match_ncc
+from sfm.matching.correlation import match_ncc
 from sfm.matching.lsm.two_photo import match_lsm
 from tests.textures import REACH, Pairs, affine_pairs, random_texture, with_noise
 

@@ -25,7 +25,7 @@ from sfm.camera import Camera, project
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.distortion.models import MODELS
 from sfm.network import Estimate, ImagePoints, Mounts, Network
-from sfm.report.findings.rigs import rigs_of
+from sfm.report.findings.calibrated_cameras import rigs_of
 
 MOMENTS, NOISE_PX, PITCH = 14, 0.03, 30.0
 ROWS, COLUMNS, BASE = 6, 9, 100.0

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from sfm.camera import camera_from_values
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.report.view_page import write_view
-from sfm.report.viewer.solution_scene import scene_of_stored
+from sfm.report.viewer.embedded import scene_of_stored
 from sfm.solution import Solution
 
 FRAMES = 60

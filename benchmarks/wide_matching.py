@@ -23,8 +23,7 @@ from datasets.textured import render
 from sfm.camera import camera_from_values, project
 from sfm.conventions import AnyArray, FloatArray
 from sfm.matching import conjugate
-from sfm.matching.conjugate import match_points
-from sfm.matching.local_affinity import affinities_around
+from sfm.matching.conjugate import affinities_around, match_points
 
 SIZE_PX = (640, 480)
 # Angle between the viewing directions and turn about the right one, degrees, and distance, times the left one

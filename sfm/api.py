@@ -28,8 +28,8 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult
-from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
+from sfm.runtime.public_names import load_adapters
 from sfm.solution import Solution, solution_of
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey
@@ -149,7 +149,7 @@ def write_result(
             Path(folder), "tables", Content(solution_of(result, "write_result").with_joint_covariance)
         )
         return Path(folder) / "points.csv"
-    from sfm.report.findings.findings import findings_of
+    from sfm.report.findings.survey_remarks import findings_of
     from sfm.report.output import write_result as write
 
     with one_blas_thread():

@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, Network, values_of
-from sfm.observations.exterior import ExteriorObservations
+from sfm.observations.pose import ExteriorObservations
 from sfm.solution import CONTROL_COVARIANCE
 
 CENTRE, ROTATION = "projection centre", "rotation"

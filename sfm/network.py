@@ -21,11 +21,9 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
-from sfm.observations.control import ObjectPoints
-from sfm.observations.exterior import ExteriorObservations
-from sfm.observations.interior import InteriorObservations
+from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.observations.kind import Kind
-from sfm.observations.scale_bars import ScaleBars
+from sfm.observations.pose import ExteriorObservations
 
 __all__ = [
     "AdjustedValues",

@@ -24,12 +24,11 @@ from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import find_photographs, refuse_incomplete_cameras
+from sfm.survey.inputs.measurements import Measurements, find_photographs, refuse_incomplete_cameras
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.measuring.other_sizes import separate_sizes
+from sfm.survey.measuring.targets import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_with_models
 from sfm.survey.target_network import measure_targets

@@ -1,4 +1,9 @@
-"""A part of a network: some of its photographs, points and image points, counted anew."""
+"""A part of a network: some of its photographs, points and image points, counted anew.
+
+Checks of the input of an adjustment from Python, as of files: shapes, indices, numbers, covariances.
+
+The first thing that is wrong is named, with what was expected.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from sfm.conventions import BoolArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, ObjectPoints
 from sfm.observations.kind import Kind
 
+CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
 K = TypeVar("K", bound=Kind)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 
@@ -119,3 +125,139 @@ def merge_estimate(part: Estimate, images: BoolArray, points: BoolArray) -> Esti
     xyz = np.full((len(points), 3), np.nan)
     position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
     return replace(part, position=position, rotation=rotation, points=xyz)
+
+
+def check_network(network: Network, estimate: Estimate) -> None:
+    """Refuse a network and an estimate that do not belong together or hold what no adjustment can use.
+
+    Args:
+        network: what was measured.
+        estimate: start values; NaN where there is none.
+
+    Raises:
+        GeometryError: what was found, where, and what was expected.
+    """
+    if not isinstance(network, Network) or not isinstance(estimate, Estimate):
+        found = f"{type(network).__name__} and {type(estimate).__name__}"
+        raise GeometryError(f"adjustment: {found}, expected a Network and an Estimate")
+    m, n = len(network.images), len(network.points)
+    seen = network.image_points
+    k = len(seen)
+    for what, array, shape in (
+        ("projection centres", estimate.position, (m, 3)),
+        ("rotations", estimate.rotation, (m, 3, 3)),
+        ("object points", estimate.points, (n, 3)),
+        ("cameras of the photographs", network.camera, (m,)),
+        ("image points", seen.xy, (k, 2)),
+        ("covariances of the image points", seen.covariance, (k, 2, 2)),
+        ("photographs of the image points", seen.image, (k,)),
+        ("object points of the image points", seen.point, (k,)),
+        ("control coordinates", network.control.xyz, (len(network.control), 3)),
+        ("covariances of the control", network.control.covariance, (len(network.control), 3, 3)),
+    ):
+        if np.shape(array) != shape:
+            raise GeometryError(f"network: {what} of shape {np.shape(array)}, expected {shape}")
+    for what, index, count in (
+        ("camera", network.camera, len(estimate.cameras)),
+        ("photograph", seen.image, m),
+        ("object point", seen.point, n),
+        ("object point", network.control.point, n),
+        ("object point", network.scale_bars.start, n),
+        ("object point", network.scale_bars.end, n),
+        ("photograph", network.exterior.image, m),
+    ):
+        if not np.issubdtype(np.asarray(index).dtype, np.integer):
+            raise GeometryError(
+                f"network: indices of a {what} of type {np.asarray(index).dtype}, expected whole numbers"
+            )
+        wrong = _first((index < 0) | (index >= count))
+        if wrong is not None:
+            raise GeometryError(f"network: index {index[wrong]} of a {what}, expected 0 to {count - 1}")
+
+    def of_row(row: int) -> str:
+        return f"image {network.images[seen.image[row]]}, point {network.points[seen.point[row]]}"
+
+    wrong = _first(np.asarray(~np.isfinite(seen.xy).all(axis=1)))
+    if wrong is not None:
+        raise GeometryError(
+            f"{of_row(wrong)}: image coordinates {_said(seen.xy[wrong])} px, expected numbers"
+        )
+    wrong = _first(~_positive_definite(seen.covariance))
+    if wrong is not None:
+        raise GeometryError(
+            f"{of_row(wrong)}: covariance {_said(seen.covariance[wrong])} px^2, expected a symmetric "
+            "positive definite matrix"
+        )
+    control, bars = network.control, network.scale_bars
+    if len(control):
+        _check_control(control, network.points)
+    good = np.isfinite(bars.length) & (bars.length > 0) & np.isfinite(bars.sigma) & (bars.sigma > 0)
+    wrong = _first(~good | (bars.start == bars.end))
+    if wrong is not None:
+        raise GeometryError(
+            f"scale bar {network.points[bars.start[wrong]]} - {network.points[bars.end[wrong]]}: length "
+            f"{bars.length[wrong]:g}, sigma {bars.sigma[wrong]:g}, expected two points and positive numbers"
+        )
+
+
+def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
+    """Refuse control that no adjustment can use; points are the names of the object points."""
+    wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~possible_covariances(control.covariance))
+    if wrong is not None:
+        raise GeometryError(
+            f"control point {points[control.point[wrong]]}: expected finite coordinates and a symmetric "
+            "positive definite covariance, of which variances may be 0 (fixed) or infinite (not known)"
+        )
+    twice = np.flatnonzero(np.bincount(control.point, minlength=len(points)) > 1)
+    if len(twice):
+        raise GeometryError(f"control point {points[twice[0]]}: duplicate, expected each point once")
+
+
+def check_number(what: str, value: float, low: float, high: float = np.inf) -> None:
+    """Refuse a number that is not between two others, the bounds left out.
+
+    Raises:
+        GeometryError: with what was found and expected.
+    """
+    if not isinstance(value, int | float | np.number) or not low < value < high:
+        expected = f"more than {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
+        raise GeometryError(f"{what} = {value}, expected a number {expected}")
+
+
+def _first(wrong: BoolArray) -> int | None:
+    rows: IntArray = np.flatnonzero(wrong)
+    return int(rows[0]) if len(rows) else None
+
+
+def _said(values: FloatArray) -> str:
+    return " ".join(f"{value:g}" for value in np.ravel(values))
+
+
+def _positive_definite(covariance: FloatArray) -> BoolArray:
+    """Return which covariances (k, 2, 2) are symmetric and positive definite."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    symmetric = np.abs(b - covariance[:, 1, 0]) <= 1e-9 * np.sqrt(np.abs(a * c))
+    return np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & symmetric & (a > 0) & (a * c > b * b))
+
+
+def possible_covariances(covariance: FloatArray) -> BoolArray:
+    """Return which covariances (c, n, n) coordinates can have, those fixed or not known left out, (c,).
+
+    Args:
+        covariance: variance 0 = fixed, infinite = not known; these are correlated with nothing.
+    """
+    n = covariance.shape[1]
+    unknown = np.eye(n, dtype=bool) & np.isposinf(covariance)  # a variance may be infinite
+    finite = (np.isfinite(covariance) | unknown).all(axis=(1, 2))
+    symmetric = np.isclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=0).all(axis=(1, 2))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    usable: BoolArray = np.asarray(finite & symmetric & (variance >= 0).all(axis=1))
+    free = np.isfinite(variance) & (variance > 0)
+    scale = np.where(free, 1 / np.sqrt(np.where(free, variance, 1.0)), 1.0)
+    unit = np.eye(n, dtype=bool)
+    mixed = np.where(unit | ~usable[:, None, None], 0.0, covariance)
+    correlation = np.where(unit, 1.0, mixed * scale[:, :, None] * scale[:, None, :])
+    both = free[:, :, None] & free[:, None, :]
+    bearable = unit | (correlation == 0) | (both & (np.abs(correlation) <= CORRELATION_LIMIT))
+    regular = np.linalg.eigvalsh(correlation).min(axis=1) > n * np.finfo(float).eps
+    return np.asarray(usable & bearable.all(axis=(1, 2)) & regular)

@@ -22,7 +22,7 @@ from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
 from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution
-from sfm.targets.flags import LIKEST_FIRST, Flag, count_flags
+from sfm.targets.outlines import LIKEST_FIRST, Flag, count_flags
 
 COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
 
@@ -67,8 +67,8 @@ class PhotographTargets:
     semi_axes: FloatArray  # of their outlines, larger first, px, (k, 2)
     angle: FloatArray  # of the larger semi-axis from x towards y, rad, (k,)
     rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
-    rejected_flag: IntArray  # reason for each rejection, see sfm.targets.flags.Flag, (r,)
-    flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.flags.Flag, (k,)
+    rejected_flag: IntArray  # reason for each rejection, see sfm.targets.outlines.Flag, (r,)
+    flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.outlines.Flag, (k,)
     stored: bool = False  # whether the targets were measured in an earlier run
     blur: FloatArray | None = None  # standard deviation of their edges, px; NaN where there is none, (k,)
     camera: str = ""  # its name, with photographs of one size

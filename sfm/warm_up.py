@@ -22,10 +22,11 @@ from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.errors import KolinearError
-from sfm.geometry.mesh import Mesh
-from sfm.kernels.compiling import set_warm
+from sfm.files.user_cache import closed_current_folder
+from sfm.geometry.tolerance import Mesh
 from sfm.kernels.sampling import resample
 from sfm.kernels.threads import cores
+from sfm.kernels.warmed import set_warm
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import METHODS
 from sfm.matching.lsm.coverage import points_apart
@@ -35,11 +36,10 @@ from sfm.matching.tracks.interest import foerstner_points, natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
-from sfm.planning.design.candidates import gains
-from sfm.planning.sight.occlusion import box_tree, hidden_points
+from sfm.planning.design.designer import gains
+from sfm.planning.planned_object import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring
-from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family

@@ -56,11 +56,6 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_statistics.py",
         "tests/adjustment/test_minimal_bias.py",
     ),
-    "sfm/adjustment/quality/reliability.py": (
-        "tests/adjustment/test_statistical_tests.py",
-        "tests/adjustment/test_minimal_bias.py",
-        "tests/adjustment/test_statistics.py",
-    ),
     **{
         f"sfm/adjustment/quality/{module}.py": (
             "tests/adjustment/test_given_model.py",
@@ -106,7 +101,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/survey/test_solution.py",
     ),
     "sfm/orientation/resection": ("tests/orientation/resection",),
-    "sfm/orientation/absolute.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
+    "sfm/similarity.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
     "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),
     "sfm/epochs/displacements.py": ("tests/epochs/test_displacements.py",),
     "sfm/conventions.py": ("tests/test_units.py",),

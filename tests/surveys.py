@@ -19,7 +19,7 @@ from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, co
 from sfm.result import SurveyResult
 from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.survey import CameraSetup, Survey
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 from tests.synthetic import make_network, seed_of
 

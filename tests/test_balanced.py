@@ -10,10 +10,10 @@ import pytest
 
 from sfm.adjustment.result import Adjustment
 from sfm.camera import camera_from_values, pixel_from_tangents
-from sfm.distortion.balanced import BALANCED, brown_by_balanced, from_balanced, to_balanced
+from sfm.distortion.brown import BALANCED, brown_by_balanced, from_balanced, to_balanced
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of

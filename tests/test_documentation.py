@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import types
 from pathlib import Path
 
 import pytest
 
 from sfm.survey.inputs.survey_file import SurveyFile
-from tests.places import ROOT
-
-
-def load(name: str) -> types.ModuleType:
-    """Return a module of docs/, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"docs/{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from tests.places import ROOT, load_page_code
 
 
 def test_every_page_is_on_the_site() -> None:
@@ -49,7 +38,7 @@ def test_commands_of_the_page_name_what_is_there(page: str) -> None:
 
 
 def test_every_key_of_the_survey_file_has_a_meaning_and_bounds() -> None:
-    keys = load("survey_keys")
+    keys = load_page_code("survey_keys")
     rows = {}
     for name, field in SurveyFile.model_fields.items():
         for row in keys.rows_of(keys.section_of(field.annotation)):
@@ -68,7 +57,7 @@ def test_every_key_of_the_survey_file_has_a_meaning_and_bounds() -> None:
 
 
 def test_faults_of_a_site_are_found(tmp_path: Path) -> None:
-    links = load("links")
+    links = load_page_code("links")
     (tmp_path / "a.html").write_text(
         '<h1 id="top">A</h1><a href="b.html#there">b</a><a href="#top">up</a>'
         '<a href="https://elsewhere.org">x</a><a href="b.html#gone">b</a><a href="c.html">c</a>'

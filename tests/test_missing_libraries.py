@@ -12,7 +12,7 @@ import sfm
 from sfm import cli
 from sfm.cli.commands.batching import in_process_engine
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
-from sfm.kernels import compiling as warmed
+from sfm.kernels import warmed
 from sfm.remarks.remark import Remark
 from sfm.runtime.executor import Call, Done, Event, Lost, Send, Sent, Work
 from tests.surveys import write_observed_survey

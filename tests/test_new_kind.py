@@ -17,7 +17,7 @@ from sfm.network import values_of
 from sfm.observations import TABLES
 from sfm.observations.point_pairs import PointPairs
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey

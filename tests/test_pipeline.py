@@ -17,7 +17,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.places import ROOT
 
 DATASETS = ROOT / "datasets"

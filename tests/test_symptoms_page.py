@@ -15,17 +15,15 @@ import pytest
 
 from sfm import errors
 from sfm.remarks.catalogue import KINDS
-from sfm.remarks.symptoms import END, with_tables
-from sfm.targets.flags import Flag
-from tests.places import ROOT
+from sfm.targets.outlines import Flag
+from tests.places import ROOT, load_page_code
 
 VARIES = "…"
 MIN_WORDS = 4  # of what the rooms below say; shorter texts are parts of sentences, keys and units
 REASONS = (
-    "sfm/files/globs.py",
+    "sfm/files/plain_text.py",
     "sfm/survey/diagnosis",
     "sfm/survey/drafting/camera_groups.py",
-    "sfm/survey/measuring/other_sizes.py",
     "sfm/survey/measuring/targets.py",
     "sfm/survey/orientation.py",
     "sfm/survey/adjusting/settling.py",
@@ -34,6 +32,7 @@ REASONS = (
     "sfm/pipeline.py",
 )
 ERRORS = {name for name, value in vars(errors).items() if isinstance(value, type)}
+TABLES = load_page_code("remark_tables")
 PAGE = (ROOT / "docs" / "symptoms.md").read_text(encoding="utf-8")
 
 
@@ -105,7 +104,7 @@ def messages() -> dict[str, str]:
 
 def entries() -> list[str]:
     """Return the texts in backticks of the first columns, but for those of the candidates."""
-    tables = PAGE.partition(END)[2].partition("## Candidates")[0]
+    tables = PAGE.partition(TABLES.END)[2].partition("## Candidates")[0]
     rows = re.findall(r"^\| (.+?) \| ", tables, re.M)
     return [phrase for row in rows for phrase in re.findall(r"`([^`]+)`", row)]
 
@@ -121,7 +120,7 @@ MESSAGES, ENTRIES = messages(), entries()
 
 
 def test_the_remarks_are_those_of_the_catalogue() -> None:
-    assert with_tables(PAGE) == PAGE, "python -m sfm.remarks.symptoms docs/symptoms.md"
+    assert TABLES.with_tables(PAGE) == PAGE, "python docs/remark_tables.py docs/symptoms.md"
     assert all(f"`{kind}`" in PAGE for kind in KINDS)
 
 

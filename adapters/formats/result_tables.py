@@ -37,7 +37,7 @@ from sfm.files.plain_text import Content as Json
 from sfm.files.plain_text import Name, Pixel, Side, Text, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
-from sfm.network_check import CORRELATION_LIMIT
+from sfm.reduced_network import CORRELATION_LIMIT
 from sfm.solution import MEASURED, SeenTargets, Solution
 
 SIGMAS, SIGMAS_PX = ("sX", "sY", "sZ"), ("sx_px", "sy_px")

@@ -20,7 +20,7 @@ from sfm.conventions import FloatArray
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, join_marks
 from sfm.rendering.scene_file import Staging
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 
 EPOCHS = {"first": 0.0, "second": 0.15, "third": 0.4}  # sag at mid-span, mm
 PHOTOGRAPHS = 12  # of an epoch

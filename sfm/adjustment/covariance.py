@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from sfm.adjustment.datum import Datum, ResolvedDatum
+from sfm.adjustment.datum import Datum, ResolvedDatum, motions_of
 from sfm.adjustment.engine.cofactors import (
     MAX_FIXED_VARIANCE,
     Cofactors,
@@ -34,7 +34,6 @@ from sfm.adjustment.engine.cofactors import (
 )
 from sfm.adjustment.engine.correlated import CorrelatedPart, Influence, correlated_part, influence_of
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
-from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed import ObservedKind, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of

@@ -11,7 +11,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network, values_of
-from sfm.observations.groups import Group
+from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
 from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 

@@ -38,8 +38,8 @@ from sfm.adjustment.quality.gross_errors.robust import (
     tukey_slopes,
 )
 from sfm.adjustment.quality.rank import rank_defect, undetermined_of
-from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.quality.reliability import (
+from sfm.adjustment.quality.statistics import redundancy_numbers as numbers_of
+from sfm.adjustment.quality.statistics import (
     residual_weights,
     residuals_of_observed,
     standardised_residuals,
@@ -52,7 +52,7 @@ from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
-from sfm.network_check import check_network, check_number
+from sfm.reduced_network import check_network, check_number
 from sfm.remarks.remark import Remark, remark
 
 FREE = Datum("free")

@@ -22,22 +22,20 @@ from pathlib import Path
 from typing import Any
 
 from sfm.errors import FolderInUseError, OutputError
-from sfm.files.manifest import MANIFEST, sha256_of
-from sfm.files.open_folders import Owner, locked, owner_of
+from sfm.files.open_folders import MANIFEST, Owner, locked, owner_of, sha256_of
 from sfm.files.plain_text import as_plain
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
-from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
-from sfm.report.output import write_result
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.report.output import LOG, SurveyLog, read_log, remove_log, result_entries, write_result
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Send
 from sfm.runtime.faults import error_in_words, is_fault
 from sfm.survey.assembly import OtherPrograms
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import Measured, MeasuredStore

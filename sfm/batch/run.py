@@ -34,16 +34,13 @@ from sfm.batch.job import (
 )
 from sfm.batch.table import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
-from sfm.files.globs import BELOW, find_files
-from sfm.files.manifest import MANIFEST, refuse_foreign_folder
-from sfm.files.open_folders import locked, owner_of
-from sfm.files.plain_text import as_plain
+from sfm.files.open_folders import MANIFEST, locked, owner_of, refuse_foreign_folder
+from sfm.files.plain_text import BELOW, as_plain, find_files
 from sfm.files.whole_files import remove_leftovers
-from sfm.report.log import SurveyLog, refuse_other_log, remove_log
-from sfm.report.output import folder_name
+from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file

@@ -24,15 +24,15 @@ from rich.text import Text
 from sfm.batch.job import LOGS, SurveyRow
 from sfm.display import counted
 from sfm.errors import OutputError
-from sfm.files.manifest import MANIFEST, read_manifest, refuse_foreign_files
+from sfm.files.open_folders import MANIFEST, read_manifest, refuse_foreign_files
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.whole_files import whole_files
 from sfm.kernels.compiling import COMPILING
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import judge
-from sfm.report.numbers import fixed
 from sfm.report.page import Column, Link, Mark, Note, Page, Section, Table, Tile
 from sfm.report.pages import texts_of
+from sfm.report.phrases import fixed
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first states whose they are
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}

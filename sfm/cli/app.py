@@ -9,18 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sfm.cli.commands import (
-    batching,
-    checking,
-    comparing_epochs,
-    inspecting,
-    measuring,
-    planning,
-    refining,
-    solvers,
-    surveying,
-    viewing,
-)
+from sfm.cli.commands import batching, inspecting, measuring, planning, refining, solvers, starting, surveying
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all messages of typer on wrong arguments; it has no name
 
@@ -63,11 +52,11 @@ for _command in (
     inspecting.accept,
     solvers.validate,
     solvers.compare,
-    comparing_epochs.epochs,
+    solvers.epochs,
     solvers.convert,
     refining.refine,
-    checking.doctor,
-    viewing.view,
+    starting.doctor,
+    inspecting.view,
 ):
     app.command()(_command)
 planning.plan.command("simulate")(planning.simulate_command)

@@ -20,8 +20,7 @@ from rich.text import Text
 from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
-from sfm.report.findings.findings import Findings
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.findings.survey_remarks import Findings
 from sfm.report.page import Banner
 from sfm.report.phrases import (
     describe_calibration,
@@ -31,6 +30,8 @@ from sfm.report.phrases import (
     describe_rigs,
     describe_sigma0,
     describe_test,
+    finer_unit,
+    significant,
     words_left_out,
 )
 from sfm.result import SurveyResult

@@ -37,9 +37,8 @@ from typing import Any, NamedTuple
 
 from sfm.conventions import FloatArray
 from sfm.distortion.brown import brown, brown_affine
-from sfm.distortion.opencv import full_opencv, opencv
+from sfm.distortion.opencv import full_opencv, opencv, rad_tan_thin_prism_fisheye, thin_prism_fisheye
 from sfm.distortion.radial import division, eucm, fisheye, fov, radial
-from sfm.distortion.thin_prism import rad_tan_thin_prism_fisheye, thin_prism_fisheye
 from sfm.kernels.compiling import inlined, kernel
 
 

@@ -18,16 +18,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sfm.errors import KolinearError, OutputError
-from sfm.files.manifest import (
+from sfm.files.open_folders import (
     MANIFEST,
     manifest_text,
+    move,
     names_below,
+    open_folder,
+    open_new_folder,
     read_manifest,
     refuse_foreign_files,
     refuse_foreign_folder,
+    refuse_links,
     sha256_of,
 )
-from sfm.files.open_folders import move, open_folder, open_new_folder, refuse_links
 
 SYNCED = 8  # files that are brought to the disk at a time
 ROOM_BYTES = 1 << 20  # what is written on trial to learn why a library could not write

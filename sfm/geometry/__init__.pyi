@@ -16,10 +16,10 @@ from sfm.geometry.measured import height as height
 from sfm.geometry.measured import measured_points as measured_points
 from sfm.geometry.measured import point_function as point_function
 from sfm.geometry.measured import with_hidden_point as with_hidden_point
-from sfm.geometry.mesh import Mesh as Mesh
 from sfm.geometry.shapes.fit import ShapeFit as ShapeFit
 from sfm.geometry.shapes.fit import fit_shape as fit_shape
 from sfm.geometry.tolerance import Deviations as Deviations
+from sfm.geometry.tolerance import Mesh as Mesh
 from sfm.geometry.tolerance import decide as decide
 from sfm.geometry.tolerance import deviations_from_mesh as deviations_from_mesh
 from sfm.geometry.tolerance import deviations_from_points as deviations_from_points

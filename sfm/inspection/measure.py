@@ -29,13 +29,13 @@ from sfm.geometry.measured import (
     point_function,
     with_hidden_point,
 )
-from sfm.geometry.mesh import Mesh
 from sfm.geometry.shapes.fit import ShapeFit, fit_shape
 from sfm.geometry.tolerance import (
     OUT,
     UNDECIDED,
     UNKNOWN,
     Deviations,
+    Mesh,
     deviations_from_mesh,
     deviations_from_points,
     deviations_from_shape,

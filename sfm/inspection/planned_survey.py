@@ -22,7 +22,7 @@ from sfm.files.plain_text import Content, Name, Text, csv_text, read_json
 from sfm.files.result_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
 from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
 from sfm.observations import TABLES
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.planning.prediction import simulate_network
 from sfm.planning.stations import Stations
 from sfm.planning.weakness import open_motions
@@ -32,7 +32,7 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_motions, fit_similarity
 from sfm.solution import Solution
 from sfm.survey.observation_tables import ObservationTable, observation_table, with_tables
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")

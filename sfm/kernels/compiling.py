@@ -9,8 +9,6 @@ Expensive results on disk, compiled kernels and measurements of photographs, are
 for these sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled
 into it.
 
-Whether the kernels of a survey have been compiled for the sources and the numba of today.
-
 Whether kernels are being compiled, which takes a minute that a person wants to know of.
 
 Numba itself reports when it begins to compile, and reports nothing when it takes a form that it has kept.
@@ -25,7 +23,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -33,14 +31,10 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 from numba.core.event import Event, Listener, install_listener
 
-from sfm.files.user_cache import make_user_folder, user_folder
-
 COMPILING = (
     "kernels are compiled first, a minute or more, once (ahead of it: python -m sfm.warm_up, which takes "
     "the common ones)"
 )
-WARM_UP = "sfm.warm_up"  # imports all that a survey needs
-DECORATORS = "sfm.kernels.compiling"
 ROOT = Path(__file__).resolve().parents[2]
 IMPORT = re.compile(r"^\s*from (sfm[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 P = ParamSpec("P")
@@ -150,39 +144,6 @@ def _imported(name: str) -> tuple[str, ...]:
         found.append(module)
         found += [f"{module}.{word}" for word in re.findall(r"\w+", names)]
     return tuple(found)
-
-
-def is_warm() -> bool:
-    """Return whether `sfm.warm_up` has ended for the kernels of today."""
-    return (_folder() / _mark()).is_file()
-
-
-def set_warm() -> None:
-    """Remember that it has, and forget earlier ones; report a folder that cannot be written."""
-    folder = _folder()
-    with suppress(OSError):
-        if folder == KEPT:
-            folder.mkdir(exist_ok=True)
-        else:
-            make_user_folder(folder)
-        for old in folder.glob("warm-*"):
-            old.unlink()
-        (folder / _mark()).touch()
-
-
-def _folder() -> Path:
-    """Where numba keeps what it compiles, or the user's cache where that is not writable."""
-    return KEPT if os.access(KEPT.parent, os.W_OK) else user_folder("kernels", "notes of compiled kernels")
-
-
-@cache
-def _mark() -> str:
-    """Name of the file that represents the sources of all kernels."""
-    digest = hashlib.sha256(numba.__version__.encode())
-    for module, source in sorted(sources_of(WARM_UP).items()):
-        if DECORATORS in source:
-            digest.update((source_hash(module) or "").encode())
-    return f"warm-{digest.hexdigest()[:16]}"
 
 
 @contextmanager

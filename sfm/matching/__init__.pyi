@@ -3,8 +3,8 @@
 from sfm.kernels.sampling import resample as resample
 from sfm.matching.conjugate import match_points as match_points
 from sfm.matching.conjugate_patches import ConjugatePoints as ConjugatePoints
-from sfm.matching.correlation.ncc import NccMatches as NccMatches
-from sfm.matching.correlation.ncc import match_ncc as match_ncc
+from sfm.matching.correlation import NccMatches as NccMatches
+from sfm.matching.correlation import match_ncc as match_ncc
 from sfm.matching.epipolar import epipolar_paths as epipolar_paths
 from sfm.matching.lsm.two_photo import LsmMatches as LsmMatches
 from sfm.matching.lsm.two_photo import match_lsm as match_lsm

@@ -4,16 +4,29 @@ Correlation finds the place to a pixel in a search window, least squares matchin
 not found in this way are looked for again with templates that are turned and scaled.
 
 Matching without any key point: templates turned and scaled in steps, in the search window.
+
+Affine maps from one photograph to another around points, from the key points near them.
+
+Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or
+something else. Key points, whose descriptors know neither scale nor rotation, give the map beforehand.
+
+Which of two photographs is blurred more, and the sharper one brought to the blur of the other.
+
+Out of focus, or moved during exposure, a photograph shows less of the same texture, and correlation and least
+squares matching find nothing alike. How much less needs no conjugate points: spectra of natural texture have
+one form, so that the ratio of those of two photographs of one object is that of their blurs.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import combinations
 
+import cv2
 import numpy as np
 
 from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.conjugate_patches import (
     METHODS,
@@ -24,11 +37,38 @@ from sfm.matching.conjugate_patches import (
     match_upright,
     match_warped,
 )
-from sfm.matching.correlation.ncc import ambiguous, independent_pixels, match_ncc, match_ncc_warped
-from sfm.matching.local_affinity import LocalAffinities, equally_blurred, local_affinities
-from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
-from sfm.matching.radiometry import grey_of, grey_of_8_bit
+from sfm.matching.correlation import (
+    LsmFlag,
+    NccFlag,
+    ambiguous,
+    in_words,
+    independent_pixels,
+    match_ncc,
+    match_ncc_warped,
+)
+from sfm.matching.radiometry import averaged, grey_of, grey_of_8_bit
+from sfm.matching.tracks.features import match_features, sift_features
 
+TILE_PX = 128  # side of the squares whose spectra are averaged
+LOBE = 2  # frequencies on either side into which the window of a tile spreads each one
+NOISE_FREQUENCIES = 6  # the highest ones of a tile, in which photographs have noise only
+MIN_SIGNAL_TO_NOISE = 3.0  # of the power of a frequency that is compared
+MIN_FREQUENCIES = 4  # two parameters are fitted to them
+MIN_DEVIATE = 4.0  # of a difference of blur, in its standard deviations: neighbouring frequencies are alike
+SHARP_PX = 0.7  # blur that leaves 9 % of the contrast at two pixels a cycle, and nearly nothing beyond
+MAX_TILES = 200  # spread over the photograph
+NEAR_KEY_POINTS = 12  # key points nearest to a point
+MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it
+FARTHEST_PX = 150.0  # of the third-nearest key point: farther away the surface is another one
+MARGIN_PX = 300.0  # around the points, in which key points are looked for
+MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
+LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
+GROSS_SPREADS = 3.0  # times the robust spread, beyond which a key point is on another map
+MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set fit some map with their spread
+MAX_FEATURES = 10_000
+TRIPLES = np.array(list(combinations(range(NEAR_KEY_POINTS), 3)))
+# Part of the squared extent of the key points that the triangle of a triple must have.
+MIN_TRIANGLE_FRACTION = 1e-3
 # Correlation tolerates a rotation of 5 degrees and a scale of 7 % between template and photograph.
 ANGLES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
@@ -269,3 +309,190 @@ def _starts(
         place = np.where((least >= by.start_correlation)[:, None], places[number, one], np.nan)
         starts.append(Starts(place, np.array(shapes)[number, one], np.full(len(one), REACH_PX)))
     return starts[0], starts[1], np.array(second)[best, one]
+
+
+@dataclass(frozen=True)
+class LocalAffinities:
+    """Where points are in the other photograph, and how it is turned and scaled there; NaN if unknown."""
+
+    xy: FloatArray  # place in the right photograph, px, (k, 2)
+    linear: FloatArray  # right px per left px, (k, 2, 2)
+    spread_px: FloatArray  # standard deviation of the place along an axis, right px, (k,)
+
+    def rows(self, some: IntArray) -> LocalAffinities:
+        """Return those of some points."""
+        return LocalAffinities(self.xy[some], self.linear[some], self.spread_px[some])
+
+
+def local_affinities(
+    left: AnyArray, right: AnyArray, xy: FloatArray, *, max_features: int = MAX_FEATURES, seed: int = 0
+) -> LocalAffinities:
+    """Return the affine maps around points that the key points near them agree on.
+
+    Args:
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
+        xy: points in the left photograph, px, (k, 2).
+        max_features: of each photograph, the strongest ones.
+        seed: of the random samples of the epipolar geometry.
+
+    Source: Lowe (2004), IJCV 60(2), for the key points; Rousseeuw (1984), J. Am. Stat. Assoc. 79, for the
+    least median of squares over all triples of the nearest ones.
+    """
+    at = np.asarray(xy, dtype=float).reshape(-1, 2)
+    if not len(at):
+        return affinities_around(at, at, at)
+    low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # what is near no point is no use
+    high = np.ceil(at.max(axis=0) + MARGIN_PX).astype(int)
+    part = left[low[1] : high[1], low[0] : high[0]]
+    a, b = (sift_features(one, max_features=max_features) for one in (part, right))
+    pairs = match_features(a, b, seed=seed)
+    return affinities_around(a.xy[pairs[:, 0]] + low, b.xy[pairs[:, 1]], at)
+
+
+def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArray) -> LocalAffinities:
+    """Return the affine maps of conjugate key points, px, (m, 2) each, around points, px, (k, 2)."""
+    at = np.asarray(xy, dtype=float).reshape(-1, 2)
+    found = LocalAffinities(
+        np.full((len(at), 2), np.nan), np.full((len(at), 2, 2), np.nan), np.full(len(at), np.nan)
+    )
+    if len(key_left) < NEAR_KEY_POINTS:
+        return found
+    for k, place in enumerate(at):
+        if not np.isfinite(place).all():
+            continue
+        distance = np.linalg.norm(key_left - place, axis=1)
+        near = np.argpartition(distance, NEAR_KEY_POINTS - 1)[:NEAR_KEY_POINTS]
+        if np.sort(distance[near])[2] > FARTHEST_PX:
+            continue
+        one = _agreed_map(key_left[near] - place, key_right[near])
+        if one is not None:
+            found.linear[k], found.xy[k], found.spread_px[k] = one[0], one[1], one[2]
+    return found
+
+
+def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return linear part, place of the zero offset and its standard deviation, px; None if too few agree.
+
+    Args:
+        offset: of the key points from the point, left px, (NEAR_KEY_POINTS, 2).
+        target: their places in the right photograph, px, (NEAR_KEY_POINTS, 2).
+    """
+    full = np.column_stack([offset, np.ones(len(offset))])  # (n, 3)
+    area = np.abs(np.linalg.det(full[TRIPLES]))
+    triples = TRIPLES[area > MIN_TRIANGLE_FRACTION * np.ptp(offset, axis=0).max() ** 2]
+    if not len(triples):
+        return None
+    maps = np.linalg.solve(full[triples], target[triples])  # (t, 3, 2)
+    off = np.linalg.norm(full @ maps - target, axis=2)  # (t, n)
+    best = int(np.median(off, axis=1).argmin())
+    spread = max(MAD_TO_SIGMA * float(np.median(off[best])), LOCALISATION_PX)
+    if spread > MAX_SPREAD_PX:
+        return None
+    agree = off[best] <= GROSS_SPREADS * spread
+    if agree.sum() < MIN_AGREEING:
+        return None
+    # near ones predict the place better than far ones, as the surface is curved
+    length = np.linalg.norm(offset[agree], axis=1)
+    weight = 1.0 / (1.0 + (length / max(float(np.median(length)), 1.0)) ** 2)
+    N = full[agree].T @ (weight[:, None] * full[agree])
+    if np.linalg.matrix_rank(N) < 3:
+        return None
+    solved = np.linalg.solve(N, full[agree].T @ (weight[:, None] * target[agree]))
+    linear = solved[:2].T
+    stretch = np.linalg.svd(linear, compute_uv=False)
+    if not (np.linalg.det(linear) > 0 and stretch[0] < MAX_STRETCH and stretch[1] > 1 / MAX_STRETCH):
+        return None
+    v = full[agree] @ solved - target[agree]
+    redundancy = max(2 * int(agree.sum()) - 6, 1)
+    variance = max(float((weight[:, None] * v * v).sum()) / redundancy, LOCALISATION_PX**2)
+    return linear, solved[2], float(np.sqrt(variance * np.linalg.inv(N)[2, 2]))
+
+
+@dataclass(frozen=True)
+class EquallyBlurred:
+    """Two photographs of one blur, in pixels that are as large as it allows."""
+
+    left: AnyArray
+    right: AnyArray
+    shrink: int  # px of the photographs that were given along the side of a pixel of these
+
+    def small(self, xy: FloatArray) -> FloatArray:
+        """Return places in these photographs from those in the ones given, px, (k, 2)."""
+        return (xy + 0.5) / self.shrink - 0.5
+
+    def full(self, xy: FloatArray) -> FloatArray:
+        """Return places in the photographs given from those in these, px, (k, 2)."""
+        return self.shrink * (xy + 0.5) - 0.5
+
+
+def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
+    """Return both photographs with the blur of the less sharp one.
+
+    The sharper one is smoothed by a Gaussian. Both are then averaged over squares for which that blur is one
+    of SHARP_PX: a window contains as much texture as one of a sharp photograph, and its noise is that of
+    pixels that have none in common.
+
+    Args:
+        left: photograph, (H, W) or (H, W, 3), 8 or 16 bit or float, of an object.
+        right: another one of it.
+    """
+    more = difference_of_blur(left, right)
+    sigma = float(np.sqrt(abs(more)))
+    if more != 0.0:
+        sharper = left if more > 0.0 else right
+        smooth = np.asarray(cv2.GaussianBlur(sharper, (0, 0), sigma))
+        left, right = (smooth, right) if more > 0.0 else (left, smooth)
+    shrink = max(round(sigma / SHARP_PX), 1)
+    return EquallyBlurred(averaged(left, shrink), averaged(right, shrink), shrink)
+
+
+def difference_of_blur(left: AnyArray, right: AnyArray) -> float:
+    """Return by how much the variance of the point spread is larger in the right photograph, px^2.
+
+    0 where the spectra do not differ by more than chance, or noise hides them. Blur is counted in the pixels
+    of each photograph: of photographs in different scale those of the same lens count as equal.
+
+    Source: the Gaussian as in Pentland (1987), A new sense for depth of field, IEEE Trans. PAMI 9(4): the
+    logarithm of the ratio of two power spectra is linear in the squared frequency, and its slope is the
+    difference of the variances.
+    """
+    spectra = [_power_spectrum(grey_of_8_bit(one)) for one in (left, right)]
+    if len(spectra[0]) != len(spectra[1]) or len(spectra[0]) <= LOBE + NOISE_FREQUENCIES + MIN_FREQUENCIES:
+        return 0.0
+    noise = [float(one[-NOISE_FREQUENCIES:].mean()) for one in spectra]
+    above = np.all(
+        [one > (1.0 + MIN_SIGNAL_TO_NOISE) * floor for one, floor in zip(spectra, noise, strict=True)], axis=0
+    )
+    first = LOBE
+    end = first + int(np.cumprod(above[first:]).sum())
+    if end - first < MIN_FREQUENCIES:
+        return 0.0
+    a, b = ((one - floor)[first:end] for one, floor in zip(spectra, noise, strict=True))
+    frequency = np.pi * (np.arange(first, end) + 1.0) / len(spectra[0])  # rad/px
+    A = np.column_stack([np.ones(end - first), frequency**2])
+    y = np.log(a / b)
+    N = A.T @ A
+    slope = np.linalg.solve(N, A.T @ y)
+    v = y - A @ slope
+    sigma = np.sqrt((v @ v) / (len(y) - 2) * np.linalg.inv(N)[1, 1])
+    return float(slope[1]) if abs(slope[1]) > MIN_DEVIATE * sigma else 0.0
+
+
+def _power_spectrum(grey: AnyArray) -> FloatArray:
+    """Return the mean power of a photograph at 1, 2 ... cycles a tile, without direction, (n,)."""
+    side = min(TILE_PX, *grey.shape)
+    side -= side % 2
+    taper = np.hanning(side + 2)[1:-1].astype(np.float32)
+    window = np.outer(taper, taper)
+    total = np.zeros((side, side // 2 + 1))
+    step = max(side // 2, int(np.sqrt(grey.size / MAX_TILES)))
+    for y in range(0, grey.shape[0] - side + 1, step):
+        for x in range(0, grey.shape[1] - side + 1, step):
+            tile = grey[y : y + side, x : x + side]
+            total += np.abs(np.fft.rfft2((tile - tile.mean()) * window)) ** 2
+    ring = np.rint(side * np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :])).astype(
+        np.int64
+    )
+    power = np.bincount(ring.ravel(), weights=total.ravel()) / np.bincount(ring.ravel())
+    return np.asarray(power[1 : side // 2 + 1])

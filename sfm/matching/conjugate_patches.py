@@ -14,9 +14,12 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.sampling import AFTER, BEFORE
-from sfm.matching.correlation.ncc import (
+from sfm.matching.correlation import (
+    LsmFlag,
+    NccFlag,
     NccMatches,
     ambiguous,
+    in_words,
     independent_pixels,
     match_ncc,
     match_ncc_warped,
@@ -24,7 +27,6 @@ from sfm.matching.correlation.ncc import (
 from sfm.matching.lsm.patch_equations import MARGIN, linear_part
 from sfm.matching.lsm.surface_planes import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
 from sfm.matching.radiometry import equalise_histogram, grey_of
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}

@@ -6,19 +6,18 @@ variance components, the survey file, the tables and the reports take everything
 
 from __future__ import annotations
 
-from sfm.observations.antenna_positions import AntennaPositions
-from sfm.observations.coordinate_differences import CoordinateDifferences
-from sfm.observations.distances import Distances
-from sfm.observations.height_differences import HeightDifferences
-from sfm.observations.horizontal_directions import HorizontalDirections
 from sfm.observations.kind import TableKind
-from sfm.observations.level_groups import LevelGroups
-from sfm.observations.offset_distances import OffsetDistances
-from sfm.observations.planes import Planes
-from sfm.observations.plumb_lines import Lines, PlumbLines
-from sfm.observations.relative_orientations import RelativeOrientations
+from sfm.observations.planes_and_lines import LevelGroups, Lines, Planes, PlumbLines
+from sfm.observations.point_pairs import (
+    CoordinateDifferences,
+    Distances,
+    HeightDifferences,
+    HorizontalDirections,
+    OffsetDistances,
+    ZenithAngles,
+)
+from sfm.observations.pose import AntennaPositions, RelativeOrientations
 from sfm.observations.rigid_frames import RigidFrames
-from sfm.observations.zenith_angles import ZenithAngles
 
 TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
     "distance": Distances,

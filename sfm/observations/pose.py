@@ -1,17 +1,29 @@
-"""Position and angles known beforehand: what photographs and mounts of cameras have in common."""
+"""Position and angles known beforehand: what photographs and mounts of cameras have in common.
+
+Exterior orientation known beforehand (satellite positions, a calibrated rig).
+
+Mounts of the cameras of a rig known beforehand, as from an earlier calibration.
+
+Relative orientations of two photographs, as of a camera that a machine has moved.
+
+Positions of an antenna beside the camera, as by GNSS, with the lever arm in the camera's axes.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.observations.kind import Kind, Linear, Values
+from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, skew
+from sfm.observations.kind import MOUNT, PHOTOGRAPH, Block, Kind, Linear, RowKind, Values, no_index
+from sfm.observations.point_pairs import Pairs
 
 if TYPE_CHECKING:
-    from sfm.network import Estimate
+    from sfm.network import Estimate, Network
 
 MIN_COS_PHI = 1e-8  # nearer to +-90 deg omega and kappa have no separate sigmas
 
@@ -77,3 +89,205 @@ def exterior_jacobian(M: FloatArray) -> FloatArray:
     J[:, :3, :3] = np.eye(3)
     J[:, 3:, 3:] = angle_jacobian(M)
     return J
+
+
+@dataclass(frozen=True)
+class ExteriorObservations(PoseObservations):
+    """Exterior orientation known beforehand (satellite positions, a calibrated rig)."""
+
+    name: ClassVar[str] = "exterior orientation"
+    single: ClassVar[str] = "photograph"
+    components: ClassVar[tuple[str, ...]] = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+    image: IntArray = field(default_factory=no_index)  # index of the photograph, (e,)
+    position: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # X0, object unit, (e, 3)
+    angles: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # omega, phi, kappa, rad, (e, 3)
+    covariance: FloatArray = field(
+        default_factory=lambda: np.zeros((0, 6, 6))
+    )  # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
+
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions and angles."""
+        return replace(self, position=values[:, :3], angles=values[:, 3:])
+
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the photographs."""
+        return (Block(PHOTOGRAPH, self.image),)
+
+    def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return X0, (e, 3), and object to image axes, (e, 3, 3)."""
+        return values.position[self.image], values.M[self.image]
+
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of the photographs."""
+        return tuple(network.images[i] for i in self.image)
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the photographs."""
+        return replace(
+            self,
+            image=self.image[rows],
+            position=self.position[rows],
+            angles=self.angles[rows],
+            covariance=self.covariance[rows],
+        )
+
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return them with the photographs at other places."""
+        return self if images is None else replace(self, image=images[self.image])
+
+    def shifted(self, by: FloatArray) -> Self:
+        """Return them with a shift added to all projection centres."""
+        return replace(self, position=self.position + by)
+
+
+@dataclass(frozen=True)
+class MountObservations(PoseObservations):
+    """Mounts of the cameras of a rig known beforehand, as from an earlier calibration."""
+
+    name: ClassVar[str] = "mounts"
+    single: ClassVar[str] = "mount"
+    components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z", "omega", "phi", "kappa")
+
+    camera: IntArray  # index of the camera, (c,)
+    position: FloatArray  # projection centre in the axes of the rig, object unit, (c, 3)
+    angles: FloatArray  # omega, phi, kappa of image axes to those of the rig, rad, (c, 3)
+    covariance: FloatArray  # of both; infinite = not observed, (c, 6, 6)
+
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions and angles."""
+        return replace(self, position=values[:, :3], angles=values[:, 3:])
+
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the mounts."""
+        return (Block(MOUNT, self.camera),)
+
+    def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the projection centres, (c, 3), and axes of the rig to image axes, (c, 3, 3)."""
+        return values.mount_position[self.camera], values.camera_from_rig[self.camera]
+
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of the cameras."""
+        return tuple(estimate.cameras[a].name for a in self.camera)
+
+    def of_cameras(self, on: BoolArray) -> Self:
+        """Return the mounts of some cameras, counted anew, (a,)."""
+        kept = self.select(on[self.camera])
+        return replace(kept, camera=(np.cumsum(on) - 1)[kept.camera])
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the mounts."""
+        return replace(
+            self,
+            camera=self.camera[rows],
+            position=self.position[rows],
+            angles=self.angles[rows],
+            covariance=self.covariance[rows],
+        )
+
+
+class RelativeOrientations(Pairs):
+    """Position and angles of one photograph in the image axes of another."""
+
+    name: ClassVar[str] = "relative orientations"
+    single: ClassVar[str] = "relative orientation"
+    components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z", "omega", "phi", "kappa")
+    angles: ClassVar[tuple[str, ...]] = ("omega", "phi", "kappa")
+    texts_of: ClassVar[str] = PHOTOGRAPH
+
+    def linearise(self, values: Values) -> Linear:
+        """Return t = M1 (X2 - X1) and the angles of M1 R2, less those observed.
+
+        With R <- R exp([w]x) the derivatives of t are -M1, [t]x by X1, w1 and M1, 0 by X2, w2; the second
+        photograph turns by w2 - R2' R1 w1 in the axes of the first.
+        """
+        M1, M2 = values.M[self.start], values.M[self.end]
+        t = np.einsum("nab,nb->na", M1, values.position[self.end] - values.position[self.start])
+        R = M1 @ np.swapaxes(M2, 1, 2)
+        turned = (angles_from_rotation(R) - self.value[:, 3:] + np.pi) % (2 * np.pi) - np.pi
+        by_turn = angle_jacobian(np.swapaxes(R, 1, 2))
+        first, second = np.zeros((2, len(self), 6, 6))
+        first[:, :3, :3], first[:, :3, 3:] = -M1, skew(t)
+        first[:, 3:, 3:] = -by_turn @ np.swapaxes(R, 1, 2)
+        second[:, :3, :3], second[:, 3:, 3:] = M1, by_turn
+        return Linear(np.hstack([t - self.value[:, :3], turned]), (first, second))
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the orientations of exchanged photographs."""
+        return {**super().mistakes(), "exchanged": replace(self, start=self.end, end=self.start)}
+
+
+@dataclass(frozen=True)
+class AntennaPositions(RowKind):
+    """Positions of an antenna that is mounted on the camera."""
+
+    name: ClassVar[str] = "antenna positions"
+    single: ClassVar[str] = "antenna position"
+    components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
+    texts: ClassVar[tuple[str, ...]] = ("image",)
+    texts_of: ClassVar[str] = PHOTOGRAPH
+    numbers: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
+
+    image: IntArray  # index of the photograph, (n,)
+    lever: FloatArray  # the antenna in image axes from the projection centre, object unit, (n, 3)
+    position: FloatArray  # X, Y, Z of the antenna, object unit, (n, 3)
+    sigma: FloatArray  # object unit, (n, 3)
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def values(self) -> FloatArray:
+        """Positions, object unit, (n, 3)."""
+        return self.position
+
+    @property
+    def without_sigma(self) -> FloatArray:
+        """Lever arms, object unit, (n, 3)."""
+        return self.lever
+
+    def with_values(self, values: FloatArray) -> Self:
+        """Return them with other positions."""
+        return replace(self, position=values)
+
+    def with_sigma(self, sigma: FloatArray) -> Self:
+        """Return them with other standard deviations."""
+        return replace(self, sigma=sigma)
+
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the photographs."""
+        return (Block(PHOTOGRAPH, self.image),)
+
+    def linearise(self, values: Values) -> Linear:
+        """Return X0 + R lever - observed, and the derivatives I and -R [lever]x by X0, w."""
+        R = np.swapaxes(values.M[self.image], 1, 2)
+        computed = values.position[self.image] + np.einsum("nab,nb->na", R, self.lever)
+        unit = np.broadcast_to(np.eye(3), (len(self), 3, 3))
+        return Linear(computed - self.position, (np.concatenate([unit, -R @ skew(self.lever)], axis=2),))
+
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of the photographs."""
+        return tuple(network.images[i] for i in self.image)
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the positions."""
+        return replace(
+            self,
+            image=self.image[rows],
+            lever=self.lever[rows],
+            position=self.position[rows],
+            sigma=self.sigma[rows],
+        )
+
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return them with the photographs at other places."""
+        return self if images is None else replace(self, image=images[self.image])
+
+    def shifted(self, by: FloatArray) -> Self:
+        """Return them with a shift added to all positions."""
+        return replace(self, position=self.position + by)
+
+    @classmethod
+    def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
+        """Return the observations of a table; the lever arms come before the values."""
+        return cls(indices[0], value[:, :3], value[:, 3:], sigma)

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_vector, skew
-from sfm.observations.groups import Fit, Group, OwnParameters, inverse_of_determined
-from sfm.observations.kind import Values
+from sfm.observations.kind import Fit, Group, OwnParameters, Values, inverse_of_determined
 
 if TYPE_CHECKING:
     from sfm.network import Network

@@ -1,19 +1,25 @@
 """Rays of the image points of a network, and the object points in which they meet.
 
 Angles at which the rays of object points meet.
+
+The homography of two photographs of a plane: fitted, and decomposed into camera pairs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.intersection import Intersection, intersect
 
+PLANAR_POINTS = 4
+RANSAC_TRIALS = 300  # a plane is of interest that most pairs lie on; enough where half of them do, at 1e-8
+NO_BASE = 1e-9  # (sigma1 - sigma3) of a homography of unit sigma2 below which it is a rotation
 MAX_PAIRS = 4_000_000  # of rays that are compared at a time
 
 
@@ -102,3 +108,94 @@ def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatAr
             sine = np.sqrt(np.maximum(1 - np.einsum("nia,nja->nij", u, u) ** 2, 0))
             angle[some] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))
     return angle
+
+
+def fit_homography(
+    first: FloatArray, second: FloatArray, *, tolerance: float, seed: int = 0
+) -> tuple[FloatArray, BoolArray]:
+    """Return H with r2 ~ H r1 for rays r = (u, v, -1), and the pairs that fit it.
+
+    Args:
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 4.
+        second: the conjugate rays of photograph 2, shape (n, 2).
+        tolerance: largest residual in photograph 2, tangents.
+        seed: of the random samples.
+    """
+    n = len(first)
+    used = np.ones(n, dtype=bool)
+    if n > PLANAR_POINTS:
+        cv2.setRNGSeed(seed)
+        _, mask = cv2.findHomography(first, second, cv2.RANSAC, tolerance, maxIters=RANSAC_TRIALS)
+        if mask is None or mask.sum() < PLANAR_POINTS:
+            return np.eye(3), np.zeros(n, dtype=bool)
+        used = mask.ravel().astype(bool)
+    H = _direct_homography(first[used], second[used])
+    if np.sum((rays_of(first[used]) @ H.T) * rays_of(second[used])) < 0:
+        H = -H
+    residuals = np.linalg.norm(transfer_residuals(H, first, second), axis=1)
+    return H, np.asarray(residuals <= tolerance)
+
+
+def transfer_residuals(H: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return computed minus measured tangents in photograph 2, NaN behind it, shape (n, 2)."""
+    mapped = rays_of(first) @ H.T
+    W = np.where(mapped[:, 2] < 0, mapped[:, 2], np.nan)
+    return np.asarray(-mapped[:, :2] / W[:, None] - second)
+
+
+def decompose_homography(
+    H: FloatArray, first: FloatArray, second: FloatArray
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return (base, rotation, normal) of the camera pairs that a homography describes.
+
+    Args:
+        H: r2 ~ H r1 for rays r = (u, v, -1), its sign such that depths are positive, shape (3, 3).
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1 to points of the plane, shape (n, 2).
+        second: the conjugate rays of photograph 2, shape (n, 2).
+
+    Returns:
+        The solutions that have the plane in front of photograph 1: two, one where they coincide, none for a
+        mere rotation.
+
+    Source: Ma et al. (2004), alg. 5.2: H = R' + t n', from the eigenvectors of H'H.
+    """
+    _, s, Vt = np.linalg.svd(H)
+    H = H / s[1]
+    s1, s3 = s[0] / s[1], s[2] / s[1]
+    if s1 - s3 < NO_BASE:
+        return []
+    v1, v2, v3 = Vt
+    p, q = np.sqrt(max(1 - s3**2, 0.0)), np.sqrt(max(s1**2 - 1, 0.0))
+    solutions: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    for sign in (1.0, -1.0):
+        u = (p * v1 + sign * q * v3) / np.sqrt(s1**2 - s3**2)
+        normal = np.cross(v2, u)
+        R21 = np.stack([H @ v2, H @ u, np.cross(H @ v2, H @ u)], axis=1) @ np.stack([v2, u, normal])
+        t = (H - R21) @ normal
+        if np.sum(rays_of(first) @ normal) < 0:
+            normal, t = -normal, -t
+        base = -R21.T @ t
+        solutions.append((base / np.linalg.norm(base), np.asarray(R21.T), np.asarray(normal)))
+    if abs(solutions[0][2] @ solutions[1][2]) > 1 - NO_BASE:
+        return solutions[:1]
+    return solutions
+
+
+def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Direct linear solution with conditioned coordinates (Hartley, Zisserman 2004, alg. 4.2)."""
+    T1, T2 = _conditioner(first), _conditioner(second)
+    r1, r2 = rays_of(first) @ T1.T, rays_of(second) @ T2.T
+    rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
+    h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
+    return np.asarray(np.linalg.inv(T2) @ h @ T1)
+
+
+def _conditioner(uv: FloatArray) -> FloatArray:
+    centre = uv.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum((uv - centre) ** 2, axis=1)) / 2)
+    return np.asarray(np.array([[1, 0, centre[0]], [0, 1, centre[1]], [0, 0, spread]]) / spread)
+
+
+def rays_of(uv: FloatArray) -> FloatArray:
+    """Return (u, v, -1) of tangents, shape (n, 3)."""
+    return np.concatenate([uv, -np.ones((len(uv), 1))], axis=1)

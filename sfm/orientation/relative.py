@@ -21,14 +21,14 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import cross, solve_scaled, turn
-from sfm.orientation.homography import (
+from sfm.orientation.image_rays import (
     PLANAR_POINTS,
     decompose_homography,
     fit_homography,
     transfer_residuals,
 )
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.candidates import rotation_from_position
+from sfm.orientation.resection.least_squares import rotation_from_position
 
 UNKNOWNS = 5
 MAX_STEPS = 30

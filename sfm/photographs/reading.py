@@ -13,7 +13,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray
 from sfm.errors import PhotographError
-from sfm.photographs.file_checks import opened_header, read_bytes, refuse_bomb, refuse_truncated
+from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 
 # PhotographError states what is wrong with a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

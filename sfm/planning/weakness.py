@@ -35,7 +35,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, spread_evenly, usable
 from sfm.planning.sight.visibility import WORDS, Seeing, Why
 from sfm.reduced_network import reduce_network

@@ -24,7 +24,7 @@ from sfm.rendering.scene import (
     square_tag,
 )
 from sfm.targets.codes.concentric import ConcentricFamily
-from sfm.targets.codes.families import Family, code_family
+from sfm.targets.codes.plates import Family, code_family
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 

@@ -29,7 +29,7 @@ from sfm.rendering.scene import (
     rectangles,
 )
 from sfm.targets.codes.concentric import ConcentricFamily
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 

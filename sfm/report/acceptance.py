@@ -9,8 +9,8 @@ from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.comparisons import length_error_figure
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import general, signed, significant
 from sfm.report.page import Column, Note, Page, Section, Table, facts
+from sfm.report.phrases import general, signed, significant
 
 PICTURE = (
     "Error of length measurement over length: bars are the expanded uncertainty of the calibration, lines "

@@ -14,8 +14,8 @@ from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import finer_unit, fixed, length_of, significant
 from sfm.report.page import YES, Column, FoldedParts, Note, Page, Part, Section, Table, axes, values_of
+from sfm.report.phrases import finer_unit, fixed, length_of, significant
 
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "

@@ -16,7 +16,6 @@ from sfm.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_ep
 from sfm.report.figures.comparisons import difference_figure, plot_series
 from sfm.report.figures.plot_process import Plot
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import finer_unit, general, significant
 from sfm.report.page import (
     YES,
     Column,
@@ -31,7 +30,8 @@ from sfm.report.page import (
     axes,
     values_of,
 )
-from sfm.report.viewer.solution_scene import displacements_viewer
+from sfm.report.phrases import finer_unit, general, significant
+from sfm.report.viewer.embedded import displacements_viewer
 
 MAX_NAMED = 12  # points in a sentence
 PICTURE = (

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.display import counted
-from sfm.planning.further import Further
+from sfm.planning.plan import Further
 from sfm.remarks.verdict import Line
-from sfm.report.numbers import length_of
 from sfm.report.page import Banner, Column, Note, Page, Section, Table
+from sfm.report.phrases import length_of
 from sfm.report.planning import exterior_table, shot_columns, shot_rows
-from sfm.report.viewer.embedded import viewer_of
+from sfm.report.viewer.embedded import scene_of_stored, viewer_of
 from sfm.report.viewer.pictures import Pictures
-from sfm.report.viewer.solution_scene import scene_of_stored
 from sfm.solution import Solution
 
 HIDDEN = Line("note", "What hides a point from a new station is not known: look before you photograph.")

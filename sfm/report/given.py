@@ -12,15 +12,6 @@ from sfm.display import counted
 from sfm.files.result_tables import GIVEN
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings.bundle_statistics import Given
-from sfm.report.numbers import (
-    finer_unit_of,
-    general,
-    or_fixed,
-    signed,
-    significant,
-    with_exponent,
-    with_sigma,
-)
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -33,7 +24,16 @@ from sfm.report.page import (
     columns,
     columns_of,
 )
-from sfm.report.phrases import describe_check
+from sfm.report.phrases import (
+    describe_check,
+    finer_unit_of,
+    general,
+    or_fixed,
+    signed,
+    significant,
+    with_exponent,
+    with_sigma,
+)
 from sfm.result import ControlCheck, PlacedEquipment
 
 HEADINGS = {

@@ -18,7 +18,6 @@ from sfm.geometry.tolerance import DECISIONS, Deviations
 from sfm.inspection.measure import Measurement
 from sfm.report.figures.comparisons import deviation_figure
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import fixed, general, signed, significant, with_sigma
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -33,7 +32,8 @@ from sfm.report.page import (
     facts,
     values_of,
 )
-from sfm.report.viewer.solution_scene import measurement_viewer
+from sfm.report.phrases import fixed, general, signed, significant, with_sigma
+from sfm.report.viewer.embedded import measurement_viewer
 from sfm.solution import Solution
 
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}

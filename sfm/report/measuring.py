@@ -20,7 +20,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError, OutputError
 from sfm.files.whole_files import whole_file
 from sfm.matching.conjugate_patches import ConjugatePoints
-from sfm.orientation.resection.candidates import ResectionSolution
+from sfm.orientation.resection.least_squares import ResectionSolution
 from sfm.report.page import Column, Table, plain
 from sfm.textbook.resection.by_method import ResectionResult
 from sfm.textbook.resection.dlt import DirectLinearTransformation

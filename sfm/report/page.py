@@ -22,7 +22,7 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.files.result_tables import ResultTable
 from sfm.remarks.verdict import Line, Verdict
 from sfm.report.figures.plot_process import Plot
-from sfm.report.numbers import significant
+from sfm.report.phrases import significant
 from sfm.report.viewer.embedded import Viewer
 
 MAX_ROWS = 2000  # of a table of a page; files have all

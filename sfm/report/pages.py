@@ -31,7 +31,6 @@ from sfm.display import NO_BREAK, bound
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_folder
 from sfm.report.figures.plot_process import Plot
-from sfm.report.numbers import is_number
 from sfm.report.page import (
     Cards,
     FoldedParts,
@@ -44,6 +43,7 @@ from sfm.report.page import (
     Table,
     one_line,
 )
+from sfm.report.phrases import is_number
 
 WIDTH = 100
 MAX_ROWS = 10  # of a table

@@ -14,25 +14,14 @@ from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
 from sfm.files.result_tables import IN_FILES
 from sfm.observations import TABLES
-from sfm.observations.mounts import MountObservations
-from sfm.observations.scale_bars import ScaleBars
+from sfm.observations.given import ScaleBars
+from sfm.observations.pose import MountObservations
 from sfm.planning.plan import Plan, verdict_of_plan
+from sfm.planning.prediction import ALPHA, found_displacement
 from sfm.planning.sight import MIN_PIXELS
 from sfm.planning.stations import Shot, Stations
-from sfm.planning.wanted import ALPHA, found_displacement
 from sfm.planning.weakness import Calibratability, Contribution
-from sfm.report.findings.rigs import rigs_of
-from sfm.report.numbers import (
-    NOT_DETERMINED,
-    finer_unit,
-    fixed,
-    length_of,
-    or_unlimited,
-    placed,
-    raised,
-    significant,
-    with_exponent,
-)
+from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.page import (
     YES,
     Column,
@@ -48,9 +37,21 @@ from sfm.report.page import (
     plain,
     values_of,
 )
-from sfm.report.phrases import NORMAL_95, describe_rigs
+from sfm.report.phrases import (
+    NORMAL_95,
+    NOT_DETERMINED,
+    describe_rigs,
+    finer_unit,
+    fixed,
+    length_of,
+    or_unlimited,
+    placed,
+    raised,
+    significant,
+    with_exponent,
+)
 from sfm.report.tables.summary import summary_of_rigs
-from sfm.report.viewer.solution_scene import plan_viewer
+from sfm.report.viewer.embedded import plan_viewer
 
 MAX_NAMED = 12  # weak points that are listed
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")

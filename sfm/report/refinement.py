@@ -12,12 +12,12 @@ from sfm.conventions import IntArray
 from sfm.display import agreeing, counted
 from sfm.remarks.verdict import judge
 from sfm.report.findings.bundle_statistics import given_of
-from sfm.report.findings.precision import rms_of_groups, standard_deviations
+from sfm.report.findings.checks import rms_of_groups, standard_deviations
 from sfm.report.given import given_parts
-from sfm.report.numbers import general, significant
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes
+from sfm.report.phrases import general, significant
+from sfm.survey.refining.oriented_windows import PREFIX
 from sfm.survey.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
-from sfm.survey.refining.targets import PREFIX
 from sfm.survey.refining.windows import MIN_RAYS
 
 

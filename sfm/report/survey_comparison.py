@@ -9,11 +9,10 @@ import numpy as np
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.display import counted, program_name
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import Findings
-from sfm.report.findings.precision import point_sigma
-from sfm.report.numbers import finer_unit, fixed, general, scientific, significant
+from sfm.report.findings.checks import point_sigma
+from sfm.report.findings.survey_remarks import Findings
 from sfm.report.page import Column, Heading, Note, Paragraph, Part, Statement, Table, columns, facts
-from sfm.report.phrases import words_left_out
+from sfm.report.phrases import finer_unit, fixed, general, scientific, significant, words_left_out
 
 
 def adjuster_parts(f: Findings) -> Iterator[Part]:

@@ -12,19 +12,8 @@ from sfm.display import counted, listed
 from sfm.files.result_tables import VARIANCE_COMPONENTS
 from sfm.report.findings.bundle_statistics import WEAK_DEG, Coverage, Geometry
 from sfm.report.findings.calibrated_cameras import InteriorParameter
-from sfm.report.findings.findings import Findings
+from sfm.report.findings.survey_remarks import Findings
 from sfm.report.given import given_parts
-from sfm.report.numbers import (
-    finer_unit,
-    finer_unit_of,
-    fixed,
-    general,
-    or_unlimited,
-    probability,
-    raised,
-    significant,
-    with_exponent,
-)
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -46,6 +35,15 @@ from sfm.report.phrases import (
     describe_neighbours,
     describe_test,
     describe_weights,
+    finer_unit,
+    finer_unit_of,
+    fixed,
+    general,
+    or_unlimited,
+    probability,
+    raised,
+    significant,
+    with_exponent,
 )
 from sfm.report.tables.csv_files import component_rows
 

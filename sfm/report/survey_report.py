@@ -17,8 +17,7 @@ from sfm.files.result_tables import LEFT_OUT
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_process import Plot
-from sfm.report.findings.findings import Findings
-from sfm.report.numbers import finer_unit, fixed, or_fixed, significant, to_precision
+from sfm.report.findings.survey_remarks import Findings
 from sfm.report.page import (
     Card,
     Cards,
@@ -44,6 +43,11 @@ from sfm.report.phrases import (
     describe_calibration,
     describe_fixed,
     describe_sigma0,
+    finer_unit,
+    fixed,
+    or_fixed,
+    significant,
+    to_precision,
     words_left_out,
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts

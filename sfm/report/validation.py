@@ -15,8 +15,8 @@ from sfm.remarks.catalogue import KINDS
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import plot
-from sfm.report.numbers import fixed, general
 from sfm.report.page import YES, Column, FoldedParts, Note, Page, Paragraph, Section, Table
+from sfm.report.phrases import fixed, general
 
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost is constant, for the sake "

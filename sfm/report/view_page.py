@@ -12,12 +12,11 @@ from sfm.display import counted
 from sfm.errors import OutputError
 from sfm.files.whole_files import refuse_existing, whole_file
 from sfm.remarks.verdict import Line
-from sfm.report.numbers import fixed
 from sfm.report.page import Banner, Column, FoldedParts, Page, Section, Table, axes, facts
 from sfm.report.pages import html
+from sfm.report.phrases import fixed
 from sfm.report.viewer.embedded import viewer_of
-from sfm.report.viewer.pictures import BUDGET_MB, Pictures, cut_pictures
-from sfm.report.viewer.scene import ViewerScene
+from sfm.report.viewer.pictures import BUDGET_MB, Pictures, ViewerScene, cut_pictures
 from sfm.runtime.progress import SILENT, Progress
 
 MARK = b"<!DOCTYPE html>\n<!-- kolinear view -->\n"

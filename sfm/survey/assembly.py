@@ -27,8 +27,7 @@ from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.plates import points_of_plates

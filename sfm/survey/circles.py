@@ -17,7 +17,7 @@ from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import object_scale
 from sfm.survey.target_network import UNNAMED
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 # No centres of ellipses: nothing is eccentric in these.
 NO_CIRCLE = Flag.CORNER | Flag.CROSSING | Flag.CONCENTRIC

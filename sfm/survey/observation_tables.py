@@ -18,8 +18,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, read_table
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
-from sfm.observations.groups import Group
-from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, RowKind, TableKind
+from sfm.observations.kind import PHOTOGRAPH, POINT, Group, Kind, RowKind, TableKind
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI

@@ -22,7 +22,7 @@ from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import Survey

@@ -12,26 +12,27 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.kernels.sampling import as_grey
-from sfm.targets.candidates import (
-    find_counters,
-    find_duplicates,
-    find_legible,
-    find_parts_of_codes,
-    judge_fits,
-)
 from sfm.targets.codes.boards import find_boards
 from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among
-from sfm.targets.codes.families import TargetFamily, code_family
-from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup, plates_of
+from sfm.targets.codes.plates import BOARDS, PlateFamily, PlateGroup, TargetFamily, code_family, plates_of
 from sfm.targets.codes.rings import UNCODED, UNREADABLE, CodeFamily, read_codes
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
 from sfm.targets.fits.centroid import WEIGHTS, measure_centroids, measure_edge_ellipses
 from sfm.targets.fits.concentric import BACKGROUND, BLUR, CONTRAST
 from sfm.targets.fits.saddle import Saddles
-from sfm.targets.flags import Flag
-from sfm.targets.measure import EllipseFit, axes_covariance, axes_from_shape, fit_ellipse_model
-from sfm.targets.outlines import estimate_noise, find_outlines, scale_of
+from sfm.targets.measure import (
+    EllipseFit,
+    axes_covariance,
+    axes_from_shape,
+    find_counters,
+    find_duplicates,
+    find_legible,
+    find_parts_of_codes,
+    fit_ellipse_model,
+    judge_fits,
+)
+from sfm.targets.outlines import Flag, estimate_noise, find_outlines, scale_of
 
 SIGNS = {"dark": (-1,), "bright": (1,), "auto": (1, -1)}
 CENTRES = ("model", "edges", *WEIGHTS)
@@ -68,11 +69,11 @@ class Targets:
     noise: FloatArray
     """standard deviation of the intensities about the fitted model, shape (k,)"""
     flag: IntArray
-    """remarks, see sfm.targets.flags.Flag, shape (k,)"""
+    """remarks, see sfm.targets.outlines.Flag, shape (k,)"""
     rejected_xy: FloatArray
     """positions of rejected candidates, px, shape (m, 2)"""
     rejected_flag: IntArray
-    """their reasons, see sfm.targets.flags.Flag, shape (m,)"""
+    """their reasons, see sfm.targets.outlines.Flag, shape (m,)"""
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -100,7 +101,7 @@ def find_targets(
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
         polarity: dark, bright or auto (both).
-        codes: a name in `sfm.targets.codes.families.FAMILIES` (arcs, ring12, ring14, ring20, none, a family
+        codes: a name in `sfm.targets.codes.plates.FAMILIES` (arcs, ring12, ring14, ring20, none, a family
             of tags), the path of a code table, or a family, as that of a calibration plate.
         centres: how centres are measured: model (least squares fit of a blurred ellipse, the most precise),
             edges (ellipse through the edges on rays), or the centroid with binary, intensity or squared

@@ -1,13 +1,15 @@
 """The public names of `sfm.textbook`, a row each."""
 
-from sfm.kernels.quartic import positive_roots as positive_roots
+from sfm.kernels.small_algebra import positive_roots as positive_roots
 from sfm.textbook.direct import DirectOrientation as DirectOrientation
+from sfm.textbook.direct import SeparateAdjustment as SeparateAdjustment
+from sfm.textbook.direct import adjust_separately as adjust_separately
 from sfm.textbook.direct import orient_direct as orient_direct
 from sfm.textbook.matching import match_along_line as match_along_line
 from sfm.textbook.matching import match_pyramid as match_pyramid
-from sfm.textbook.normal_images import NormalImages as NormalImages
-from sfm.textbook.normal_images import make_normal_images as make_normal_images
+from sfm.textbook.pair import NormalImages as NormalImages
 from sfm.textbook.pair import PairOrientation as PairOrientation
+from sfm.textbook.pair import make_normal_images as make_normal_images
 from sfm.textbook.pair import orient_dependent as orient_dependent
 from sfm.textbook.pair import orient_independent as orient_independent
 from sfm.textbook.photo_coordinates import FiducialTransformation as FiducialTransformation
@@ -32,12 +34,10 @@ from sfm.textbook.resection.church import resect_church as resect_church
 from sfm.textbook.resection.dlt import DirectLinearTransformation as DirectLinearTransformation
 from sfm.textbook.resection.dlt import resect_dlt as resect_dlt
 from sfm.textbook.resection.p4p import resect_p4p as resect_p4p
-from sfm.textbook.resection.rampal import resect_rampal as resect_rampal
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise as resect_unknown_noise
 from sfm.textbook.resection.zeng_wang import direction_test as direction_test
 from sfm.textbook.resection.zeng_wang import distance_quartic as distance_quartic
 from sfm.textbook.resection.zeng_wang import pope_hinsken as pope_hinsken
+from sfm.textbook.resection.zeng_wang import resect_rampal as resect_rampal
 from sfm.textbook.resection.zeng_wang import resect_zeng_wang as resect_zeng_wang
 from sfm.textbook.resection.zeng_wang import trilaterate as trilaterate
-from sfm.textbook.separate import SeparateAdjustment as SeparateAdjustment
-from sfm.textbook.separate import adjust_separately as adjust_separately

@@ -15,7 +15,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.matching.correlation.ncc import (
+from sfm.matching.correlation import (
     NOT_COMPARED,
     OUTPUTS,
     NccMatches,

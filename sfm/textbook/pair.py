@@ -3,20 +3,34 @@
 Dependent: photograph 1 keeps its frame, photograph 2 gets by, bz (at a given bx) and omega, phi, kappa.
 Independent: the base is the X axis of the model, photograph 1 gets phi1, kappa1 (omega1 = 0), photograph 2
 omega2, phi2, kappa2; model coordinates are in units of the base.
+
+Normal images of two oriented photographs: free of distortion, with epipolar lines along their rows.
+
+Both images have one rotation, whose x axis is the base, and one principal distance; conjugate points have
+the same y, and differ in x by the parallax c b / depth. Matching along a row is then matching along an
+epipolar line.
+
+Source: document 002, sec. II.1.2.1 (normalisation); Kraus (2007), Photogrammetry, sec. 4.3 and 6.8.4 (normal
+images); the rotation as Fusiello, Trucco and Verri (2000), Machine Vision and Applications 12, 16-22.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
+from sfm.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
+from sfm.kernels.sampling import resample
+from sfm.network import Estimate, Network
 from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
 
+BORDER_POINTS = 40  # on each side of a photograph, from which the format of its normal image is taken
+MAX_LARGER = 4.0  # area of a normal image over that of its photograph; beyond, the base is along the rays
 DIFFERENCE = 1e-6  # rad, of central differences: their error is some 1e-12 of the derivative
 NO_BX = 1e-6  # of the base: below it by and bz cannot be counted at a given bx
 FIVE_POINT_TOLERANCE = 0.01  # tangents: pairs that are farther off take no part in the five-point start
@@ -168,3 +182,140 @@ def _pair(
         sigma0,
         redundancy,
     )
+
+
+@dataclass(frozen=True)
+class NormalImages:
+    """The normal images of a pair, the photograph whose centre is on the left first."""
+
+    images: tuple[str, str]
+    """names of the photographs"""
+    cameras: tuple[Camera, Camera]
+    """of the normal images: without distortion; principal distance, format and y0 are those of both"""
+    position: FloatArray
+    """projection centres, object unit, (2, 3)"""
+    rotation: FloatArray
+    """R of both, image to object axes, (3, 3)"""
+    source: Estimate
+    """interior and exterior orientation of the two photographs"""
+
+    def normal_xy(self, side: int, xy: FloatArray) -> FloatArray:
+        """Return the places in a normal image of points of its photograph, px, (k, 2); NaN without one.
+
+        Args:
+            side: 0 or 1.
+            xy: points in the photograph, px, (k, 2).
+        """
+        here = self.source
+        return _seen_by(self.cameras[side], self.rotation, here.cameras[side], here.rotation[side], xy)
+
+    def photograph_xy(self, side: int, xy: FloatArray) -> FloatArray:
+        """Return the places in a photograph of points of its normal image, px, (k, 2); NaN without one.
+
+        Args:
+            side: 0 or 1.
+            xy: points in the normal image, px, (k, 2).
+        """
+        here = self.source
+        return _seen_by(here.cameras[side], here.rotation[side], self.cameras[side], self.rotation, xy)
+
+    def resample(self, side: int, photograph: AnyArray) -> FloatArray:
+        """Return the normal image of a photograph, intensities, (H, W); NaN outside the photograph.
+
+        Args:
+            side: 0 or 1.
+            photograph: intensities, (h, w).
+        """
+        width, height = self.cameras[side].size_px
+        y, x = np.mgrid[:height, :width]
+        xy = self.photograph_xy(side, np.stack([x, y], axis=-1).reshape(-1, 2).astype(float))
+        return resample(photograph, xy.reshape(height, width, 2), interpolation="bicubic")
+
+
+@checked_arguments()
+def make_normal_images(network: Network, estimate: Estimate, first: str, second: str) -> NormalImages:
+    """Return the normal images of two oriented photographs, large enough to show both of them whole.
+
+    Args:
+        network: has the photographs.
+        estimate: their orientation.
+        first: name of one photograph.
+        second: name of the other.
+
+    Raises:
+        UnknownNameError: no photograph of that name.
+        GeometryError: a photograph without orientation, no base, or a base along the rays, by which a normal
+            image would have no end.
+
+    Source: document 002, sec. II.1.2.1; Kraus (2007), sec. 6.8.4.
+    """
+    rows = [network.image_index(name) for name in (first, second)]
+    position, rotation = estimate.position[rows], estimate.rotation[rows]
+    if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
+        raise GeometryError(f"normal images: {first} or {second} is not oriented")
+    base = position[1] - position[0]
+    if not np.linalg.norm(base) > 0:
+        raise GeometryError(f"normal images: {first} and {second} have one projection centre, needed a base")
+    if base @ (rotation[0] + rotation[1])[:, 0] < 0:  # x of the images points the other way
+        rows, position, rotation, base = rows[::-1], position[::-1], rotation[::-1], -base
+    cameras = tuple(estimate.cameras[network.camera[i]] for i in rows)
+    x = base / np.linalg.norm(base)
+    y = np.cross((rotation[0] + rotation[1])[:, 2], x)
+    if not np.linalg.norm(y) > 0:
+        raise GeometryError(f"normal images: the base of {first} and {second} is along their axes")
+    y /= np.linalg.norm(y)
+    R = np.column_stack([x, y, np.cross(x, y)])
+    names = network.images[rows[0]], network.images[rows[1]]
+    source = replace(estimate, cameras=cameras, position=position, rotation=rotation)
+    c_px = float(np.mean([camera.c_px for camera in cameras]))
+    centred = camera_from_values("centred", "brown", (1, 1), (1.0, 1.0), c_mm=c_px)
+    seen = [
+        _seen_by(centred, R, camera, turned, _border(camera))
+        for camera, turned in zip(cameras, rotation, strict=True)
+    ]
+    if not all(np.isfinite(part).all() for part in seen):
+        raise GeometryError(f"normal images: {first} or {second} looks along the base, or behind it")
+    low, high = (np.array([edge(part, axis=0) for part in seen]) for edge in (np.min, np.max))
+    size = np.ceil([(high - low)[:, 0].max(), high[:, 1].max() - low[:, 1].min()]).astype(int) + 1
+    area = max(float(np.prod(camera.size_px)) for camera in cameras)
+    if size[0] * size[1] > MAX_LARGER * area:
+        raise GeometryError(
+            f"normal images: {size[0]} x {size[1]} px for {first} and {second}, at most {MAX_LARGER:g} "
+            "times the photographs are made; the base is too nearly along the rays"
+        )
+    normal = []
+    for k in range(2):
+        x0 = 0.5 - low[k, 0] - size[0] / 2  # the leftmost point of each image is in column 0
+        y0 = size[1] / 2 - 0.5 + low[:, 1].min()  # and the highest point of both in row 0
+        normal.append(
+            camera_from_values(
+                f"{names[k]}, normal",
+                "brown",
+                (int(size[0]), int(size[1])),
+                (1.0, 1.0),
+                c_mm=c_px,
+                values=(("x0", x0), ("y0", y0)),
+            )
+        )
+    return NormalImages(names, (normal[0], normal[1]), position, R, source)
+
+
+def _border(camera: Camera) -> FloatArray:
+    """Return points on the border of a photograph, px, (4 BORDER_POINTS, 2)."""
+    width, height = camera.size_px
+    along, zero = np.linspace(0, 1, BORDER_POINTS), np.zeros(BORDER_POINTS)
+    unit = np.vstack(
+        [
+            np.column_stack(pair)
+            for pair in ((along, zero), (along, zero + 1), (zero, along), (zero + 1, along))
+        ]
+    )
+    return unit * (width - 1, height - 1)
+
+
+def _seen_by(
+    camera: Camera, rotation: FloatArray, source: Camera, source_rotation: FloatArray, xy: FloatArray
+) -> FloatArray:
+    """Return where a camera sees the rays of another one from the same place, px, (k, 2); NaN behind it."""
+    ray = ray_directions(tangents_from_pixel(source, xy), source_rotation)
+    return project(camera, np.zeros(3), rotation, ray)

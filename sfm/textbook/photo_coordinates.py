@@ -17,7 +17,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import tangents_of
+from sfm.orientation.resection.least_squares import tangents_of
 
 SIMILARITY, AFFINE = "similarity", "affine"
 FEWEST = {SIMILARITY: 2, AFFINE: 3}

@@ -13,16 +13,8 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import (
-    alternatives,
-    columns,
-    families,
-    hypotheses,
-    moved,
-    patterns,
-    refit,
-    score,
-)
+from sfm.adjustment.hypotheses import alternatives, columns, families, hypotheses, moved, refit, score
+from sfm.adjustment.hypotheses import moved as patterns
 from sfm.adjustment.hypotheses.alternatives import (
     alternatives_of,
     is_significant,

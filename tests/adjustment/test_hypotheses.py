@@ -12,7 +12,7 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import hypotheses
 from sfm.adjustment.hypotheses import refit as refitting
-from sfm.adjustment.hypotheses.alternatives import interiors
+from sfm.adjustment.hypotheses.alternatives import explain_rejections, interiors
 from sfm.adjustment.hypotheses.columns import (
     CAMERA,
     columns_of,
@@ -26,7 +26,6 @@ from sfm.adjustment.hypotheses.hypotheses import (
     contradicted_parameters,
     judge_alternatives,
 )
-from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

@@ -22,7 +22,7 @@ from sfm.camera import Camera, project
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
-from sfm.textbook.separate import adjust_separately
+from sfm.textbook.direct import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 
 FREE = Datum("free")

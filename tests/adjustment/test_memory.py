@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.motions import motions_of
+from sfm.adjustment.datum import Datum, motions_of
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.solvers import choice

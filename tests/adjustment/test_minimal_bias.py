@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.quality.reliability import tau_critical
-from sfm.adjustment.quality.statistics import non_centrality, reliability
+from sfm.adjustment.quality.statistics import non_centrality, reliability, tau_critical
 from sfm.adjustment.solve import adjust
 from tests.synthetic import make_network, seed_of
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import rejections
-from sfm.adjustment.hypotheses.rejections import SecondPlace, explain_rejections
+from sfm.adjustment.hypotheses import alternatives as rejections
+from sfm.adjustment.hypotheses.alternatives import SecondPlace, explain_rejections
 from sfm.adjustment.quality.consistency import intersected
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

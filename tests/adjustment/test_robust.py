@@ -21,7 +21,7 @@ from sfm.adjustment.quality.gross_errors.robust import (
     tukey_slopes,
     tukey_weights,
 )
-from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.gross_errors.robust import _Rays, would_pass
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
-from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
+from sfm.adjustment.quality.statistics import standardised_residuals, tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
 from sfm.network import ImagePoints

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.covariance import shifted
-from sfm.adjustment.datum import Datum
+from sfm.adjustment.datum import Datum, free_motions
 from sfm.adjustment.engine.collinearity import collinearity, new_workspace, residuals
-from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

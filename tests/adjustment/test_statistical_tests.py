@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.quality import reliability as numbers
 from sfm.adjustment.quality import statistics
+from sfm.adjustment.quality import statistics as numbers
 from sfm.adjustment.quality.statistics import (
     CoordinateTest,
     component_tests,

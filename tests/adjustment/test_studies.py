@@ -13,7 +13,7 @@ from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
-from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError

@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, families, patterns
+from sfm.adjustment.hypotheses import alternatives, families
+from sfm.adjustment.hypotheses import moved as patterns
 from sfm.adjustment.hypotheses import refit as unchecked
 from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import columns_of, shared_columns

@@ -28,11 +28,10 @@ from sfm.batch.job import LOCK, SurveyJob, SurveyRow, note_finished, reconstruct
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.batch.table import batch_page, batch_remarks
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.files.manifest import MANIFEST, sha256_of
-from sfm.files.open_folders import Owner, locked
+from sfm.files.open_folders import MANIFEST, Owner, locked, sha256_of
 from sfm.files.whole_files import write_manifest
 from sfm.remarks.remark import kinds_of
-from sfm.report.log import read_log
+from sfm.report.output import read_log
 from sfm.report.pages import html
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing

@@ -8,7 +8,7 @@ import pytest
 
 from sfm import cli, warm_up
 from sfm.cli.commands.starting import compile_first
-from sfm.kernels import compiling as warmed
+from sfm.kernels import warmed
 
 
 def doctor(monkeypatch: pytest.MonkeyPatch) -> int:

@@ -17,7 +17,7 @@ from sfm.batch.run import run_batch
 from sfm.cli.app import app
 from sfm.cli.commands import starting
 from sfm.errors import KolinearError
-from sfm.report.log import read_log
+from sfm.report.output import read_log
 from sfm.runtime.faults import error_in_words, is_fault, working_on
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT

@@ -22,11 +22,11 @@ import pytest
 from sfm.errors import FolderInUseError, OutputError
 from sfm.files.open_folders import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
-from sfm.report.log import SurveyLog, read_log
+from sfm.report.output import SurveyLog, read_log
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore, measured_key
 from sfm.survey.measuring.targets import target_settings
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import PLOTLESS, points_of
 from tests.places import ROOT

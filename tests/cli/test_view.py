@@ -15,10 +15,10 @@ import pytest
 
 from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
-from sfm.cli.commands.viewing import view
+from sfm.cli.commands.inspecting import view
 from sfm.errors import OutputError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.view_page import photographs_in
 from sfm.survey.inputs.survey import read_survey

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of

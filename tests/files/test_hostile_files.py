@@ -21,12 +21,12 @@ from adapters.formats.registry import read_any, read_comparable
 from adapters.formats.result_tables import read_result, write_tables
 from sfm.batch.run import find_surveys
 from sfm.errors import KolinearError, SurveyFileError
-from sfm.files import globs
+from sfm.files import plain_text as globs
 from sfm.files.csv_tables import read_header, read_table
 from sfm.inspection.planned_survey import read_plan
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refining.refinement import refine_model

@@ -35,7 +35,7 @@ from sfm.survey.inputs.given import (
     read_image_points,
     read_points,
 )
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.rings import read_code_table

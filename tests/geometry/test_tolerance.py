@@ -11,9 +11,15 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.alignment import Nominal
 from sfm.geometry.measured import MeasuredPoints, distance, point_function, with_hidden_point
-from sfm.geometry.mesh import Mesh, distances_from_mesh
 from sfm.geometry.shapes.fit import fit_shape
-from sfm.geometry.tolerance import decide, deviations_from_mesh, deviations_from_points, deviations_from_shape
+from sfm.geometry.tolerance import (
+    Mesh,
+    decide,
+    deviations_from_mesh,
+    deviations_from_points,
+    deviations_from_shape,
+    distances_from_mesh,
+)
 from tests.geometry.simulated import points_on, random_covariance, simulated_shape
 from tests.synthetic import seed_of
 

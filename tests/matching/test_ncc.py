@@ -11,9 +11,8 @@ from sfm.camera import project
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.conjugate import match_points
-from sfm.matching.correlation.ncc import ambiguous, independent_pixels, match_ncc
+from sfm.matching.correlation import NccFlag, ambiguous, independent_pixels, match_ncc
 from sfm.matching.epipolar import epipolar_paths
-from sfm.matching.match_flags import NccFlag
 from sfm.textbook.matching import match_along_line, match_pyramid
 from tests.synthetic import make_network
 from tests.textures import random_texture, with_noise

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import FloatArray
-from sfm.matching.conjugate import match_points
-from sfm.matching.local_affinity import difference_of_blur
+from sfm.matching.conjugate import difference_of_blur, match_points
 from tests.textures import natural_texture, with_noise
 
 SIZE = (420, 380)

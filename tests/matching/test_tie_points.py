@@ -57,7 +57,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
-from sfm.report.log import read_log
+from sfm.report.output import read_log
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.drafting.draft import draft_survey

@@ -11,9 +11,8 @@ from benchmarks.wide_matching import count_matches, photograph, points_and_truth
 from datasets.textured import render
 from sfm.conventions import FloatArray
 from sfm.matching import conjugate
-from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate import affinities_around, match_points
 from sfm.matching.conjugate_patches import ConjugatePoints
-from sfm.matching.local_affinity import affinities_around
 from sfm.matching.lsm.surface_planes import match_where_plane
 from sfm.matching.lsm.two_photo import match_lsm
 from tests.textures import MEAN, affine_pairs, random_texture, with_noise

@@ -5,8 +5,7 @@ import pytest
 
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.orientation.absolute import orient_absolute
-from sfm.similarity import Similarity
+from sfm.similarity import Similarity, orient_absolute
 from tests.synthetic import seed_of
 
 

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.motions import motions_of
+from sfm.adjustment.datum import Datum, motions_of
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
-from sfm.orientation.homography import fit_homography
+from sfm.orientation.image_rays import fit_homography
 from sfm.orientation.incremental import growth as growing
 from sfm.orientation.incremental import starting_pair
 from sfm.orientation.incremental.growth import Growth

@@ -5,7 +5,7 @@ import pytest
 
 from sfm.conventions import rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.orientation.homography import decompose_homography, fit_homography
+from sfm.orientation.image_rays import decompose_homography, fit_homography
 from sfm.orientation.relative import (
     coplanarity_residuals,
     model_points,

@@ -14,20 +14,18 @@ from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
-from sfm.planning.further import further_photographs
-from sfm.planning.plan import plan_of, verdict_of_plan
+from sfm.planning.plan import further_photographs, plan_of, verdict_of_plan
 from sfm.planning.planned_object import shape_object
-from sfm.planning.prediction import predict_network
+from sfm.planning.prediction import WantedPrecision, predict_network
 from sfm.planning.sight.visibility import Seeing, TargetImage
 from sfm.planning.stations import Stations, arrangement
-from sfm.planning.wanted import WantedPrecision
 from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest
 from sfm.report.page import Banner
 from sfm.report.pages import page_of, write_page
 from sfm.solution import Solution
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 from tests.rigs import make_rig
 from tests.synthetic import seed_of

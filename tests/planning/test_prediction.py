@@ -15,7 +15,7 @@ from sfm.adjustment.solve import adjust, predict
 from sfm.camera import camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, UnknownNameError
-from sfm.geometry.mesh import Mesh
+from sfm.geometry.tolerance import Mesh
 from sfm.planning.planned_object import PlannedObject, farthest_points, object_of_points, shape_object
 from sfm.planning.prediction import (
     Prediction,
@@ -30,7 +30,7 @@ from sfm.planning.stations import ARRANGEMENTS, Stations, around, arrangement, l
 from sfm.planning.weakness import calibratability, reason_of, rolled_share, weak_points
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
-from sfm.report.viewer.scene import distance_sigmas
+from sfm.report.viewer.pictures import distance_sigmas
 from sfm.similarity import fit_similarity
 from tests.places import DATASETS, SHARED
 from tests.synthetic import make_network, seed_of

@@ -10,9 +10,15 @@ import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.geometry.mesh import Mesh
-from sfm.planning.planned_object import object_of_mesh, object_of_points, open_edges, shape_object
-from sfm.planning.sight.occlusion import box_tree, hidden_points
+from sfm.geometry.tolerance import Mesh
+from sfm.planning.planned_object import (
+    box_tree,
+    hidden_points,
+    object_of_mesh,
+    object_of_points,
+    open_edges,
+    shape_object,
+)
 from sfm.planning.sight.visibility import (
     DepthOfField,
     Lens,

@@ -13,7 +13,7 @@ from sfm.errors import GeometryError, OutputError, SurveyFileError
 from sfm.printing.sheet import MARGIN_MM, RULER_MM, lay_out_sheet, write_sheet
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets
 
 PX_PER_MM = 8

@@ -21,7 +21,7 @@ from sfm.rendering.render import (
 )
 from sfm.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, discs, join_marks
 from sfm.rendering.scene_file import read_scene
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import read_codes
 from tests.places import ROOT
 

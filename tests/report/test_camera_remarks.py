@@ -17,7 +17,7 @@ from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.remarks.verdict import Verdict
 from sfm.report.findings import camera_remarks
 from sfm.report.findings.calibrated_cameras import camera_is_result
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.phrases import describe_calibration
 from sfm.result import SeenPlate, SurveyResult
 from tests.surveys import survey_of

@@ -11,8 +11,7 @@ from sfm.adjustment.solve import adjust
 from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark, of_kind
 from sfm.report.findings.bundle_statistics import Given
-from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.findings.survey_remarks import given_remarks
+from sfm.report.findings.survey_remarks import Findings, findings_of, given_remarks
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 

@@ -17,13 +17,12 @@ import pytest
 
 import sfm.report.findings.bundle_statistics as statistics
 import sfm.report.findings.checks as checks
-import sfm.report.findings.findings as findings_module
+import sfm.report.findings.survey_remarks as findings_module
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
-from sfm.report.findings.findings import findings_of
-from sfm.report.log import SurveyLog
-from sfm.report.output import write_result
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.report.output import SurveyLog, write_result
 from sfm.result import SurveyResult
 from tests import compare_results
 from tests.places import ROOT

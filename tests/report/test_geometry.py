@@ -16,7 +16,7 @@ from sfm.adjustment.solve import adjust
 from sfm.network import ObjectPoints
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.findings.bundle_statistics import Geometry, geometry_of, hull_area
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report

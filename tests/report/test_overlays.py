@@ -10,10 +10,10 @@ import numpy as np
 
 from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.survey.inputs.survey import read_survey
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.surveys import write_photograph_survey
 
 

@@ -16,7 +16,6 @@ from sfm.conventions import FloatArray
 from sfm.files.result_tables import GIVEN
 from sfm.remarks.remark import remark
 from sfm.remarks.verdict import judge
-from sfm.report.numbers import significant
 from sfm.report.page import (
     MAX_ROWS,
     YES,
@@ -43,6 +42,7 @@ from sfm.report.page import (
 from sfm.report.pages import MAX_ROWS as MAX_TEXT_ROWS
 from sfm.report.pages import PAGES, WIDTH, html, page_of, write_page
 from sfm.report.pages import text as text_of
+from sfm.report.phrases import significant
 
 EVIL = "<img src=x onerror=alert(1)>"
 

@@ -17,7 +17,7 @@ from sfm.camera import project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import Findings, findings_of
+from sfm.report.findings.survey_remarks import Findings, findings_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.page import FoldedParts, Heading, Part, Table
 from sfm.report.pages import page_of
 from sfm.survey.inputs.survey import read_survey

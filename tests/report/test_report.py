@@ -24,7 +24,7 @@ from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import bound, counted
 from sfm.errors import OutputError
-from sfm.files.manifest import refuse_foreign_folder
+from sfm.files.open_folders import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
@@ -32,26 +32,27 @@ from sfm.report import survey_report
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.findings.bundle_statistics import geometry_of
-from sfm.report.findings.findings import findings_of
-from sfm.report.numbers import (
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.report.output import WRITTEN, plot_data, write_result
+from sfm.report.page import Paragraph, Section
+from sfm.report.pages import WIDTH, html_of, page_of, wrapped
+from sfm.report.phrases import (
     alike,
+    describe_precision,
     finer_unit,
     placed,
     probability,
     significant,
     to_precision,
     with_exponent,
+    words_left_out,
 )
-from sfm.report.output import WRITTEN, plot_data, write_result
-from sfm.report.page import Paragraph, Section
-from sfm.report.pages import WIDTH, html_of, page_of, wrapped
-from sfm.report.phrases import describe_precision, words_left_out
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
-from sfm.targets.flags import LIKEST_FIRST, Flag
+from sfm.targets.outlines import LIKEST_FIRST, Flag
 from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT

@@ -39,11 +39,11 @@ from sfm.report.findings.checks import (
     count_observations,
     largest_residuals,
     longest_residual,
+    point_precision,
+    precision_of,
     sigma0_of,
 )
-from sfm.report.findings.findings import findings_of
-from sfm.report.findings.precision import point_precision, precision_of
-from sfm.report.numbers import signed, to_precision
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.phrases import (
@@ -52,6 +52,8 @@ from sfm.report.phrases import (
     describe_sigma0,
     describe_test,
     describe_weights,
+    signed,
+    to_precision,
 )
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables

@@ -11,7 +11,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.page import Paragraph, Statement, Table
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.result import BaselineComparison, SurveyResult

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.report.viewer.embedded import packed_scene, sources
+from sfm.report.viewer.embedded import packed_scene, scene_of_stored, sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
-from sfm.report.viewer.solution_scene import scene_of_stored
 from sfm.solution import Solution
 from tests.places import ROOT
 from tests.synthetic import SIZE_PX, make_network, seed_of

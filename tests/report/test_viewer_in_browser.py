@@ -16,9 +16,8 @@ import pytest
 
 from sfm.conventions import IntArray
 from sfm.report.view_page import view_page, write_view
-from sfm.report.viewer.pictures import cut_pictures
-from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
-from sfm.report.viewer.solution_scene import scene_of_stored
+from sfm.report.viewer.embedded import scene_of_stored
+from sfm.report.viewer.pictures import Bar, Marks, ViewerScene, cut_pictures, distance_sigmas
 from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import SIZE_PX, make_network, seed_of

@@ -23,7 +23,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics, Scene
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.inputs.survey import read_survey
 from tests.survey.judging import CAUSES
 from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates

@@ -27,7 +27,7 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.remarks.catalogue import hypotheses
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted

@@ -20,7 +20,7 @@ from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.exterior_table import ObservedExterior

@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.calibration import Calibration

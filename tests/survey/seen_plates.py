@@ -14,8 +14,7 @@ from sfm.pipeline import _solve
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, StageClock
 from sfm.survey.assembly import ALONE, assemble_result, compare_solution
-from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded
 from sfm.targets.detect import Targets, _of_crossings

@@ -11,8 +11,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.survey.board_turns import _is_certain, _Rig, agree_on_turns
-from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, PhotographList
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded

@@ -14,7 +14,7 @@ from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from sfm.errors import SurveyFileError
 from sfm.survey.inputs.from_exif import moments_from_exif
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.synthetic import seed_of

@@ -17,7 +17,7 @@ from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
 from sfm.report.findings.bundle_statistics import given_of
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report

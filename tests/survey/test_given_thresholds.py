@@ -11,7 +11,7 @@ from sfm.adjustment.quality.given_values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.survey import mistyped

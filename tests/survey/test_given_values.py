@@ -13,7 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity

@@ -17,7 +17,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
 from sfm.result import SurveyResult

@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import reverse_depth
 from sfm.survey.adjusting.settling import held_to_converge, nearer_start
 from tests.survey.weak_networks import _measured, _stations

@@ -14,7 +14,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.diagnosis.lost_photographs import (
     explain_lost_photographs,
     lost_groups,

@@ -16,7 +16,7 @@ from sfm.conventions import IntArray
 from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
 from sfm.photographs.exif import Metadata, SatellitePosition
 from sfm.remarks.remark import of_kind
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.survey.measuring import tie_points

@@ -12,9 +12,9 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
 from sfm.survey.drafting.draft import draft_survey
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.measuring.other_sizes import OtherSizes, separate_sizes
+from sfm.survey.measuring.targets import OtherSizes, separate_sizes
 from sfm.targets.codes.tags import tag_family, tag_modules
 from tests.surveys import SIZE_PX, write_photograph_survey
 

@@ -12,7 +12,7 @@ from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_tables as write_stored
 from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.survey.inputs.given import KnownPoints, read_control, read_image_points

@@ -15,7 +15,7 @@ from sfm.network import Estimate, Network
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.correspondences import restore_strayed
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
 from sfm.survey.inputs.settings import AdjustSettings

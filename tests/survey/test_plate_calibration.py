@@ -17,10 +17,9 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.numbers import significant
+from sfm.report.findings.survey_remarks import Findings, findings_of
 from sfm.report.pages import html_of
-from sfm.report.phrases import describe_calibration
+from sfm.report.phrases import describe_calibration, significant
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey

@@ -19,9 +19,9 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.network import ObjectPoints, rows_of
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.drafting.draft import draft_survey
-from sfm.survey.inputs.plate import plate_family
+from sfm.survey.inputs.calibration import plate_family
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import TAGGED, PlateFamily
 from tests.plates import GRID, PITCH, PIXEL_MM, TRUTH, camera, plate_pictures, stations

@@ -18,8 +18,8 @@ from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.findings.survey_remarks import ray_remarks
 from sfm.survey.adjusting.solution_remarks import datum_remarks
 from sfm.survey.diagnosis.codes_found import missing_plates
+from sfm.survey.inputs.calibration import plate_control
 from sfm.survey.inputs.measurements import MeasuredPhotographs
-from sfm.survey.inputs.plate import plate_control
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.targets.codes.plates import BOARDS, TAGGED, PlateFamily
 from sfm.targets.detect import find_targets

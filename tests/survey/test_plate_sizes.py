@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sfm.remarks.remark import Remark
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from tests.survey.seen_plates import Plates, about, plates_survey, run_plates
 from tests.synthetic import seed_of
 

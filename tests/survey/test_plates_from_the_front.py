@@ -10,7 +10,7 @@ import pytest
 
 from sfm.network import Estimate
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.adjusting.solution_remarks import not_calibrated
 from tests.plates import camera
 from tests.survey.seen_plates import FREE, Plates, about, plates_survey, run_plates

@@ -13,7 +13,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import Findings, findings_of
+from sfm.report.findings.survey_remarks import Findings, findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey

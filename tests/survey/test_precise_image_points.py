@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

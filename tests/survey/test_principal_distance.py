@@ -9,7 +9,7 @@ import pytest
 
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.adjusting.solution_remarks import far_principal_distances
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

@@ -15,7 +15,7 @@ from adapters.formats.result_tables import write_tables
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.solution import Solution
 from sfm.survey.inputs.given import read_image_points

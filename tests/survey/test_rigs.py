@@ -19,8 +19,8 @@ from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
 from sfm.report.figures.plots import epipolar_figure
-from sfm.report.findings.findings import findings_of
-from sfm.report.findings.rigs import rigs_of
+from sfm.report.findings.calibrated_cameras import rigs_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey

@@ -9,7 +9,7 @@ import pytest
 
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey
 

@@ -18,7 +18,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.lost_photographs import find_second_objects

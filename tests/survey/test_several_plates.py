@@ -17,7 +17,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import settings_by_table
 from sfm.survey.diagnosis.codes_found import plates_not_in_result

@@ -14,7 +14,7 @@ from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
 from sfm.survey.diagnosis.codes_found import small_codes
 from sfm.survey.drafting.draft import draft_survey
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.detect import Targets, find_targets
 

@@ -15,7 +15,7 @@ from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.bundle_statistics import statistics_of
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey

@@ -34,8 +34,7 @@ from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING, sources_of
 from sfm.matching.tracks.interest import natural_points
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.report.log import SurveyLog, read_log
-from sfm.report.output import folder_name
+from sfm.report.output import SurveyLog, folder_name, read_log
 from sfm.solution import Solution
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore
 from sfm.targets.detect import Targets, find_targets

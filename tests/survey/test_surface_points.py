@@ -20,8 +20,7 @@ from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs import reading as reading_module
 from sfm.photographs.reading import read_photograph
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring import covering_points, surface_points, tie_points

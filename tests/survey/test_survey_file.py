@@ -14,7 +14,7 @@ from sfm.network import Estimate, Network
 from sfm.photographs.exif import Metadata
 from sfm.survey.adjusting.solution_remarks import datum_remarks
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, start_values
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import read_survey_file

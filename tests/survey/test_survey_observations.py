@@ -26,17 +26,14 @@ from sfm.network import (
     values_of,
 )
 from sfm.observations import TABLES
-from sfm.observations.groups import Group
-from sfm.observations.height_differences import HeightDifferences
-from sfm.observations.horizontal_directions import HorizontalDirections
-from sfm.observations.kind import PHOTOGRAPH, RowKind, TableKind
-from sfm.observations.mounts import MountObservations
-from sfm.observations.offset_distances import OffsetDistances
-from sfm.observations.plumb_lines import Lines, PlumbLines
+from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind
+from sfm.observations.planes_and_lines import Lines, PlumbLines
+from sfm.observations.point_pairs import HeightDifferences, HorizontalDirections, OffsetDistances
+from sfm.observations.pose import MountObservations
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult

@@ -11,7 +11,7 @@ import pytest
 from sfm.errors import SurveyFileError
 from sfm.files import csv_tables
 from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey

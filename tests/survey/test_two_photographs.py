@@ -12,12 +12,11 @@ from sfm.errors import GeometryError
 from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.circles import circle_misfit
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.measurements import Measurements, find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import measure_targets

@@ -14,7 +14,7 @@ from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.hypotheses.given_scales import remarks_on_unchecked

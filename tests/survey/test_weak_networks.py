@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.adjusting.solution_remarks import contradicted
 from sfm.survey.inputs.survey import CameraSetup
 from tests.survey.weak_networks import outcome_of, study, weak_network

@@ -12,7 +12,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.pipeline import run_survey
 from sfm.report.findings.checks import Sigma0
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.phrases import describe_sigma0, describe_weights
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.given import KnownPoints

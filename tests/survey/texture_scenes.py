@@ -26,7 +26,7 @@ from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.planning.stations import looking
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.rendering.scene import CircularTargets, Faces, Scene, coded_ring, join_marks
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 
 # Places on a plate and on one above it, mm: (face, x, y).

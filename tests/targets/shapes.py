@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.targets.detect import find_targets
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of
 
 # Fine cells per px, their coverage is exact; corners of the polygon that stands for a circle.

@@ -10,9 +10,9 @@ from sfm.camera import camera_from_values
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets
-from sfm.targets.flags import count_flags
+from sfm.targets.outlines import count_flags
 
 SUPER, NOISE, BLUR = 4, 3.5, 0.75
 WIDTH, HEIGHT = 1000, 700

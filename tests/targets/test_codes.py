@@ -11,7 +11,7 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
 from sfm.targets.codes import rings
-from sfm.targets.codes.families import FAMILIES, code_family
+from sfm.targets.codes.plates import FAMILIES, code_family
 from sfm.targets.codes.rings import (
     UNCODED,
     UNREADABLE,

@@ -12,9 +12,9 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.targets.codes.concentric import WIDTHS, ConcentricFamily, concentric_family
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of
 from tests.targets.concentric_tags import Tag, draw_tag, read_tags
 

@@ -13,7 +13,7 @@ from numba import njit
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes import ring_cells
 from sfm.targets.codes import rings as ring_reading
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily, smallest_rotation
 from sfm.targets.detect import find_targets
 

@@ -11,13 +11,11 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.photographs.reading import read_photograph
-from sfm.targets.candidates import SOFTEST_EDGE, judge_fits
-from sfm.targets.codes.families import code_family
+from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets
 from sfm.targets.fits.blurred_ellipse import BLUR
-from sfm.targets.flags import Flag, count_flags
-from sfm.targets.measure import axes_from_shape, fit_ellipse_model
-from sfm.targets.outlines import estimate_noise
+from sfm.targets.measure import SOFTEST_EDGE, axes_from_shape, fit_ellipse_model, judge_fits
+from sfm.targets.outlines import Flag, count_flags, estimate_noise
 from tests.places import SHARED
 
 DATA = SHARED / "data"

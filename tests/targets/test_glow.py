@@ -9,7 +9,7 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.report.figures.overlays import REASON_COLOURS, REMARK_COLOURS
 from sfm.targets.detect import Targets, find_targets
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 SUPER, SIZE, NOISE = 5, 120, 2.0
 CENTRE = np.array([60.3, 58.6])

@@ -8,7 +8,6 @@ import pytest
 from scipy.linalg import eigvalsh
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.flags import Flag
 from sfm.targets.measure import (
     EllipseFit,
     axes_covariance,
@@ -16,6 +15,7 @@ from sfm.targets.measure import (
     fit_ellipse_model,
     shape_from_axes,
 )
+from sfm.targets.outlines import Flag
 
 SUPER = 5
 

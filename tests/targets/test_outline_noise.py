@@ -13,7 +13,6 @@ import pytest
 from datasets.bridge import render
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.rendering.render import render_photographs
-from sfm.targets.candidates import find_duplicates
 from sfm.targets.detect import find_targets
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness, undamaged
@@ -31,8 +30,8 @@ from sfm.targets.fits.outline_noise import (
     rise_to_first,
 )
 from sfm.targets.fits.undamaged import _stands_out
-from sfm.targets.flags import Flag
-from sfm.targets.measure import EllipseFit
+from sfm.targets.measure import EllipseFit, find_duplicates
+from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of
 from tests.targets.shapes import measure_class, over_stated, polygon_coverage
 

@@ -12,7 +12,7 @@ from sfm.conventions import AnyArray
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.detect import find_targets
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.targets.shapes import polygon_coverage
 from tests.targets.test_bound import coverage
 

@@ -12,7 +12,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.tags import DICTIONARIES, _widening, find_tags, tag_family, tag_modules
 from sfm.targets.detect import find_targets
 from sfm.targets.fits.whole_tag import fit_whole_tags
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of
 
 TILE, ACROSS, FINE, TEXTURE = 64, 6, 12, 16

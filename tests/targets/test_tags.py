@@ -30,7 +30,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.tags import DICTIONARIES, corner_name, tag_family
 from sfm.targets.detect import find_targets
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, stations
 
 LOW, HIGH = 0.08, 0.8

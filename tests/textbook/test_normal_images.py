@@ -11,7 +11,7 @@ from sfm.camera import project
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
-from sfm.textbook.normal_images import MAX_LARGER, make_normal_images
+from sfm.textbook.pair import MAX_LARGER, make_normal_images
 from tests.synthetic import make_network, seed_of
 
 

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
 from sfm.network import ObjectPoints, ScaleBars
-from sfm.textbook.separate import adjust_separately
+from sfm.textbook.direct import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.datum import leading
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_points, times_reduced
-from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance

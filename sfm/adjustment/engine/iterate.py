@@ -21,11 +21,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from sfm.adjustment.datum import ResolvedDatum
+from sfm.adjustment.datum import Motions, ResolvedDatum, motions_of, on_sound_points, with_further
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
-from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
-from sfm.adjustment.engine.null_space import on_sound_points, with_further
 from sfm.adjustment.engine.observed import ObservedKind, couples_poses, vPv_of
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver

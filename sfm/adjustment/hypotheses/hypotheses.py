@@ -26,7 +26,7 @@ from sfm.adjustment.hypotheses.alternatives import (
 )
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
-from sfm.adjustment.hypotheses.patterns import MIN_GROUP
+from sfm.adjustment.hypotheses.moved import MIN_GROUP
 from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of, unchecked_assumptions
 from sfm.adjustment.hypotheses.score import (
     Reduced,
@@ -35,7 +35,7 @@ from sfm.adjustment.hypotheses.score import (
     squares_gained,
 )
 from sfm.adjustment.quality.given_values import MIN_LEAD
-from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray

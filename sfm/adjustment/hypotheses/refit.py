@@ -38,7 +38,7 @@ from sfm.adjustment.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
-from sfm.adjustment.hypotheses.patterns import MIN_GROUP, too_many_cameras
+from sfm.adjustment.hypotheses.moved import MIN_GROUP, too_many_cameras
 from sfm.adjustment.hypotheses.score import (
     MIN_DETERMINED_SHARE,
     NONE,

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.reliability import level_of_single
+from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.camera import pixel_jacobian, project

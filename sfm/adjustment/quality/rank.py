@@ -6,10 +6,9 @@ from collections import Counter
 
 import numpy as np
 
+from sfm.adjustment.datum import free_motions, leading
 from sfm.adjustment.engine.iterate import Optimum
-from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.normals import times_schur
-from sfm.adjustment.engine.null_space import leading
 from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted

@@ -161,7 +161,7 @@ def _dask_cluster() -> ModuleType | None:
 
 
 class InProcess:
-    """Runs one piece of work after the other in this process, see sfm.runtime.executor.Engine.
+    """Runs one piece of work after the other in this process, see sfm.kernels.threads.Engine.
 
     Messages of a call are passed on when it has returned.
     """

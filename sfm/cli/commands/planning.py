@@ -78,7 +78,7 @@ def target_size_command(
         from sfm.conventions import METRES
         from sfm.files.whole_files import refuse_existing, whole_file
         from sfm.planning.sight.visibility import compute_target_size
-        from sfm.targets.codes.families import code_family
+        from sfm.targets.codes.plates import code_family
         from sfm.targets.codes.rings import CodeFamily
 
     if diagram is not None:
@@ -236,12 +236,11 @@ def network_command(
     with loading():
         from sfm.cli.console import print_verdict
         from sfm.conventions import METRES
-        from sfm.files.manifest import refuse_foreign_folder
-        from sfm.planning.design.candidates import StationLimits
-        from sfm.planning.design.designer import design_network
+        from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.planning.design.designer import StationLimits, design_network
         from sfm.planning.plan import describe_plan, plan_of, verdict_of_plan
+        from sfm.planning.prediction import WantedPrecision
         from sfm.planning.sight.visibility import Seeing, TargetImage
-        from sfm.planning.wanted import WantedPrecision
         from sfm.report.pages import write_page
         from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
@@ -359,8 +358,7 @@ def simulate_command(
     """
     with loading():
         from sfm.api import run_survey
-        from sfm.files.manifest import refuse_foreign_folder
-        from sfm.files.open_folders import locked
+        from sfm.files.open_folders import locked, refuse_foreign_folder
         from sfm.files.whole_files import remove_leftovers, whole_folder
         from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 
@@ -411,8 +409,8 @@ def more_command(
         from adapters.formats.result_tables import read_result
         from sfm.cli.console import print_verdict
         from sfm.errors import GeometryError
-        from sfm.files.manifest import refuse_foreign_folder
-        from sfm.planning.further import further_photographs
+        from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.planning.plan import further_photographs
         from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress

@@ -53,7 +53,7 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
         KolinearError: what was found, and what was expected.
     """
     from adapters.formats.mesh import read_mesh
-    from sfm.geometry.mesh import Mesh
+    from sfm.geometry.tolerance import Mesh
     from sfm.planning.planned_object import SHAPES, object_of_mesh, object_of_points, shape_object
 
     kind, colon, sizes = text.partition(":")
@@ -287,10 +287,10 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     import numpy as np
 
     from sfm.planning.prediction import ScaleBarPlan
+    from sfm.survey.inputs.start import with_given_mounts
     from sfm.survey.inputs.survey import read_survey
     from sfm.survey.observation_tables import with_tables
     from sfm.survey.rigs import planned_mounts
-    from sfm.survey.target_network import with_given_mounts
 
     survey = read_survey(path)
     if survey.unit != unit:

@@ -73,8 +73,8 @@ def refine(
         from sfm.report.refinement import Numbers, describe_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import read_survey
+        from sfm.survey.refining.oriented_windows import measure_model_targets
         from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
-        from sfm.survey.refining.targets import measure_model_targets
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
     refuse_unwritable(out)

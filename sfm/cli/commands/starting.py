@@ -1,19 +1,49 @@
 """The first second of a command, and Ctrl-C at any moment.
 
 The first command of an installation, which compiles the kernels, all cores at it.
+
+The command that looks at an installation: what is there, where things are kept, whether it measures.
 """
 
 from __future__ import annotations
 
 import atexit
 import os
+import platform
+import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
+from rich.console import Console
+from rich.table import Table
+
+from sfm.display import counted
+from sfm.errors import KolinearError, MissingLibraryError
+
+if TYPE_CHECKING:
+    from sfm.adjustment.result import Adjustment
+    from sfm.network import Estimate
+
+LIBRARIES = (
+    "kolinear",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "numba",
+    "pycolmap",
+    "distributed",
+)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "msedge")
+MIN_FREE_GB = 1.0
+CENTRE_PX = 0.1  # largest error of a drawn dot
 FAILED = 1  # exit code where a result is not dependable, or a check fails
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
 INTERRUPTED_TEXT = "kolinear: interrupted, nothing half-done is left (batch --resume goes on)"
@@ -92,7 +122,7 @@ def _announce_compiling() -> None:
 
 def compile_first() -> None:
     """Compile the kernels of a survey unless it was done for these sources, and report it on stderr."""
-    from sfm.kernels.compiling import is_warm
+    from sfm.kernels.warmed import is_warm
 
     if is_warm():
         return
@@ -102,3 +132,127 @@ def compile_first() -> None:
     print("kolinear: compiling the kernels, once, a minute or two", file=sys.stderr, flush=True)
     with drawn_progress() as drawn:
         warm_up.main(drawn)
+
+
+def doctor() -> None:
+    """Check this installation by a short measurement and adjustment.
+
+    Prints versions, cores and folders, too. Exit code 1 if a check fails; the line states what to do.
+    """
+    with loading():
+        from sfm.files.user_cache import user_folder
+        from sfm.kernels.compiling import KEPT
+        from sfm.kernels.threads import cores
+        from sfm.kernels.warmed import is_warm
+
+    console = Console(highlight=False)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row("python", f"{platform.python_version()}, {platform.system()} {platform.machine()}")
+    for name in LIBRARIES:
+        table.add_row(name, _version(name))
+    table.add_row("cores", str(cores()))
+    table.add_row("memory", _memory())
+    table.add_row("browser", next((name for name in BROWSERS if shutil.which(name)), "none found by name"))
+    table.add_row("kernels", f"{KEPT}, {'compiled' if is_warm() else 'not yet compiled'}")
+    store = user_folder("measured", "measured points")
+    table.add_row("measured points", f"{store}, {_megabytes(store):.0f} MB")
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    table.add_row("free space", f"{free:.1f} GB in {Path.cwd()}")
+    console.print(table)
+    failed = [] if free > MIN_FREE_GB else [f"only {free:.1f} GB are free here, results need room"]
+    compile_first()
+    begun = time.perf_counter()
+    for name, check in CHECKS:
+        try:
+            console.print(f"{name}: {check()}")
+        except MissingLibraryError as error:  # of an extra, which a sound installation need not have
+            console.print(f"{name}: no comparison, {error}", markup=False)
+        except KolinearError as error:
+            failed.append(f"{name}: {error}")
+    console.print(f"self-test: {time.perf_counter() - begun:.1f} s")
+    for line in failed:
+        console.print(f"! {line}", style="red")
+    if failed:
+        raise SystemExit(FAILED)
+    console.print("This installation works.", style="green")
+
+
+def _check_targets() -> str:
+    """Measure four drawn dots of known places."""
+    import numpy as np
+
+    from sfm.targets.detect import find_targets
+    from sfm.warm_up import DOTS, drawn_photograph
+
+    found = find_targets(drawn_photograph(False), polarity="dark", codes="ring14")
+    if len(found) != len(DOTS):
+        raise KolinearError(f"{len(found)} of {len(DOTS)} dots found")
+    centres = np.array(DOTS)
+    error = np.linalg.norm(found.xy[:, None] - centres, axis=2).min(axis=1).max()
+    if error > CENTRE_PX:
+        raise KolinearError(f"a dot is {error:.3f} px off, expected {CENTRE_PX} px at most")
+    return f"{counted(len(found), 'dot')} measured, {error:.4f} px off at most"
+
+
+@cache
+def _tested_network() -> tuple[Adjustment, Estimate]:
+    """Adjust a made-up network; with its truth, for both checks of it."""
+    from sfm.adjustment.datum import Datum
+    from sfm.adjustment.solve import adjust
+    from sfm.warm_up import made_up_network
+
+    network, truth = made_up_network()
+    return adjust(network, truth, datum=Datum("free")), truth
+
+
+def _check_adjustment() -> str:
+    """Compare the adjustment of a made-up network with the truth."""
+    import numpy as np
+
+    from sfm.remarks.kind import WRONG_SIGMAS
+
+    found, truth = _tested_network()
+    if not found.converged:
+        raise KolinearError("the adjustment did not converge")
+    moved = np.linalg.norm(found.estimate.points - truth.points, axis=1)
+    sigma = np.sqrt(np.trace(found.covariance.points, axis1=1, axis2=2))
+    worst = float((moved / sigma).max())
+    if worst > WRONG_SIGMAS:
+        raise KolinearError(f"a point is {worst:.1f} standard deviations off")
+    return f"{counted(len(truth.points), 'point')}, worst {worst:.1f} standard deviations off"
+
+
+def _check_colmap() -> str:
+    """Adjust the same network by COLMAP and compare."""
+    from sfm.api import programs_of
+    from sfm.comparison.two_adjusters.adjusters import compare_adjusters
+
+    adjuster = programs_of("colmap", "none").adjuster
+    assert adjuster is not None
+    if not compare_adjusters(_tested_network()[0], adjuster).agree:
+        raise KolinearError("its adjustment of a made-up network differs from Kolinear's")
+    return f"version {_version('pycolmap')} agrees on the same network"
+
+
+CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
+    ("targets", _check_targets),
+    ("adjustment", _check_adjustment),
+    ("colmap", _check_colmap),
+)
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _memory() -> str:
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return "unknown"
+    return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+
+
+def _megabytes(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6

@@ -212,17 +212,16 @@ def _run_survey(
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import print_result
-        from sfm.files.globs import nearest_name
+        from sfm.files.plain_text import nearest_name
         from sfm.kernels.threads import cores
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
-        from sfm.report.findings.findings import findings_of
-        from sfm.report.log import SurveyLog
-        from sfm.report.output import Origin, refuse_other_origin, write_result
+        from sfm.report.findings.survey_remarks import findings_of
+        from sfm.report.output import Origin, SurveyLog, refuse_other_origin, write_result
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.drafting.draft import SUFFIXES
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
-        from sfm.survey.inputs.photograph_list import find_photographs
+        from sfm.survey.inputs.measurements import find_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
@@ -297,7 +296,7 @@ def _run_survey(
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.files.manifest import refuse_foreign_folder
+    from sfm.files.open_folders import refuse_foreign_folder
     from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out

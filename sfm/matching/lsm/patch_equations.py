@@ -19,7 +19,7 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.kernels.compiling import compiled, compiled_fast
 from sfm.kernels.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, sample
 from sfm.kernels.small_algebra import factorise
-from sfm.matching.match_flags import FLAT_TEXTURE, MATCHED, OUTSIDE
+from sfm.matching.correlation import FLAT_TEXTURE, MATCHED, OUTSIDE
 
 MAX_STRETCH = 3.0  # ratio of lengths, of a patch in both photographs, that is a match no more
 MODELS = {"shift": 2, "affine": 6, "projective": 8}  # geometric parameters

@@ -12,8 +12,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
-from sfm.orientation.homography import PLANAR_POINTS
-from sfm.orientation.image_rays import image_tangents
+from sfm.orientation.image_rays import PLANAR_POINTS, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.ransac import resect_robust

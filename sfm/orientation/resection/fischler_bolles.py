@@ -10,8 +10,8 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled_fused
-from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.candidates import ResectionSolution, checked_points, ordered, solution_of
+from sfm.kernels.small_algebra import MAX_ROOTS, find_positive_roots
+from sfm.orientation.resection.least_squares import ResectionSolution, checked_points, ordered, solution_of
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # numbers of scratch space

@@ -6,6 +6,20 @@ of the network so far. Figures of the design always are of the full covariance.
 
 Source: Fraser (1984) (zero- to first-order design); Fedorov (1972), Theory of Optimal Experiments (greedy
 choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing cameras).
+
+Candidates for stations: where one may stand, and where to look from there.
+
+Source: van der Corput, Halton (1960), Numer. Math. 2 (evenly spread positions).
+
+Gain of one more photograph for the points that it shows, the orientations of all photographs held.
+
+Each image point adds A'PA to the 3 x 3 normal matrix of its point, so that the gain of every candidate
+follows from updates of rank 2, without any system of equations: limiting error propagation.
+
+    Q' = Q - Q A' (P^-1 + A Q A')^-1 A Q
+
+Source: Fraser (1987), Photogramm. Eng. Remote Sens. 53(5) (limiting error propagation); Foerstner and Wrobel
+(2016), sec. 4.2.7 (recursive estimation).
 """
 
 from __future__ import annotations
@@ -16,27 +30,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.arguments import checked_arguments
-from sfm.camera import Camera
+from sfm.camera import Camera, pixel_jacobian
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
+from sfm.kernels.compiling import compiled
 from sfm.network import Network
-from sfm.planning.design.candidates import (
-    COUNT,
-    Candidates,
-    StationLimits,
-    candidates,
-    cost_of,
-    gains,
-    image_rows,
+from sfm.planning.planned_object import PlannedObject, farthest_points
+from sfm.planning.prediction import (
+    MIN_RAYS,
+    Prediction,
+    ScaleBarPlan,
+    WantedPrecision,
+    predict_network,
+    short_of,
 )
-from sfm.planning.planned_object import PlannedObject
-from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
-from sfm.planning.sight.visibility import Seeing
-from sfm.planning.wanted import MIN_RAYS, WantedPrecision, short_of
+from sfm.planning.sight.visibility import Seeing, Sight, sight_of
+from sfm.planning.stations import Stations, filling_distance, looking, rolled
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
 
+POWER = 4  # of the variances in the sum that represents the worst: smooth, so that ties are broken
+COUNT = 300  # stations that the designer chooses from, each upright and rolled
+DISTANCES = (0.75, 1.25)  # of that at which the object fills the photograph, by default
+AIMS = 8  # parts of the object that a station may look at, besides its middle
+TRIES = 60  # positions tried for each that is wanted, until no room is reported
+MIN_POINTS = 4  # points that a candidate must show
+BASES = (2, 3, 5)
 MIN_PHOTOGRAPHS = 4  # photographs of a network whose gross errors can be found
 MAX_PHOTOGRAPHS = 100
 SWEEPS = 3  # exchanges of all stations at most
@@ -254,3 +274,209 @@ class _Designer:
     def _worst(self, prediction: Prediction) -> str:
         j = int(np.argmax(np.where(self.seeable, prediction.sigma, -1.0)))
         return f"{self.planned.names[j]} ({reason_of(prediction, j)})"
+
+
+@dataclass(frozen=True)
+class StationLimits:
+    """Where one may stand."""
+
+    distance: tuple[float, float] | None = None  # to the nearest point of the object, least and most, object
+    # unit; None = as fills the photographs
+    space: FloatArray | None = None  # least and largest X, Y, Z of a station, object unit, (2, 3)
+    floor: float | None = None  # least Z of a station, object unit
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Stations to choose from: the upright ones, then the same rolled by 90 deg."""
+
+    stations: Stations
+    sight: Sight
+
+    @property
+    def count(self) -> int:
+        """How many different stations there are."""
+        return len(self.stations) // 2
+
+
+def candidates(
+    planned: PlannedObject, camera: Camera, allowed: StationLimits, seeing: Seeing, *, count: int = COUNT
+) -> Candidates:
+    """Return stations that may be taken, spread evenly over the room that is allowed.
+
+    From each place a camera looks at the middle of the object or at the part where it shows most points.
+
+    Args:
+        planned: the object.
+        camera: interior orientation.
+        allowed: where one may stand.
+        seeing: what is seen.
+        count: stations, each upright and rolled.
+
+    Raises:
+        GeometryError: no room, or nothing is seen from where one may stand.
+    """
+    least, most = _distances(planned, camera, allowed)
+    low, high = _room(planned, allowed, most)
+    aims = np.concatenate([planned.centre[None], planned.xyz[farthest_points(planned.xyz, AIMS)]])
+    sees_all = float(np.linalg.norm(np.array(camera.size_px)) / camera.c_px)
+    position, rotation, counted = [], [], 0
+    tried = _halton(TRIES * count) * (high - low) + low
+    inside = 0
+    for place in tried:
+        if counted == count:
+            break
+        away = planned.xyz - place
+        nearest = np.linalg.norm(away, axis=1).min()
+        if not least <= nearest <= most:
+            continue
+        inside += 1
+        faced = (planned.normals * -away).sum(axis=1) > 0
+        faced |= np.isnan(planned.normals[:, 0])
+        if faced.sum() < MIN_POINTS:
+            continue
+        near = planned.size / nearest > sees_all  # the object does not fit in a photograph from here
+        aimed_at = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
+        ways = np.array([looking(aim - place) for aim in aimed_at])
+        shown = sight_of(planned, camera, np.tile(place, (len(ways), 1)), ways, seeing).seen.sum(axis=1)
+        best = int(np.argmax(shown))
+        if shown[best] < MIN_POINTS:
+            continue
+        if near and counted % 2:  # half of them look elsewhere, so that neighbours overlap in several ways
+            others = np.flatnonzero(shown >= max(MIN_POINTS, shown[best] / 2))
+            best = int(others[counted // 2 % len(others)])
+        position.append(place)
+        rotation.append(ways[best])
+        counted += 1
+    if counted < 2:
+        raise GeometryError(_no_room(planned, least, most, inside))
+    places, ways = np.array(position), np.array(rotation)
+    names = tuple(f"{k + 1}" for k in range(2 * counted))
+    stations = Stations(names, np.tile(places, (2, 1)), np.concatenate([ways, rolled(ways)]))
+    return Candidates(stations, sight_of(planned, camera, stations.position, stations.rotation, seeing))
+
+
+def _distances(planned: PlannedObject, camera: Camera, allowed: StationLimits) -> tuple[float, float]:
+    """Return least and largest distance to the nearest point of the object."""
+    if allowed.distance is not None:
+        least, most = allowed.distance
+        if not 0 < least < most:
+            raise GeometryError(f"plan: distances {least:g} to {most:g}, needed 0 < least < most")
+        return least, most
+    ways = [looking(np.array(way)) for way in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0), (1.0, 1.0, -1.0))]
+    fills = max(filling_distance(planned, camera, R) for R in ways)
+    return DISTANCES[0] * fills - planned.size / 2 if fills > planned.size else 0.2 * fills, (
+        DISTANCES[1] * fills
+    )
+
+
+def _room(planned: PlannedObject, allowed: StationLimits, most: float) -> tuple[FloatArray, FloatArray]:
+    low, high = planned.xyz.min(axis=0) - most, planned.xyz.max(axis=0) + most
+    if allowed.space is not None:
+        if not (allowed.space[0] < allowed.space[1]).all():
+            raise GeometryError("plan: the space to stand in has a side without length, needed X0 < X1")
+        low, high = np.maximum(low, allowed.space[0]), np.minimum(high, allowed.space[1])
+    if allowed.floor is not None:
+        if not np.isfinite(allowed.floor):
+            raise GeometryError(f"plan: floor at {allowed.floor:g}, expected a finite number")
+        low[2] = max(low[2], allowed.floor)
+    if not (low < high).all():
+        raise GeometryError(
+            f"plan: no room within {most:g} of the object in the space and above the floor that are allowed; "
+            "needed a space that reaches to the object"
+        )
+    return low, high
+
+
+def _no_room(planned: PlannedObject, least: float, most: float, inside: int) -> str:
+    if not inside:
+        return (
+            f"plan: no station is {least:g} to {most:g} from the object in the space that is allowed; needed "
+            "another distance or space"
+        )
+    return (
+        f"plan: of {inside} places that are allowed fewer than 2 show {MIN_POINTS} points; the object faces "
+        "away, or is too far, too oblique or not sharp from there"
+    )
+
+
+def _halton(count: int) -> FloatArray:
+    """Return evenly spread points of the unit cube, (count, 3)."""
+    out = np.zeros((count, 3))
+    for axis, base in enumerate(BASES):
+        rest, share = np.arange(1, count + 1), 1.0
+        while rest.any():
+            share /= base
+            out[:, axis] += share * (rest % base)
+            rest //= base
+    return out
+
+
+def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight: Sight) -> FloatArray:
+    """Return A of every image point over its standard deviation, 0 where it is not seen, (m, n, 2, 3)."""
+    m, n = sight.why.shape
+    rows = np.zeros((m, n, 2, 3))
+    for i in range(m):
+        used = np.flatnonzero(sight.seen[i])
+        if not len(used):
+            continue
+        R = stations.rotation[i]
+        U, V, W = ((planned.xyz[used] - stations.position[i]) @ R).T
+        zero = np.zeros(len(used))
+        of_tangents = np.stack(
+            [np.stack([-1 / W, zero, U / W**2], axis=1), np.stack([zero, -1 / W, V / W**2], axis=1)], axis=1
+        )
+        A = pixel_jacobian(camera, sight.xy[i, used]) @ of_tangents @ R.T
+        whitening = np.linalg.inv(np.linalg.cholesky(sight.covariance[i, used]))
+        rows[i, used] = whitening @ A
+    return rows
+
+
+def cost_of(variance: FloatArray, scale: FloatArray) -> float:
+    """Return the sum of the variances of points over what is wanted, each to a power."""
+    return float(((variance * scale) ** POWER).sum())
+
+
+def gains(Q: FloatArray, rows: FloatArray, scale: FloatArray, open_: BoolArray) -> FloatArray:
+    """Return by how much each candidate reduces the cost, (m,); -1 where it may not be taken.
+
+    Args:
+        Q: covariance of each point, object unit^2, (n, 3, 3).
+        rows: of the candidates, see `image_rows`, (m, n, 2, 3).
+        scale: 1 over the variance that is wanted of each point, (n,).
+        open_: which candidates may be taken, (m,).
+    """
+    return np.asarray(_gains(Q, rows, scale, open_))
+
+
+@compiled
+def _gains(Q: FloatArray, rows: FloatArray, scale: FloatArray, open_: BoolArray) -> FloatArray:
+    m, n = rows.shape[0], rows.shape[1]
+    out = np.full(m, -1.0)
+    QA = np.empty((3, 2))
+    for c in range(m):
+        if not open_[c]:
+            continue
+        total = 0.0
+        for j in range(n):
+            A = rows[c, j]
+            if A[0, 0] == 0.0 and A[0, 1] == 0.0 and A[0, 2] == 0.0:
+                continue
+            for i in range(3):
+                for a in range(2):
+                    QA[i, a] = Q[j, i, 0] * A[a, 0] + Q[j, i, 1] * A[a, 1] + Q[j, i, 2] * A[a, 2]
+            s00, s01, s11 = 1.0, 0.0, 1.0
+            g00, g01, g11 = 0.0, 0.0, 0.0
+            for i in range(3):
+                s00 += A[0, i] * QA[i, 0]
+                s01 += A[0, i] * QA[i, 1]
+                s11 += A[1, i] * QA[i, 1]
+                g00 += QA[i, 0] * QA[i, 0]
+                g01 += QA[i, 0] * QA[i, 1]
+                g11 += QA[i, 1] * QA[i, 1]
+            drop = (s11 * g00 - 2.0 * s01 * g01 + s00 * g11) / (s00 * s11 - s01 * s01)
+            before = scale[j] * (Q[j, 0, 0] + Q[j, 1, 1] + Q[j, 2, 2]) / 3.0
+            after = max(before - scale[j] * drop / 3.0, 0.0)
+            total += before**4 - after**4
+        out[c] = total
+    return out

@@ -34,8 +34,7 @@ from sfm.arguments import checked_arguments
 from sfm.camera import Camera, pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.planning.planned_object import PlannedObject
-from sfm.planning.sight.occlusion import hidden_points
+from sfm.planning.planned_object import PlannedObject, hidden_points
 
 STEEPEST_DEG = 75.0  # beyond, a target is not recognised
 STEPS = 24  # round an ellipse; the integrand is smooth and periodic

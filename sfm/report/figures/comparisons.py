@@ -36,7 +36,7 @@ from sfm.report.figures.plots import (
     plan_axes,
     plot,
 )
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.phrases import finer_unit, significant
 
 BINS = 30
 COLOURS = ((IN, GREEN), (OUT, RED))

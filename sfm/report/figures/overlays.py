@@ -21,7 +21,7 @@ from sfm.matching.conjugate_patches import ConjugatePoints
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets, SurveyResult, in_words
 from sfm.runtime.progress import SILENT, Progress
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 PANEL = 168  # least side of a patch in the picture, px
 ZOOM = 8  # least side of one of its pixels, px

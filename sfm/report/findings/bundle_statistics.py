@@ -42,12 +42,10 @@ from sfm.adjustment.quality.variance_components import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
-from sfm.observations.control import ObjectPoints
-from sfm.observations.interior import InteriorObservations
-from sfm.observations.scale_bars import ScaleBars
+from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.findings.calibrated_cameras import families, family_of_photographs
-from sfm.report.findings.precision import rms_of_groups
+from sfm.report.findings.checks import rms_of_groups
 from sfm.result import SurveyResult
 
 WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across

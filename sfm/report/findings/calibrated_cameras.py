@@ -1,6 +1,8 @@
 """The cameras of a calibration: what matters in a result whose points are given, as those of a plate.
 
 Interior orientation as people ask for it: every parameter once, whoever shares it.
+
+Where the cameras of rigs are mounted: base and angles from the reference camera.
 """
 
 from __future__ import annotations
@@ -11,11 +13,14 @@ import numpy as np
 
 from sfm.adjustment.quality.correlations import observed_part, projection_map
 from sfm.adjustment.result import Adjustment
-from sfm.camera import Camera, camera_families
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.camera import Camera, camera_families, tangents_from_pixel
+from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.distortion.models import MODELS, Parameter, Role
-from sfm.report.findings.precision import root_mean_square
+from sfm.matching.epipolar import essential_matrices
+from sfm.report.findings.checks import root_mean_square
 from sfm.result import SeenPlate, SurveyResult
+
+TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
@@ -233,3 +238,110 @@ def family_of_photographs(adjustment: Adjustment) -> IntArray:
     """Return the index of the family of cameras that each photograph was taken with, (m,)."""
     network = adjustment.network
     return camera_families(adjustment.estimate.cameras, network.camera)[1][network.camera]
+
+
+@dataclass(frozen=True)
+class EpipolarDistances:
+    """Distances of image points from the epipolar lines of the same points in the reference camera."""
+
+    xy: FloatArray  # image points that both saw at one moment, px, (k, 2)
+    px: FloatArray  # their distances, (k,)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance, px; NaN without image points."""
+        return float(np.sqrt(np.mean(self.px**2))) if len(self.px) else float("nan")
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera in the axes of its rig, which are the image axes of the reference camera."""
+
+    camera: str
+    base: float  # distance from the projection centre of the reference camera, object unit
+    base_sigma: float
+    position: FloatArray  # X, Y, Z of the projection centre, object unit, (3,)
+    position_sigma: FloatArray  # (3,)
+    rotation_deg: FloatArray  # omega, phi, kappa of R, image axes to those of the rig, deg, (3,)
+    rotation_sigma_deg: FloatArray  # (3,)
+    epipolar: EpipolarDistances | None  # None where image points are planned
+
+    @property
+    def values(self) -> tuple[tuple[str, float, float, bool], ...]:
+        """Name, value, standard deviation, and whether it is a length, of base, position and rotation."""
+        names = ("X", "Y", "Z"), ("omega", "phi", "kappa")
+        position = zip(names[0], self.position.tolist(), self.position_sigma.tolist(), strict=True)
+        rotation = zip(names[1], self.rotation_deg.tolist(), self.rotation_sigma_deg.tolist(), strict=True)
+        return (
+            ("base", self.base, self.base_sigma, True),
+            *((name, value, sigma, True) for name, value, sigma in position),
+            *((name, value, sigma, False) for name, value, sigma in rotation),
+        )
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rig: its reference camera, the mounts of the others, and how often it was used."""
+
+    name: str
+    reference: str
+    mounts: tuple[Mount, ...]
+    moments: int  # with photographs of two cameras at least
+
+
+def rigs_of(a: Adjustment, *, planned: bool = False) -> tuple[Rig, ...]:
+    """Return the rigs of an adjustment; of one that is planned without distances from epipolar lines."""
+    mounts, moment = a.estimate.mounts, a.network.moment
+    if mounts is None or moment is None:
+        return ()
+    found = []
+    for rig, (reference, *others_on) in mounts.by_rig().items():
+        of_rig = np.isin(a.network.camera, [reference, *others_on])
+        others = tuple(
+            _mount(a, k, None if planned else _epipolar(a, reference, k, moment)) for k in others_on
+        )
+        shared = int((np.bincount(moment[of_rig]) > 1).sum())
+        found.append(Rig(rig, a.estimate.cameras[reference].name, others, shared))
+    return tuple(found)
+
+
+def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> EpipolarDistances:
+    """Return the distances of image points of a camera from epipolar lines of its reference camera.
+
+    Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.3.2 (coplanarity).
+    """
+    mounts, k = a.estimate.mounts, a.network.image_points
+    assert mounts is not None
+    rows = [np.flatnonzero(~a.rejected & (a.network.camera[k.image] == of)) for of in (reference, camera)]
+    keys = [moment[k.image[some]] * len(a.network.points) + k.point[some] for some in rows]
+    _, *common = np.intersect1d(keys[0], keys[1], return_indices=True)
+    first, second = (some[at] for some, at in zip(rows, common, strict=True))
+    d1, d2 = (
+        np.column_stack([tangents_from_pixel(a.estimate.cameras[of], k.xy[at]), -np.ones(len(at))])
+        for of, at in ((reference, first), (camera, second))
+    )
+    pair = [reference, camera]
+    (E,) = essential_matrices(mounts.position[pair], mounts.rotation[pair], np.array([[0, 1]]))
+    line = d1 @ E.T
+    away = np.einsum("ka,ka->k", line, d2) / np.maximum(np.hypot(line[:, 0], line[:, 1]), TINY)
+    known = np.isfinite(away)
+    return EpipolarDistances(k.xy[second][known], a.estimate.cameras[camera].c_px * away[known])
+
+
+def _mount(a: Adjustment, camera: int, epipolar: EpipolarDistances | None) -> Mount:
+    mounts, Q = a.estimate.mounts, a.covariance.mounts[camera]
+    assert mounts is not None
+    X = mounts.position[camera]
+    base = float(np.linalg.norm(X))
+    along = X / max(base, TINY)
+    sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
+    return Mount(
+        a.estimate.cameras[camera].name,
+        base,
+        float(np.sqrt(max(along @ Q[:3, :3] @ along, 0.0))),
+        X,
+        sigma[:3],
+        np.degrees(angles_from_rotation(mounts.rotation[camera])),
+        np.degrees(sigma[3:]),
+        epipolar,
+    )

@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm.adjustment.quality.gross_errors.robust import HUBER, TUKEY
-from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import f_sf
 from sfm.report.findings.bundle_statistics import Given
-from sfm.report.findings.precision import standard_deviations
+from sfm.report.findings.checks import standard_deviations
 from sfm.result import ControlCheck, SurveyResult
 
 EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken

@@ -6,16 +6,22 @@ Given values are judged by the image points alone before they take part; these a
 took part, and of those that only check the result. Given interior orientation is not tested here: whether it
 is wrong is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object
 points.
+
+Everything that the reports of a survey state, computed once: Findings.
+
+Whatever prints a result takes its numbers from here: statistics, checks, geometry, given values, precision,
+protocol, verdict.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.consistency import FAMILY, Consistency
+from sfm.adjustment.quality.consistency import FAMILY, Consistency, consistency_of
 from sfm.adjustment.quality.given_values import LEVEL
 from sfm.adjustment.quality.statistics import ALPHA, component_tests, more_than_chance, robust_test
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
@@ -26,12 +32,39 @@ from sfm.distributions import normal_ppf
 from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark, unless_note
-from sfm.remarks.verdict import Level
-from sfm.report.findings.bundle_statistics import Given, Statistics
-from sfm.report.findings.checks import LongestResidual, Sigma0
-from sfm.report.findings.protocol import ControlCoordinate
+from sfm.remarks.verdict import Level, Verdict, judge
+from sfm.report.findings.bundle_statistics import (
+    Geometry,
+    Given,
+    Statistics,
+    geometry_of,
+    given_of,
+    statistics_of,
+)
+from sfm.report.findings.calibrated_cameras import (
+    CalibratedCamera,
+    InteriorOrientation,
+    Rig,
+    calibrated_cameras,
+    interior_of,
+    rigs_of,
+)
+from sfm.report.findings.camera_remarks import camera_remarks, edges_of, sharpness_remarks
+from sfm.report.findings.checks import (
+    LongestResidual,
+    ObservationCounts,
+    Precision,
+    Sigma0,
+    count_observations,
+    largest_residuals,
+    longest_residual,
+    precision_of,
+    sigma0_of,
+)
+from sfm.report.findings.protocol import ControlCoordinate, Protocol, check_coordinates, protocol_of
 from sfm.result import SurveyResult
 
+UNCODED = -1
 MM = 1e-3  # m
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # The rest of the error of a value that is checked less is below the rounding and the neglected second
@@ -354,3 +387,76 @@ def _scale(result: SurveyResult) -> tuple[Remark, ...]:
     if not largest > MAX_MAGNIFICATION:
         return ()
     return (remark("scale_implausible", distance=(nearest / MM, "mm"), magnification=largest),)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A result and everything that is reported of it."""
+
+    result: SurveyResult
+    verdict: Verdict
+    sigma0: Sigma0
+    counts: ObservationCounts
+    longest: LongestResidual  # in standard deviations, of the accepted image points
+    largest: tuple[tuple[Any, ...], ...]  # photograph, point, vx and vy in px, w, tau of the accepted
+    statistics: Statistics
+    geometry: Geometry
+    interior: InteriorOrientation
+    calibrated: tuple[CalibratedCamera, ...]  # where the cameras are the result
+    given: Given
+    rigs: tuple[Rig, ...]
+    precision: Precision
+    object_size: float  # diagonal of the box around the points, object unit
+    consistency: Consistency  # tests of points and photographs
+    edges: Mapping[str, float]  # blur of each photograph with measured edges, px
+    protocol: Protocol  # entries of a bundle protocol
+
+
+def with_remark(findings: Findings, new: Remark) -> Findings:
+    """Return findings with one remark more, and the verdict that follows."""
+    result = findings.result
+    verdict = judge((*findings.verdict.remarks, new), headlines_of(result))
+    return replace(findings, result=replace(result, remarks=(*result.remarks, new)), verdict=verdict)
+
+
+def findings_of(result: SurveyResult) -> Findings:
+    """Return everything that the reports state of a result."""
+    a = result.adjustment
+    sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
+    given = given_of(a, result.length_unit)
+    consistency, edges = consistency_of(a), edges_of(result.photographs)
+    geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
+    calibrated = calibrated_cameras(result, interior)
+    remarks = (
+        *adjustment_remarks(a),
+        *photograph_remarks(result),
+        *result.remarks,
+        *other_solution_remarks(result),
+        *sigma0_remarks(sigma0, statistics, a),
+        *residual_remarks(result, longest),
+        *ray_remarks(a),
+        *consistency_remarks(consistency),
+        *sharpness_remarks(result, edges, consistency),
+        *camera_remarks(result, calibrated),
+        *given_remarks(result, given, statistics, check_coordinates(result)),
+        *comparison_remarks(result),
+    )
+    return Findings(
+        result=result,
+        verdict=judge(remarks, headlines_of(result)),
+        sigma0=sigma0,
+        counts=count_observations(a),
+        longest=longest,
+        largest=largest_residuals(a),
+        statistics=statistics,
+        geometry=geometry,
+        interior=interior,
+        calibrated=calibrated,
+        given=given,
+        rigs=rigs_of(a),
+        precision=precision,
+        object_size=float(np.linalg.norm(np.ptp(a.estimate.points, axis=0))),
+        consistency=consistency,
+        edges=edges,
+        protocol=protocol_of(result, given),
+    )

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.reliability import MIN_CHECKED_REDUNDANCY
+from sfm.adjustment.quality.statistics import MIN_CHECKED_REDUNDANCY
 from sfm.adjustment.result import Adjustment
 from sfm.camera import base_name
 from sfm.conventions import FloatArray
-from sfm.distortion.balanced import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
-from sfm.distortion.balanced import MODEL as BALANCED_MODEL
+from sfm.distortion.brown import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
+from sfm.distortion.brown import MODEL as BALANCED_MODEL
 from sfm.errors import GeometryError
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
@@ -23,7 +23,7 @@ from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.given_residuals import given_rows
 from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
-from sfm.report.findings.findings import Findings
+from sfm.report.findings.survey_remarks import Findings
 from sfm.result import SurveyResult
 from sfm.solution import MEASURED
 

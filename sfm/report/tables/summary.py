@@ -19,9 +19,9 @@ from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings.bundle_statistics import Given, Spread, spread
-from sfm.report.findings.findings import Findings
-from sfm.report.findings.precision import point_sigma
-from sfm.report.findings.rigs import Rig
+from sfm.report.findings.calibrated_cameras import Rig
+from sfm.report.findings.checks import point_sigma
+from sfm.report.findings.survey_remarks import Findings
 from sfm.report.page import plain, values_of
 from sfm.report.phrases import describe_test, describe_weights
 from sfm.result import SurveyResult

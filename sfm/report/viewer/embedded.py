@@ -9,6 +9,10 @@ A scene as text inside a page: names as JSON, numbers as arrays, gzip, base64.
 The header names them as [type, first byte, values]. Its reader is viewer/src/data.js.
 
 Source: RFC 1952 (gzip), RFC 4648 (base64).
+
+The scene of any solution: a survey's result, tables, a COLMAP model or another program's.
+
+Scenes of what follows from solutions: displacements, measurements and plans.
 """
 
 from __future__ import annotations
@@ -16,21 +20,49 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
 
-from sfm.conventions import AnyArray, angles_from_rotation
+from sfm.camera import project
+from sfm.comparison.stable_points import point_blocks
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import or_none
-from sfm.report.numbers import finer_unit
-from sfm.report.viewer.pictures import COLUMNS, CROP_PX, Pictures
-from sfm.report.viewer.scene import ViewerScene
+from sfm.geometry.tolerance import Deviations
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.image_rays import ray_angles
+from sfm.report.figures.overlays import nearest_image_points
+from sfm.report.findings.checks import rms_of_groups
+from sfm.report.findings.survey_remarks import Findings
+from sfm.report.phrases import finer_unit
+from sfm.report.viewer.pictures import (
+    COLUMNS,
+    CROP_PX,
+    Bar,
+    Marks,
+    Pictures,
+    Rays,
+    ViewerScene,
+    cut_pictures,
+    distance_sigmas,
+)
+from sfm.result import likest_first
+from sfm.solution import SeenTargets, Solution
 
+if TYPE_CHECKING:
+    from sfm.epochs.displacements import Displacements
+    from sfm.epochs.series import EpochSeries
+    from sfm.geometry.shapes.fit import ShapeFit
+    from sfm.inspection.measure import Measurement
+    from sfm.planning.plan import Plan
+
+MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
+UNUSED = "measured, not part of the result"
 ALIGNED = 8  # bytes
 TYPES = {"f8": "<f8", "f4": "<f4", "u4": "<u4", "u1": "|u1"}
 NO_CROP = "no picture: it is neither in this page nor beside it"
@@ -171,3 +203,249 @@ def _packed(header: dict[str, Any], arrays: dict[str, tuple[str, AnyArray]]) -> 
     text = head(start)
     data = len(text).to_bytes(4, "little") + text + body
     return base64.b64encode(gzip.compress(data, compresslevel=6, mtime=0)).decode()
+
+
+def scene_of_result(findings: Findings) -> ViewerScene:
+    """Return what the viewer shows of a survey, with what was measured and rejected in its photographs."""
+    result, a = findings.result, findings.result.adjustment
+    names, check = a.network.points, result.control_check
+    scene = scene_of_stored(
+        replace(result.solution.with_joint_covariance, network=a.network),
+        w=a.standardised if len(a.standardised) == len(a.rejected) else None,
+        rejected=a.rejected,
+        seen_targets=result.seen_targets,
+        residuals=a.residuals,
+    )
+    checked = () if check is None else tuple(names.index(name) for name in check.points if name in names)
+    return replace(scene, exterior_sigma=findings.precision.exterior_deg, control=scene.control or checked)
+
+
+def scene_of_stored(
+    stored: Solution,
+    *,
+    w: FloatArray | None = None,
+    rejected: BoolArray | None = None,
+    seen_targets: SeenTargets | None = None,
+    residuals: FloatArray | None = None,
+) -> ViewerScene:
+    """Return what the viewer shows of a result; photographs and points without coordinates are left out.
+
+    Args:
+        stored: the result, rejected image points included where `rejected` names them.
+        w: Baarda's w of its image points, where known, (k, 2).
+        rejected: which of its image points took no part; none if not given, (k,).
+        seen_targets: outlines of its targets and what else was seen in its photographs, where known.
+        residuals: computed minus measured, px, (k, 2); by projection if not given.
+    """
+    network, estimate = stored.network, stored.estimate
+    seen = network.image_points
+    oriented, determined = np.flatnonzero(estimate.oriented), np.flatnonzero(estimate.determined)
+    rejected = np.zeros(len(seen), dtype=bool) if rejected is None else rejected
+    w = np.full((len(seen), 2), np.nan) if w is None else w
+    kept = np.flatnonzero(estimate.oriented[seen.image] & estimate.determined[seen.point])
+    kept = kept[np.lexsort((seen.image[kept], seen.point[kept]))]
+    v = (_residuals(stored, seen) if residuals is None else residuals)[kept]
+    point = np.searchsorted(determined, seen.point[kept])
+    photo = np.searchsorted(oriented, seen.image[kept])
+    used = ~rejected[kept]
+    ellipse, marks = np.full((len(kept), 3), np.nan), Marks.none()
+    if seen_targets is not None:
+        there = np.flatnonzero(estimate.oriented[seen_targets.image])
+        shown = SeenTargets(
+            np.searchsorted(oriented, seen_targets.image[there]),
+            seen_targets.xy[there],
+            seen_targets.ellipse[there],
+            tuple(seen_targets.reason[k] for k in there),
+        )
+        ellipse, marks = joined_targets(shown, photo, seen.xy[kept])
+    rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, ellipse)
+    use = np.zeros(len(seen), dtype=bool)
+    use[kept[used]] = True
+    n, m = len(determined), len(oriented)
+    xyz = estimate.points[determined]
+    covariance = np.full((n, 3, 3), np.nan)
+    if stored.point_covariance is not None:
+        covariance = stored.point_covariance[determined]
+    sigma = np.full((m, 6), np.nan)
+    if stored.position_covariance is not None:
+        sigma[:, :3] = np.sqrt(np.diagonal(stored.position_covariance[oriented], axis1=1, axis2=2))
+    joint = stored.covariance
+    bars, place = network.scale_bars, {int(j): k for k, j in enumerate(determined)}
+    notes = []
+    for kind, found, names in (
+        ("photographs", oriented, network.images),
+        ("points", determined, network.points),
+    ):
+        if len(found) < len(names):
+            notes.append(f"{len(names) - len(found)} of {len(names)} {kind} have no coordinates: left out.")
+    return ViewerScene(
+        stored.name,
+        stored.unit or "object units",
+        estimate.cameras,
+        tuple(network.points[j] for j in determined),
+        xyz,
+        covariance,
+        np.bincount(point[used], minlength=n),
+        ray_angles(network, estimate, use)[determined],
+        rms_of_groups(point[used], v[used], n),
+        tuple(network.images[i] for i in oriented),
+        network.camera[oriented],
+        estimate.position[oriented],
+        estimate.rotation[oriented],
+        sigma,
+        rms_of_groups(photo[used], v[used], m),
+        np.bincount(photo[used], minlength=m),
+        rays,
+        marks,
+        tuple(
+            Bar(place[i], place[j], length, s, float(np.linalg.norm(xyz[place[i]] - xyz[place[j]])) - length)
+            for i, j, length, s in zip(
+                *(x.tolist() for x in (bars.start, bars.end, bars.length, bars.sigma)), strict=True
+            )
+            if i in place and j in place
+        ),
+        tuple(place[int(j)] for j in network.control.point if int(j) in place),
+        None
+        if joint is None or stored.covariance_points is not None or n < len(network.points)
+        else distance_sigmas(xyz, joint),
+        float(np.sqrt(np.nanmean(v[used] ** 2))) if used.any() else np.nan,
+        tuple(notes),
+    )
+
+
+def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
+    """Return computed minus measured position of every image point, px; NaN where not known, (k, 2)."""
+    network, estimate = stored.network, stored.estimate
+    computed = np.full(seen.xy.shape, np.nan)
+    order = np.argsort(seen.image, kind="stable")
+    ends = np.searchsorted(seen.image[order], np.arange(1, len(network.images)))
+    for i, rows in enumerate(np.split(order, ends)):
+        if len(rows) and estimate.oriented[i]:
+            camera = estimate.cameras[network.camera[i]]
+            where = estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]]
+            computed[rows] = project(camera, *where)
+    return computed - seen.xy
+
+
+def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
+    """Return the ellipse of each image point, NaN without one, (k, 3), and what else was seen.
+
+    Args:
+        seen: in the same photographs.
+        image: photograph of each image point, (k,).
+        xy: where it is, px, (k, 2).
+    """
+    ellipse = np.full((len(xy), 3), np.nan)
+    left = np.ones(len(seen.image), dtype=bool)
+    for i in np.unique(seen.image).tolist():
+        rows = np.flatnonzero(image == i)
+        measured = np.flatnonzero((seen.image == i) & seen.measured)
+        used = nearest_image_points(seen.xy[measured], xy[rows])
+        ellipse[rows[used[used >= 0]]] = seen.ellipse[measured[used >= 0]]
+        left[measured[used >= 0]] = False
+    kept = np.flatnonzero(left)
+    kept = kept[np.argsort(seen.image[kept], kind="stable")]
+    words = [seen.reason[k] or UNUSED for k in kept.tolist()]
+    reasons = {word: number for number, word in enumerate(likest_first(set(words)))}
+    number = np.array([reasons[word] for word in words], dtype=np.int64)
+    return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
+
+
+def displacements_viewer(found: EpochSeries) -> Viewer | None:
+    """Return the scene of the first epoch with the displacements to the last; None without photographs."""
+    if not found.first.result.estimate.oriented.any():
+        return None
+    scene = _scene_of_displacements(found.since_first[-1].displacements, found.first.result)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
+
+
+def _scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
+    """Return the scene of an epoch with the displacement of every point and the outcome of its test.
+
+    Standard deviations and ellipsoids are those of the displacements.
+
+    Args:
+        found: displacements from this epoch to another one.
+        first: the epoch.
+    """
+    names = first.network.points
+    row = {name: j for j, name in enumerate(names)}
+    tested = np.array([row[name] for name in found.differences.points], dtype=np.int64)
+    covariance = np.full((len(names), 3, 3), np.nan)
+    covariance[tested] = point_blocks(found.covariance, 3)
+    scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
+    displacement = np.full((len(names), 3), np.nan)
+    displacement[tested] = found.displacement
+    state = [UNTESTED] * len(names)
+    for k, j in enumerate(tested.tolist()):
+        state[j] = MOVED if found.moved[k] else STABLE if found.stable[k] else ""
+    kept = [row[name] for name in scene.points]
+    return replace(
+        scene,
+        name=" to ".join(found.differences.names),
+        displacement=displacement[kept],
+        state=tuple(state[j] for j in kept),
+        notes=(
+            *scene.notes,
+            f"Displacements from {found.differences.names[0]} to {found.differences.names[1]}; standard "
+            "deviations and ellipsoids are those of the displacements.",
+        ),
+    )
+
+
+def measurement_viewer(found: Measurement, result: Solution) -> Viewer | None:
+    """Return the scene in the system of a measurement; None without photographs."""
+    if not result.estimate.oriented.any():
+        return None
+    estimate, n = result.estimate, int(result.estimate.determined.sum())
+    positions = result.position_covariance
+    if found.alignment is not None:
+        estimate = found.alignment.aligned_from_object.apply_estimate(estimate)
+        positions = None
+    kept = np.flatnonzero(result.estimate.determined)
+    covariance = np.full((len(result.network.points), 3, 3), np.nan)
+    covariance[kept] = found.points.blocks[:n]
+    moved = replace(
+        result,
+        estimate=estimate,
+        point_covariance=covariance,
+        position_covariance=positions,
+        covariance=None,
+        unit=found.unit,
+    )
+    scene = scene_of_stored(moved)
+    deviation = _worst_deviation(found)[:n]
+    if np.isfinite(deviation).any():
+        scene = replace(scene, deviation=deviation)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
+
+
+def _worst_deviation(found: Measurement) -> FloatArray:
+    """Return of each point its largest deviation from what tolerances, else shapes, say; NaN without any."""
+    worst = np.full(len(found.points.names), np.nan)
+    judged: list[Deviations | ShapeFit] = [*found.tolerances] or [*found.shapes]
+    for one in judged:
+        value = one.value if isinstance(one, Deviations) else one.deviation
+        larger = ~(np.abs(value) <= np.abs(worst[one.points]))
+        worst[one.points[larger]] = value[larger]
+    return worst
+
+
+def plan_viewer(plan: Plan) -> Viewer:
+    """Return the scene of a plan: stations, rays and all points, those not determined included."""
+    p = plan.prediction
+    a = p.adjustment
+    m, n = np.nonzero(p.sight.seen)
+    network = Network(
+        p.stations.names,
+        p.stations.camera,
+        p.planned.names,
+        ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
+    )
+    estimate = Estimate(p.cameras, p.stations.position, p.stations.rotation, p.planned.xyz)
+    covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
+    of_position = np.full((len(p.stations), 3, 3), np.nan)
+    used = p.photograph >= 0
+    of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
+    solution = Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit)
+    return viewer_of(scene_of_stored(solution), Pictures())

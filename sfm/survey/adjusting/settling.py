@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import scaled
-from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.hypotheses.alternatives import explain_rejections
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.moved import bump_remarks
-from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
@@ -21,7 +21,7 @@ from sfm.camera import base_name
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -48,11 +48,11 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.hypotheses.given import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
+from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.measurements import Naming
-from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.start import given_values
+from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 from sfm.survey.observation_tables import find_gross, without_observations
@@ -68,7 +68,6 @@ from sfm.survey.placing import (
     scale_to_bars,
 )
 from sfm.survey.rigs import hold_mounts, split_blocks
-from sfm.survey.target_network import with_given_mounts
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")

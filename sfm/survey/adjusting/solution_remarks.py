@@ -20,7 +20,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import (
     LeftOutPoint,
 )
-from sfm.survey.inputs.plate import is_plate_control, plate_control, plate_family
+from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import unused_observations

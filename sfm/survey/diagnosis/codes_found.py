@@ -15,20 +15,18 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
-from sfm.orientation.homography import PLANAR_POINTS
+from sfm.orientation.image_rays import PLANAR_POINTS
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.dot_plates import MIN_DOTS
-from sfm.targets.codes.families import Family, TargetFamily
-from sfm.targets.codes.plates import PlateFamily, plates_of, points_of_plates
+from sfm.targets.codes.plates import Family, PlateFamily, TargetFamily, plates_of, points_of_plates
 from sfm.targets.codes.rings import RINGS
 from sfm.targets.codes.tags import CORNERS, DICTIONARIES, find_tags, tag_family
 from sfm.targets.detect import Targets, find_targets
-from sfm.targets.flags import Flag
-from sfm.targets.outlines import scale_of
+from sfm.targets.outlines import Flag, scale_of
 
 MIN_VIEWS = 2  # photographs that show the place of a side of a plate that none of them has
 NOT_FOUND = {  # kinds of remarks by the codes of a board; that on dots of any grid is another

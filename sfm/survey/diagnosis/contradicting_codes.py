@@ -16,8 +16,7 @@ import numpy as np
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
-from sfm.targets.codes.families import TargetFamily
-from sfm.targets.codes.plates import PlateFamily, plates_of
+from sfm.targets.codes.plates import PlateFamily, TargetFamily, plates_of
 from sfm.targets.codes.tags import CORNERS
 
 MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread

@@ -43,8 +43,7 @@ from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
-from sfm.orientation.homography import rays_of
-from sfm.orientation.image_rays import image_tangents
+from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.reduced_network import reduce_network, supported

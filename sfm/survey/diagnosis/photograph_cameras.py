@@ -25,7 +25,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.hypotheses.hypotheses import adjust_image_points, best_explanation
-from sfm.adjustment.hypotheses.patterns import price_of
+from sfm.adjustment.hypotheses.moved import price_of
 from sfm.adjustment.hypotheses.refit import log_likelihood
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment

@@ -13,10 +13,8 @@ import numpy as np
 
 from sfm.display import agreeing, counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.files.globs import why_no_folder
-from sfm.files.plain_text import as_plain, is_plain
-from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, read_metadata
-from sfm.photographs.file_checks import conversion_of
+from sfm.files.plain_text import as_plain, is_plain, why_no_folder
+from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
@@ -24,8 +22,7 @@ from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targe
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
-from sfm.targets.codes.families import FAMILIES
-from sfm.targets.codes.plates import BOARDS, PLATES, PlateFamily
+from sfm.targets.codes.plates import BOARDS, FAMILIES, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 COMMENT_WIDTH = 100  # letters

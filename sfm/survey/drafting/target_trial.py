@@ -23,7 +23,6 @@ from sfm.targets.codes.boards import find_crossings, read_april_tags, reduced
 from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
 from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.dot_plates import find_lattice
-from sfm.targets.codes.families import code_family
 from sfm.targets.codes.plate_search import (
     KALIBR_TAGS,
     MIN_DOTS_OF_PLATE,
@@ -36,7 +35,7 @@ from sfm.targets.codes.plate_search import (
     search_dots,
     shows_a_lattice,
 )
-from sfm.targets.codes.plates import PlateFamily, group_plates
+from sfm.targets.codes.plates import PlateFamily, code_family, group_plates
 from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily, read_codes
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,

@@ -28,8 +28,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network
-from sfm.observations.mounts import MountObservations
-from sfm.observations.pose import exterior_jacobian
+from sfm.observations.pose import MountObservations, exterior_jacobian
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given_scales import (

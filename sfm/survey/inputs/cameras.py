@@ -20,10 +20,10 @@ import numpy as np
 from sfm.camera import Camera, base_name, camera_from_values
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted
-from sfm.distortion.balanced import from_balanced
+from sfm.distortion.brown import from_balanced
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings

@@ -13,7 +13,7 @@ from sfm.conventions import FloatArray
 from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_header, read_table
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.survey.inputs.given import (
     ANGLES,
     AXES,

@@ -17,7 +17,7 @@ from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinat
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import AXES
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
-from sfm.network_check import CORRELATION_LIMIT, possible_covariances
+from sfm.reduced_network import CORRELATION_LIMIT, possible_covariances
 
 MIN_SIGMA = 1e-9  # in any unit used here less than an atom
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent

@@ -1,20 +1,58 @@
-"""Measurements of the photographs of a survey: targets, natural texture, or given image points."""
+"""Measurements of the photographs of a survey: targets, natural texture, or given image points.
+
+The photographs of a survey: the files that the globs of its cameras name.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import IntArray
+from sfm.display import counted
+from sfm.errors import PhotographError, SurveyFileError
+from sfm.files.plain_text import as_plain, find_files, is_plain, why_no_folder
 from sfm.network import Network
+from sfm.photographs.exif import Metadata, read_metadata
 from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.cameras import refuse_ungrouped
+from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.survey_file import inside, is_home_file
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
+
+if TYPE_CHECKING:
+    from sfm.survey.inputs.survey import Survey
+    from sfm.survey.inputs.survey_file import SurveyFile
+
+MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
+
+
+@dataclass(frozen=True)
+class PhotographList:
+    """The photographs of a survey in order of camera and name."""
+
+    names: tuple[str, ...]  # file names, by which tables and reports know them, (m,)
+    paths: tuple[Path, ...]  # (m,)
+    camera: IntArray  # index of the camera, (m,)
+    folder: Path  # that the names are relative to
+
+    def by_camera(self) -> tuple[tuple[str, ...], ...]:
+        """Return the names of the photographs of each camera that has some."""
+        return tuple(
+            tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == one)
+            for one in np.unique(self.camera)
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 @dataclass(frozen=True)
@@ -87,3 +125,129 @@ class Measurements:
     naming: Naming | None = None  # of these targets
     remarks: tuple[Remark, ...] = ()  # on what was given and measured
     left_out: tuple[LeftOutPoint, ...] = ()  # image points that contradict one another
+
+
+def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:
+    """Return the photographs that the globs of the cameras name.
+
+    Args:
+        survey: a survey with photographs, or its file.
+        images_dir: folder of the photographs in place of that of the survey; photographs in a folder that the
+            user names may be links to files in the user's home folder.
+
+    Raises:
+        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
+            group where its camera has groups, or with a name with control or invisible characters.
+    """
+    folder = Path(images_dir) if images_dir is not None else survey.folder
+    if not folder.is_dir():
+        raise SurveyFileError(
+            f"{folder}: {why_no_folder(folder)}; photographs of survey {survey.name} were needed"
+        )
+
+    def refuse_outside(path: Path) -> None:
+        if images_dir is not None and is_home_file(path):
+            return
+        name = path.relative_to(folder).as_posix()
+        inside(folder, name, survey.source, allow_outside=survey.allow_outside)
+
+    def matching(camera: str, glob: str) -> list[Path]:
+        try:
+            found = find_files(folder, glob, enter=refuse_outside)
+        except ValueError as error:
+            raise SurveyFileError(
+                f"{survey.source}: camera {camera}: images = '{glob}' is no glob relative to {folder}"
+            ) from error
+        if not found:
+            raise SurveyFileError(
+                f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_describe_files(folder)}"
+            )
+        return found
+
+    owner: list[tuple[str, Path, int]] = []
+    for index, camera in enumerate(survey.cameras):
+        found = sorted({path for glob in camera.images or () for path in matching(camera.name, glob)})
+        if not survey.allow_outside:
+            for path in found:
+                refuse_outside(path)
+        for name in (path.relative_to(folder).as_posix() for path in found):
+            if not is_plain(name):
+                raise SurveyFileError(
+                    f"{survey.source}: the name of photograph '{as_plain(name)}' has control or invisible "
+                    "characters; rename the file"
+                )
+        owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
+    seen: dict[str, int] = {}
+    for name, _, index in owner:
+        if name in seen:
+            first, second = survey.cameras[seen[name]].name, survey.cameras[index].name
+            raise SurveyFileError(
+                f"{survey.source}: photograph '{name}' matches the globs of cameras {first} and {second}"
+            )
+        seen[name] = index
+    names, paths, cameras = zip(*owner, strict=True)
+    refuse_many(survey.source, names)
+    refuse_ungrouped(survey.cameras, names, cameras, survey.source)
+    return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
+
+
+def refuse_many(where: str, images: Sequence[str]) -> None:
+    """Raise SurveyFileError if there are more photographs than one adjustment has room for."""
+    if len(images) > MAX_PHOTOGRAPHS:
+        raise SurveyFileError(
+            f"{where}: {counted(len(images), 'photograph')}, at most {MAX_PHOTOGRAPHS} are adjusted together"
+        )
+
+
+def _describe_files(folder: Path) -> str:
+    """Return in a few words which files a folder contains."""
+    files = sorted(path.name for path in folder.iterdir() if path.is_file())
+    if not files:
+        return "which has no files (--images names another folder)"
+    return f"which has {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"
+
+
+def refuse_incomplete_cameras(
+    settings: Sequence[CameraSettings], source: str, photographs: PhotographList
+) -> None:
+    """Raise SurveyFileError if the pixel size or principal distance of cameras is not known from anywhere.
+
+    Args:
+        settings: of the cameras in the survey.
+        source: what messages call the survey.
+        photographs: whose EXIF data may give the rest.
+    """
+    lines = []
+    for number, one in enumerate(settings):
+        wanted = _wanted(one)
+        paths = [photographs.paths[k] for k in np.flatnonzero(photographs.camera == number)]
+        metadata = _readable(paths) if wanted else []
+        missing = [
+            key for key, attribute in wanted if metadata and not any(getattr(m, attribute) for m in metadata)
+        ]
+        if missing:
+            lines.append(f"camera {one.name}: {' and '.join(missing)}")
+    if lines:
+        raise SurveyFileError(
+            f"{source}: EXIF data of the photographs do not state what is needed of {'; '.join(lines)}"
+        )
+
+
+def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
+    """Return (what to write, where EXIF data have it) of what a camera does not state."""
+    said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
+    wanted = []
+    if one.pixel_mm is None and one.sensor_mm is None:
+        wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
+    if one.c_mm is None and not said & {"c", "fx", "f"}:
+        wanted.append(("c_mm", "focal_mm"))
+    return wanted
+
+
+def _readable(paths: Sequence[Path]) -> list[Metadata]:
+    """Return the metadata of the photographs that have some; the others are reported where they are read."""
+    found = []
+    for path in paths:
+        with suppress(PhotographError, OSError):
+            found.append(read_metadata(path))
+    return found

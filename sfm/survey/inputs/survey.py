@@ -16,9 +16,19 @@ from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 from sfm.files.result_tables import read_moments
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.result import PlacedEquipment
-from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
+from sfm.survey.inputs.calibration import (
+    Calibration,
+    calibrated,
+    is_plate_control,
+    plate_control,
+    plate_family,
+    plate_group,
+    read_calibrations,
+    refuse_contradicting_groups,
+    refuse_contradicting_plates,
+)
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.equipment import GivenEquipment, given_by, read_equipment
 from sfm.survey.inputs.exterior_table import ObservedExterior, mount_observations, read_observed_exterior
@@ -36,14 +46,6 @@ from sfm.survey.inputs.given import (
     read_points,
     read_start_cameras,
 )
-from sfm.survey.inputs.plate import (
-    is_plate_control,
-    plate_control,
-    plate_family,
-    plate_group,
-    refuse_contradicting_groups,
-    refuse_contradicting_plates,
-)
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -60,7 +62,7 @@ from sfm.survey.inputs.settings import (
 )
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table
-from sfm.targets.codes.families import TargetFamily, code_family, is_table
+from sfm.targets.codes.plates import TargetFamily, code_family, is_table
 from sfm.targets.codes.rings import CodeFamily
 
 T = TypeVar("T")

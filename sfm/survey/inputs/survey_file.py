@@ -35,7 +35,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
-from sfm.targets.codes.families import is_table
+from sfm.targets.codes.plates import is_table
 
 
 class SurveyFile(Section):

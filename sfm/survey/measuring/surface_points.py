@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -31,10 +31,10 @@ from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
-from sfm.survey.target_network import network_of
 
 # Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
 # several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine

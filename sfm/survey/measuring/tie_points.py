@@ -27,13 +27,12 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.targets import each_photograph
-from sfm.survey.target_network import network_of
 
 NONE = -1  # in place of a photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import with_neighbours
-from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -32,6 +32,7 @@ from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.refining.oriented_windows import (
+    ModelTargets,
     OrientedKeyPoints,
     by_count,
     describe_reasons,
@@ -41,7 +42,6 @@ from sfm.survey.refining.oriented_windows import (
     refuse_undetermined,
     whole_model,
 )
-from sfm.survey.refining.targets import ModelTargets
 from sfm.survey.refining.windows import (
     MAX_REDUCED_RATIO,
     MIN_RAYS,

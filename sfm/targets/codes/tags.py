@@ -17,8 +17,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.fits.whole_tag import fit_whole_tags
-from sfm.targets.flags import Flag
-from sfm.targets.outlines import as_bytes, estimate_noise
+from sfm.targets.outlines import Flag, as_bytes, estimate_noise
 
 # OpenCV's dictionary behind each name that a survey file uses.
 DICTIONARIES = {
@@ -79,7 +78,7 @@ class TagCorners:
     noise: FloatArray
     """standard deviation of the intensities about the fit, shape (k,)"""
     flag: IntArray
-    """remarks, see sfm.targets.flags.Flag, shape (k,)"""
+    """remarks, see sfm.targets.outlines.Flag, shape (k,)"""
     rejected_xy: FloatArray
     """corners that could not be measured, px, shape (m, 2)"""
     rejected_flag: IntArray

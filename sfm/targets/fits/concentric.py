@@ -30,8 +30,8 @@ from scipy.special import ndtr
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.fits.corner import MASK_PX, SHARPENING_SIGMA
-from sfm.targets.flags import Flag
 from sfm.targets.measure import QUANTISATION
+from sfm.targets.outlines import Flag
 
 # Unknowns in their order: x0, y0, p, q, r, two of l, B, A, s, e, gx, gy, a.
 UNKNOWNS, GEOMETRY = 14, 7

@@ -25,7 +25,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import invert_symmetric, solve_symmetric
 from sfm.targets.fits.blurred_ellipse import edge_profile
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 # Unknowns of the fit in their order: x0, y0, directions of the two normals, B, A, s, gx, gy, a.
 UNKNOWNS = 10

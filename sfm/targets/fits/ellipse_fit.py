@@ -13,7 +13,7 @@ from sfm.kernels.small_algebra import invert_symmetric, solve_symmetric
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 from sfm.targets.fits import blurred_ellipse as model
 from sfm.targets.fits import goodness
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
 GAIN_SIGMA = 0.3

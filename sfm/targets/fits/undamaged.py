@@ -29,7 +29,7 @@ from sfm.targets.fits.outline_noise import (
     outline_shape,
     rise_to_first,
 )
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 # Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
 # share of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.

@@ -38,7 +38,7 @@ from sfm.targets.fits.corner import (
     Y0,
     CornerFits,
 )
-from sfm.targets.flags import Flag
+from sfm.targets.outlines import Flag
 
 # Tags are printed with one clear module around them. What is behind it acts up to so many blurs into it.
 BEHIND_BLURS = 2.0

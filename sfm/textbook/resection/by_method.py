@@ -13,22 +13,21 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import (
+from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
+from sfm.orientation.resection.least_squares import (
     LineFit,
     ResectionSolution,
     checked_points,
     choose_by_line,
+    resect_least_squares,
     rotation_from_position,
 )
-from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
-from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import DirectLinearTransformation, resect_dlt
 from sfm.textbook.resection.p4p import resect_p4p
-from sfm.textbook.resection.rampal import resect_rampal
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise
-from sfm.textbook.resection.zeng_wang import resect_zeng_wang
+from sfm.textbook.resection.zeng_wang import resect_rampal, resect_zeng_wang
 
 # Relative distance below which the error of the position grows more than tenfold.
 MAX_RELATIVE_DISTANCE = 0.05

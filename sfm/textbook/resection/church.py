@@ -9,8 +9,8 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import ResectionSolution, checked_points, solution_of
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents
+from sfm.orientation.resection.least_squares import ResectionSolution, checked_points, solution_of
 
 MIN_POINTS = 3
 MAX_STEPS = 100

@@ -7,7 +7,7 @@ import numpy as np
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import (
+from sfm.orientation.resection.least_squares import (
     ResectionSolution,
     checked_points,
     rotation_from_position,

@@ -15,7 +15,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.result_tables import GIVEN
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
-from sfm.report.findings.findings import findings_of
+from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm.conventions import rotation_from_vector
-from sfm.kernels.quartic import positive_roots
+from sfm.kernels.small_algebra import positive_roots
 from sfm.orientation.resection.fischler_bolles import leg_quartic, rays_from_tangents, resect_triples
 from tests.places import ROOT
 from tests.synthetic import seed_of

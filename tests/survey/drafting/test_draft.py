@@ -18,12 +18,11 @@ from PIL.TiffImagePlugin import IFDRational
 from adapters.colmap.mapper import sensor_width_mm
 from sfm import cli
 from sfm.errors import GeometryError, OutputError
-from sfm.files.manifest import manifest_text, sha256_of
+from sfm.files.open_folders import manifest_text, sha256_of
 from sfm.report.output import Origin, read_origin, refuse_other_origin
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
-from sfm.targets.codes.families import FAMILIES
-from sfm.targets.codes.plates import PLATES
+from sfm.targets.codes.plates import FAMILIES, PLATES
 from tests.satellite import at, state_position
 from tests.surveys import write_photograph_survey
 

@@ -5,15 +5,15 @@ import pytest
 
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.orientation.resection.candidates import choose_by_line, solution_of
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
+from sfm.orientation.resection.least_squares import choose_by_line, solution_of
 from sfm.textbook.resection.by_method import cylinder_distance, cylinder_warning
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import resect_dlt
 from sfm.textbook.resection.p4p import resect_p4p
-from sfm.textbook.resection.rampal import resect_rampal
 from sfm.textbook.resection.zeng_wang import (
     distance_quartic,
+    resect_rampal,
     resect_triples_zeng_wang,
     resect_zeng_wang,
 )

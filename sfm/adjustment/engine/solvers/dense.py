@@ -26,9 +26,9 @@ from scipy.linalg import eigh
 from scipy.linalg.blas import dsyrk, ssyrk
 from scipy.linalg.lapack import dlauum, dpotrf, dpotrs, dtrtri, spotrf, spotrs
 
+from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations, times_reduced
 from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.fronts import Pairs, subtract_squares, times_inverse

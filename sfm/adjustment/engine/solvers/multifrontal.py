@@ -33,8 +33,8 @@ from scipy.linalg import cho_factor, eigh, qr
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf
 
+from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations, times_schur
 from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT

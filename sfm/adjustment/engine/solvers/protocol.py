@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.accumulate import Blocks
-from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError

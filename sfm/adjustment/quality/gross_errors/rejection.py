@@ -29,7 +29,7 @@ from sfm.adjustment.quality.gross_errors.robust import (
     tukey_weights,
     would_pass,
 )
-from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.statistics import tau_critical
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, remark

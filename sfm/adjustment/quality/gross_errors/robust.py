@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, residuals
-from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical, whitening_matrix
+from sfm.adjustment.quality.statistics import standardised_residuals, tau_critical, whitening_matrix
 from sfm.adjustment.result import MIN_SIGMA_PX, ROUNDING
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm.display import counted, listed
-from sfm.distortion.balanced import BALANCED, from_balanced
-from sfm.distortion.balanced import MODEL as BALANCED_MODEL
+from sfm.distortion.brown import BALANCED, from_balanced
+from sfm.distortion.brown import MODEL as BALANCED_MODEL
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.survey.inputs.given import KnownPoints
-from sfm.survey.inputs.plate import (
+from sfm.survey.inputs.calibration import (
     plate_control,
     refuse_contradicting_plates,
     refuse_free_points_without_turn,
 )
+from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.settings import (
     LARGEST,
     MAX_GLOBS,
@@ -29,8 +29,7 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
 )
 from sfm.targets.codes.concentric import WIDTHS
-from sfm.targets.codes.families import FAMILIES, is_table
-from sfm.targets.codes.plates import PLATES, TAGGED
+from sfm.targets.codes.plates import FAMILIES, PLATES, TAGGED, is_table
 from sfm.targets.codes.tags import DICTIONARIES
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """The tables of remarks in docs/symptoms.md, written from the catalogue.
 
-`python -m sfm.remarks.symptoms docs/symptoms.md` writes them between their marks.
+`python docs/remark_tables.py docs/symptoms.md` writes them between their marks.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from sfm.remarks.catalogue import SUBJECTS
 from sfm.remarks.kind import FIELD, Grade, Kind
 
-BEGIN, END = "<!-- remarks: written by sfm.remarks.symptoms -->", "<!-- end of remarks -->"
+BEGIN, END = "<!-- remarks: written by docs/remark_tables.py -->", "<!-- end of remarks -->"
 VARIES = "…"
 
 

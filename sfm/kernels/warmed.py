@@ -1,0 +1,50 @@
+"""Whether the kernels of a survey have been compiled for the sources and the numba of today."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+import numba
+
+from sfm.files.user_cache import make_user_folder, user_folder
+from sfm.kernels.compiling import KEPT, source_hash, sources_of
+
+WARM_UP = "sfm.warm_up"  # imports all that a survey needs
+DECORATORS = "sfm.kernels.compiling"
+
+
+def is_warm() -> bool:
+    """Return whether `sfm.warm_up` has ended for the kernels of today."""
+    return (_folder() / _mark()).is_file()
+
+
+def set_warm() -> None:
+    """Remember that it has, and forget earlier ones; report a folder that cannot be written."""
+    folder = _folder()
+    with suppress(OSError):
+        if folder == KEPT:
+            folder.mkdir(exist_ok=True)
+        else:
+            make_user_folder(folder)
+        for old in folder.glob("warm-*"):
+            old.unlink()
+        (folder / _mark()).touch()
+
+
+def _folder() -> Path:
+    """Where numba keeps what it compiles, or the user's cache where that is not writable."""
+    return KEPT if os.access(KEPT.parent, os.W_OK) else user_folder("kernels", "notes of compiled kernels")
+
+
+@cache
+def _mark() -> str:
+    """Name of the file that represents the sources of all kernels."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for module, source in sorted(sources_of(WARM_UP).items()):
+        if DECORATORS in source:
+            digest.update((source_hash(module) or "").encode())
+    return f"warm-{digest.hexdigest()[:16]}"
