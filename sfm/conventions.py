@@ -11,8 +11,6 @@ Rotation
     R = Rx(omega) Ry(phi) Rz(kappa) turns image axes into object axes, M = R^T the other way.
     (U, V, W) = M (X - X0); tangents u = -U/W, v = -V/W; ideal image point x = c u, y = c v.
 Angles are radians inside and degrees in files and reports. A `sigma` is one standard deviation.
-
-Units of length: those in which a length reads well, and those that are taken for one another.
 """
 
 from __future__ import annotations

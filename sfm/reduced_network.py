@@ -1,4 +1,4 @@
-"""A part of a network: some of its photographs, points and image points, counted anew.
+"""A part of a network, counted anew, and checks of networks before they are adjusted.
 
 Checks of the input of an adjustment from Python, as of files: shapes, indices, numbers, covariances.
 

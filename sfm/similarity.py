@@ -2,11 +2,7 @@
 
 Two-dimensional similarity and affine transformations (fiducial marks) live in orientation/fiducials.
 
-A network turned inside out in depth, which parallel rays cannot distinguish from itself.
-
 Source: Szeliski and Kang (1997), IEEE PAMI 19(5), for the reversal of depth.
-
-Absolute orientation: a model brought onto control by a similarity of seven parameters.
 """
 
 from __future__ import annotations

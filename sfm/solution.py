@@ -1,9 +1,7 @@
-"""Solution: a network that is solved, with its covariance, whoever solved it.
+"""Solution: a network that is solved, and its points by name, with covariance, whoever solved it.
 
 `adjust` and `run_survey` have it as `.solution`, `read_result` returns it; comparison, shapes, measurement,
 epochs and files take it.
-
-Object points by name, with their covariance: what a result gives to whoever goes on computing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""COLMAP through pycolmap: its Ceres bundle adjustment of our networks.
+"""COLMAP through pycolmap: its Ceres bundle adjustment and covariances of our networks.
 
 The only module that imports pycolmap. Limits of its adjuster against Kolinear's:
 
@@ -8,8 +8,6 @@ The only module that imports pycolmap. Limits of its adjuster against Kolinear's
 Pixel origin and axes are turned in adapters.colmap.reconstruction.
 
 Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
-
-COLMAP as the other adjuster of a validation: adjustment and covariances.
 
 Source: COLMAP 4.2, estimate_ba_covariance.
 """

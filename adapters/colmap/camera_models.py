@@ -1,4 +1,4 @@
-"""COLMAP's models, binary and text, written and read.
+"""COLMAP's models, binary and text, and kolinear.json beside them, written and read.
 
 COLMAP cannot hold names of cameras and points or the size of a pixel; they lie beside a model in
 kolinear.json.

@@ -1,4 +1,4 @@
-"""COLMAP's pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
+"""COLMAP's pipeline on the photographs of a survey, and its list of sensor widths.
 
 The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
 are compared with the survey's by sfm.comparison.solutions.

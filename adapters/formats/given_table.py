@@ -1,4 +1,4 @@
-"""Given values of a survey with standard deviations, read from and written to given.csv of its result.
+"""Given values, control and check points of a result, read from and written to tables.
 
 Control and check points of a result: control.csv of converted tables, control_points.csv of a survey.
 

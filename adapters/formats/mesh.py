@@ -1,4 +1,4 @@
-"""Meshes of triangles as STL (binary and text) and PLY (binary and text), read as untrusted.
+"""Meshes of triangles as STL and PLY (binary and text), read as untrusted.
 
 Polygons of PLY are cut into triangles from their first corner. The size that a file states is checked
 against its actual size before memory is taken.

@@ -1,9 +1,7 @@
-"""A survey's result as CSV tables, read and written.
+"""A survey's result as CSV tables, and the targets measured in its photographs.
 
 These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are passed over.
 Sizes and pixels missing from a summary are taken from the COLMAP model in the folder `colmap`.
-
-Targets measured and candidates rejected in the photographs, read from targets.csv of a result.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Calibrated rigs as other programs read them: a folder with files of each.
+"""Calibrated rigs as other programs read them: a folder with files of each, with rectification.
 
     opencv-LEFT-RIGHT.yml        of each camera with the reference of its rig, for cv2.FileStorage: width,
                                  height (px), K1, D1, K2, D2, R, T, E, F, rectification R1, R2, P1, P2, Q

@@ -1,4 +1,4 @@
-"""Covariance of any subset of the unknowns of a finished adjustment, in any datum, without adjusting again.
+"""Covariance of any subset of the unknowns of a finished adjustment, in any datum.
 
 The normal equations are formed once more at the solution. The coordinates stay; a change of datum is an
 S-transformation of their covariance.

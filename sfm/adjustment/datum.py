@@ -1,4 +1,4 @@
-"""Datum: what decides position, attitude and scale of a network, on which object points.
+"""Datum: which points define position, attitude and scale; free motions and their constraints.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3.
 

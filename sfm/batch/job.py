@@ -1,4 +1,4 @@
-"""One survey of a batch, as a worker runs it: its photographs one by one, then the rest, into one folder.
+"""One survey of a batch, as a worker runs it, and which results `--resume` may keep.
 
 Which results were finished by batches of this user: what `--resume` may keep.
 

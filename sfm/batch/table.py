@@ -1,7 +1,4 @@
-"""The table of a batch on the terminal: who is at what, how far, and how long it will take.
-
-The tables of a batch: batch.csv, batch.json and index.html, one row per survey.
-"""
+"""The table of a batch: on the terminal while it runs, and as batch.csv, batch.json and index.html."""
 
 from __future__ import annotations
 

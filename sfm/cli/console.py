@@ -1,7 +1,4 @@
-"""The summary of a result on the terminal.
-
-Printing where a code page lacks characters, a disk is full or a reader ends early.
-"""
+"""The summary of a result on the terminal, printed whatever the terminal can show."""
 
 from __future__ import annotations
 

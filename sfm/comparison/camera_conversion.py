@@ -1,4 +1,4 @@
-"""Conversion of a camera from one distortion model to another, by a fit over the photograph.
+"""Conversion of a camera from one distortion model to another, and image points without distortion.
 
 `brown` corrects the measured point and the other models distort the ideal one, so no conversion is exact:
 the parameters of the target model are fitted to the rays of the source over a grid of pixels, and what is

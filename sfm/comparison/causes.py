@@ -1,4 +1,4 @@
-"""Why the coordinates of the same points differ in two results: alternatives in one list, tested by one rule.
+"""Why the coordinates of the same points differ in two results: alternatives tested by one rule.
 
 An alternative is a row: what of one result may be another in the second one. It is the scale, the handedness,
 the names of the points, a strain or a bending of the whole. With it the differences are formed anew and

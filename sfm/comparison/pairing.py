@@ -1,12 +1,10 @@
-"""Which point and which photograph of one result is which of another.
+"""Points and photographs that two results have in common, and the covariance of their differences.
 
 Names are believed where they identify something: codes, control, given observations, file names. Uncoded
 targets and tie points are numbered anew in every run, and some formats have no names at all; a point with
 such a number is recognised by its image points, where both results have the same photographs, or else by its
 place, after an alignment on what is already paired. A number that identifies nothing is never compared with
 another.
-
-Coordinates of the same points in two results, and the covariance of their differences in any frame.
 """
 
 from __future__ import annotations

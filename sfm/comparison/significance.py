@@ -12,8 +12,6 @@ are in `sfm.comparison.causes`.
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
 Concepts of network and deformation analysis, sec. 7.
 
-The test of the points of two results with all that is known of their covariance.
-
 Source: Caspary (2000), Concepts of network and deformation analysis, sec. 7.
 """
 

@@ -1,4 +1,4 @@
-"""Comparison of two solutions of one network.
+"""Comparison of two solutions of one network, and of a survey with another pipeline.
 
 The datum is no part of a solution: one is brought onto the other by a 7-parameter similarity over the
 object points before anything is subtracted. Differences are judged in standard deviations.

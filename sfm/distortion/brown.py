@@ -1,4 +1,4 @@
-"""Corrections of the measured point in mm, with residuals in the measured or in the corrected plane.
+"""Brown's corrections of the measured point, and the balanced form with R0.
 
 In the measured plane, where frame[4] is 1, the point is found whose correction meets the ray, so that
 residuals are those of what was measured and its standard deviations are their weights. In the corrected

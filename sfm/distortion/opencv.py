@@ -1,4 +1,4 @@
-"""Equidistant wide-angle models with decentring and thin prism distortion, as COLMAP has them.
+"""OpenCV's models, and equidistant ones with decentring and thin prism distortion.
 
 The ideal point (a, b) goes to e = s(r2) (a, b), as in `radial`, and from there to the distorted point.
 

@@ -1,4 +1,4 @@
-"""The differences of two epochs in one frame, with the covariance of all of them together.
+"""Differences of two epochs in one frame, of points and of mounts, with their covariance.
 
 Points are recognised by their codes and other names, and those with a mere number by their place after a
 robust alignment. Q_d = Q_1 + Q_2 - C - C' where both epochs were given the same values: a bar whose length is
@@ -19,8 +19,6 @@ Values given alike to both epochs, as a scale bar, make the true variance of d s
 test then finds less, and does not find what is not there.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.
-
-Epoch: a result with what it was given, and what it has in common with other epochs.
 """
 
 from __future__ import annotations

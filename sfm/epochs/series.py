@@ -1,9 +1,7 @@
-"""Two or more epochs of one object: each against the first, and each against the one before.
+"""Epochs of one object: each against the first and the one before, motion of blocks, verdict.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12; Caspary (2000), Concepts of network and deformation
 analysis, sec. 7.
-
-Remarks on every pair of epochs, and the verdict on all.
 
 Motion and strain of groups of points: a block that tilted is separated from one that changed its shape.
 

@@ -1,10 +1,8 @@
-"""CSV tables with named columns, read as untrusted.
+"""CSV tables with named columns, read as untrusted, and point clouds written as PLY.
 
 Their size is bounded before memory is allocated, and every refusal names the line and the column.
 
 Source: RFC 4180.
-
-Object points written as a PLY point cloud in text form.
 
 Source: Turk, The PLY polygon file format (1994).
 """

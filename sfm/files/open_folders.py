@@ -1,4 +1,4 @@
-"""Folders that are opened part for part and through no link, and files in them.
+"""Folders opened part for part and through no link, their lock, and the list of files written.
 
 A folder that comes from somebody else may hold links at every path that is written. So no part of such a path
 may be a link but those of the system in its root folder (as /tmp of macOS). A folder is opened before

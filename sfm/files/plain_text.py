@@ -1,4 +1,4 @@
-"""Values as files hold them: numbers with the digits that give them back, names as plain text.
+"""Numbers and names as plain text; JSON, TOML and globs from files that are not trusted.
 
 Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, after spaces, too, and
 some begin a cell after each semicolon. In every such place of a text an apostrophe is put before it where CSV
@@ -8,12 +8,6 @@ names, and written out in other texts.
 
 Source: OWASP, "CSV Injection"; Unicode Standard 15, property Default_Ignorable_Code_Point, and UAX 9 for
 bidirectional characters.
-
-JSON files read as untrusted: their size bounded, their content checked against a model before use.
-
-TOML files read as untrusted: what makes the standard library's parser slow is refused before it runs.
-
-Files that a glob names, looked for in a bounded number of places, and through no links that may not be.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The tables of a result: columns that are stated once, for those who write them and those who read them.
+"""The tables of a result, rigs included: columns stated once for writers and readers.
 
 Degrees in files, lengths in the object unit of the survey, sigmas are standard deviations a posteriori (those
 of image points: as measured). Numbers are written with enough digits to give the same number back.

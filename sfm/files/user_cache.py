@@ -1,8 +1,6 @@
-"""Folders in the user's cache: files that the program may trust later lie here, where no one else can write.
+"""Folders that only this user writes, temporary folders, and settings found in the current one.
 
 They may be removed at any time.
-
-Folders in the temporary folder for what a run sets aside; those that a killed run left are removed.
 
 Settings of libraries and libraries themselves in the current folder, which may have come with a survey.
 

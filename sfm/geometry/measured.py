@@ -1,4 +1,4 @@
-"""Measured points with their covariance, and functions of their coordinates.
+"""Measured points and functions of their coordinates, with their joint covariance.
 
 A function keeps its values and its derivatives by the coordinates, so that its covariance, and that of any
 functions together, is J Q J'. In a free network only what does not change with the motions that the datum
@@ -7,8 +7,6 @@ the scale of the whole.
 
 Source: Baarda (1973), S-transformations and criterion matrices; Caspary (2000), Concepts of network and
 deformation analysis, sec. 6 (estimable functions).
-
-Hidden points: on the line of two targets of a probe, at a known distance behind the second.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.6 (hidden-point devices).
 

@@ -1,4 +1,4 @@
-"""How functions are compiled: the one place that names the options of numba, typed as the functions are.
+"""How functions are compiled with numba, and from which sources kept results were made.
 
 Compiled functions are kept in `__pycache__` of this folder, those of each module in a folder named by the
 hash of all sources that it depends on: numba itself would go on using a function whose inlined parts changed.

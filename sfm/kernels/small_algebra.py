@@ -1,4 +1,4 @@
-"""Algebra of three and six numbers inside compiled loops: products of vectors, small rotations, systems.
+"""Small algebra for compiled loops: vectors, 6 x 6 blocks, Cholesky, roots of quartics.
 
 Two products of 6 x 6 and 3 x 6 numbers for compiled loops, written in vectors of six.
 

@@ -1,11 +1,9 @@
-"""Threads: of the linear algebra during an adjustment, set on purpose, and of work that is cut into parts.
+"""Threads, processor cores and freed memory of the process, set on purpose.
 
 numpy and scipy bring a BLAS pool each, whose threads spin while they wait. On two cores 100 photographs took
 464 ms with two threads and 219 ms with one, and a symmetric product of 6000 x 1208 took 160 against 129 ms:
 both pools get one thread. Where two threads help, the work is cut into the same two parts whatever their
 number, so that the results are the same to the last bit.
-
-The processor cores that a process may use.
 
 Memory that has been freed: given back to the system after a stage, kept between the steps of one.
 

@@ -3,8 +3,6 @@
 Correlation finds the place to a pixel in a search window, least squares matching takes it from there. Points
 not found in this way are looked for again with templates that are turned and scaled.
 
-Matching without any key point: templates turned and scaled in steps, in the search window.
-
 Affine maps from one photograph to another around points, from the key points near them.
 
 Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or

@@ -1,17 +1,9 @@
-"""Normalised cross-correlation: a template of one photograph looked for in a window of another.
+"""Normalised cross-correlation: the best place of a template, its precision and its rivals.
 
 The coefficient r is that of equation (2.6) of document 002; cv2.matchTemplate does the sums. The peak is
 refined by a parabola, which is good to a tenth of a pixel where the patches differ by a shift only. The sigma
 includes the misfit of the parabola: errors are 0.5 to 1.9 times as large on the textures tried, 2.6 times on
 a smooth one without noise at whole pixels, as nine values do not show the third powers.
-
-Significance of correlation: whether the best place beats the second-best by more than chance.
-
-The peak of a surface of correlation: best and second-best place, regression, parabola, precision.
-
-Correlation of a template with a window of the other photograph that is turned and scaled beforehand.
-
-Why matching gives no position: the flags of correlation and of least squares matching.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Radiometry: mean and contrast of patches, histograms and their equalisation, brightness matching.
+"""Radiometry of patches and photographs in grey: contrast, histograms, brightness.
 
 Photographs in grey, as many at a time as there is place for: each is needed with many others.
 

@@ -1,9 +1,4 @@
-"""Object points whose coordinates are known beforehand (control).
-
-Parameters of interior orientation known beforehand, as from a calibration certificate.
-
-Measured distances between object points.
-"""
+"""Values known beforehand: control points, interior orientation and lengths of scale bars."""
 
 from __future__ import annotations
 

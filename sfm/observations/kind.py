@@ -1,4 +1,4 @@
-"""A kind of observation beside image points: what was observed, how precisely, and what unknowns explain it.
+"""Kinds of observations beside image points: single ones, and groups with common parameters.
 
 A kind is one class in one file of this package. The adjustment takes from it what its normal equations,
 redundancy numbers, tests and variance components need; the report takes its names and units.

@@ -1,11 +1,4 @@
-"""Points on one plane, as targets on a surface plate; the plane is found from them.
-
-Points at one height, as along a water level; Z is up, and the height is found from them.
-
-Points on one plumb line: Z is up, and the place of the line is found from them.
-
-Points on one straight line, as along a wire or an edge; the line is found from them.
-"""
+"""Points on a plane, at one height, on a line or a plumb line, which are found from them."""
 
 from __future__ import annotations
 

@@ -1,17 +1,4 @@
-"""Observations between two object points, or two photographs, each.
-
-Distances between object points, as by tape, tachymeter or laser tracker.
-
-Distances of one instrument, whose additive constant is found from them.
-
-Differences of heights between object points, as by levelling; Z is up.
-
-Differences of coordinates between object points, as of GNSS baselines or a tracker.
-
-Horizontal directions from a station, as by theodolite; its orientation is found from them.
-
-Zenith angles from one object point to another, as by theodolite; Z is up.
-"""
+"""Observations between two points: distances, differences, directions and zenith angles."""
 
 from __future__ import annotations
 

@@ -1,13 +1,4 @@
-"""Position and angles known beforehand: what photographs and mounts of cameras have in common.
-
-Exterior orientation known beforehand (satellite positions, a calibrated rig).
-
-Mounts of the cameras of a rig known beforehand, as from an earlier calibration.
-
-Relative orientations of two photographs, as of a camera that a machine has moved.
-
-Positions of an antenna beside the camera, as by GNSS, with the lever arm in the camera's axes.
-"""
+"""Position and angles known beforehand: of photographs, mounts, photograph pairs and antennas."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Rays of the image points of a network, and the object points in which they meet.
-
-Angles at which the rays of object points meet.
-
-The homography of two photographs of a plane: fitted, and decomposed into camera pairs.
-"""
+"""Rays of image points: where and at which angles they meet, and homographies of planes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""Relative orientation of two photographs from conjugate rays: spatial, planar and infinite scenes.
+"""Relative orientation of two photographs: closed form, and the coplanarity condition adjusted.
 
 Photograph 1 is the frame: X0 = 0, R = I, image axes of photograph 1. Photograph 2 has the base b
 (length 1, as scale is not determined) and R, from image axes 2 to image axes 1.
-
-The coplanarity condition of conjugate rays, adjusted with five unknowns.
 """
 
 from __future__ import annotations

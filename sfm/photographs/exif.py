@@ -1,9 +1,4 @@
-"""EXIF data of a photograph: its camera and sensor, its time and its place.
-
-Positions of satellite navigation in EXIF and XMP data, and a local system of metres about them.
-
-Files of photographs are untrusted: what they claim to be is checked before memory is taken for it.
-"""
+"""EXIF data of a photograph, checked before use: camera, sensor, time and satellite position."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""A plan: stations, what they will give, where that is weak, and what has to be taken along.
-
-Remarks on a plan, and the verdict on it.
+"""A plan: stations, predicted precision and weaknesses; photographs to add after a survey.
 
 After a survey: which few photographs more would help its weakest points most.
 

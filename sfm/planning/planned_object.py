@@ -1,4 +1,4 @@
-"""The object of a plan: points with the directions they face, and the surface that hides them.
+"""The object of a plan: points, the directions they face, and the surface that hides them.
 
 A surface is sampled evenly: many random points of equal density, of which each next one is farthest from
 those taken before.

@@ -1,4 +1,4 @@
-"""Prediction of a planned network: covariance of its points, redundancy, and the rule people know.
+"""Prediction of a planned network: covariance, requirements, and simulated observations.
 
     sigma = q S sigma_image / sqrt(k)
 
@@ -6,8 +6,6 @@ with the mean scale number S, k photographs from each station, and q that states
 
 Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
 Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.
-
-A network as it would be measured: image points and observations of every kind from true values.
 
 Requirements on a network: a standard deviation of points or lengths, or a displacement that is found.
 

@@ -1,9 +1,7 @@
-"""Stations of a plan: where photographs are taken from, and the arrangements that people know.
+"""Stations of a plan: arrangements that people know, and the photographs to take from each.
 
 Source: document 000, sec. 2.5.2 (designs left-right and front-back of V-STARS, four stations after Fraser),
 whose figures show them; Fraser (1984), Photogramm. Eng. Remote Sens. 50(8), for convergent networks.
-
-The list of photographs that a plan asks for, and the coded targets that each of them needs.
 """
 
 from __future__ import annotations

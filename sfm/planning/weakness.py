@@ -1,4 +1,4 @@
-"""Where a planned network is weak, and why: points, photographs, and the calibration of the camera.
+"""Where a planned network is weak, and what the rig and each kind of observation contribute.
 
 Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (what determines interior orientation:
 convergence, rolled photographs, depth of the object); Baarda (1968) for reliability.

@@ -1,7 +1,4 @@
-"""The table of `kolinear match` as text, CSV and JSON, and the files that it may replace.
-
-What `kolinear resect` prints: one method in full as JSON or text, or all methods side by side.
-"""
+"""What `kolinear match` and `kolinear resect` print and write."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The folder of a result: written beside its place, then put there by one rename, or not at all.
-
-Survey file and photographs of the result in a folder, which no other survey replaces unseen.
+"""The folder of a result: written beside its place, then renamed; its origin and its log.
 
 The log of a survey for machines: one JSON object per line, written as things happen.
 

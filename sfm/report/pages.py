@@ -1,4 +1,4 @@
-"""The pages of the program: a row for each, and how one is written with its files.
+"""The pages of the program: a row for each, rendered as HTML or as plain text.
 
 A declared page as HTML, with everything that it shows inside it, and its Content-Security-Policy.
 

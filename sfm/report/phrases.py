@@ -1,4 +1,4 @@
-"""Sentences that several reports and the terminal print: the same words everywhere.
+"""Sentences and numbers as several reports and the terminal print them.
 
 Numbers as people read them: significant digits, exponents, units of a readable size.
 

@@ -1,4 +1,4 @@
-"""The public names of a package: imported when they are first asked for, listed once, in its stub.
+"""The public names of a package, imported when asked for, and the check of its installation.
 
 `__init__.pyi` is what type checkers and editors read. Every row of it is one public name, `from module import
 name as name`, or one room, `from . import room as room`; a new name is a new row and nothing else.

@@ -1,8 +1,6 @@
-"""The result of a survey, put together from what its stages returned.
+"""The survey beside other programs, and the result put together from what its stages returned.
 
 The settings that a survey was run with, as its report lists them.
-
-The survey beside other programs: another adjuster on its network, another pipeline on its photographs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The orientation of a survey, and the remarks where there is none.
+"""The orientation of a survey, the distortion model it needs, and remarks where there is none.
 
 The distortion model of cameras where the survey does not state it: central perspective or fisheye.
 

@@ -1,7 +1,4 @@
-"""Measurement of circular targets by the least squares fit of a blurred ellipse.
-
-Rejection: which of the fitted candidates are no targets, and why.
-"""
+"""Measurement of circular targets by a blurred ellipse, and which candidates are none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outlines in a photograph that resemble ellipses: the candidates for targets.
+"""Outlines that resemble ellipses, the candidates for targets, and the quality flags.
 
 Quality flags of targets and of rejected candidates: the one list of reasons.
 

@@ -1,4 +1,4 @@
-"""Direct orientation: photographs brought onto control in one adjustment, without a model in between.
+"""Direct orientation of a pair onto control, and adjustment of points and photographs in turn.
 
 Separate adjustment: object points and orientations in turn, in place of all unknowns together.
 

@@ -1,7 +1,4 @@
-"""Correlation from coarse to fine, in pyramids of photographs of half the size each.
-
-Correlation along lines, such as the epipolar lines of two oriented photographs.
-"""
+"""Correlation from coarse to fine, and along lines such as epipolar lines."""
 
 from __future__ import annotations
 

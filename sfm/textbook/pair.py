@@ -1,4 +1,4 @@
-"""The five parameters of a relative orientation: dependent pair and independent pair.
+"""Pairs of photographs: dependent and independent relative orientation, normal images.
 
 Dependent: photograph 1 keeps its frame, photograph 2 gets by, bz (at a given bx) and omega, phi, kappa.
 Independent: the base is the X axis of the model, photograph 1 gets phi1, kappa1 (omega1 = 0), photograph 2

@@ -1,9 +1,7 @@
-"""Photo coordinates: corrections in their order, each with its inverse, and simulated photographs.
+"""Photo coordinates: fiducial marks, corrections in their order with inverses, simulation.
 
 All corrections are radial or nearly so and are applied one after the other, from the measured point to
 the collinearity equations: principal point, radial distortion, decentring, refraction, earth curvature.
-
-Interior orientation of scanned photographs: from comparator to photo coordinates by fiducial marks.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Covariance of the unknowns due to the correlation of neighbouring image points.
+"""Influence of image points on the unknowns, and covariance where neighbouring errors correlate.
 
 Least squares with weights of independent errors stays unbiased where the errors of a photograph are
 correlated, but is less precise than its cofactors show. With the influence Z of the errors e on the unknowns,

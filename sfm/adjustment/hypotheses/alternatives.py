@@ -1,4 +1,4 @@
-"""The alternatives: what is freed (family) in which photographs (pattern), each with its gain.
+"""Alternative hypotheses, each with its gain, and common causes of rejected image points.
 
 A family is a set of columns; a pattern gives each photograph a factor on them, see `patterns`. The level of
 the test is shared out among all alternatives, and lowered by what was searched inside each: the number of

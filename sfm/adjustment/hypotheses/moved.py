@@ -1,4 +1,4 @@
-"""Alternatives of an object that did not stay as it was: points, bodies or a part of it moved in between.
+"""Alternatives of an object or a rig that moved, and the patterns of photographs they affect.
 
 They moved at a place in the sequence of photographs. Points that move by different vectors are tried by
 their single gains, those that shift by one vector by two means, and bodies as they are known.

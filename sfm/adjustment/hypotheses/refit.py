@@ -1,4 +1,4 @@
-"""The winning alternative adjusted together with everything else, from all image points.
+"""The winning alternative adjusted with everything else; external reliability of alternatives.
 
 The parameters of the alternative take the score step, their effect leaves the image points, and the network
 is adjusted anew; a few rounds end at the joint optimum. Rejected image points come back where they fit.

@@ -1,4 +1,4 @@
-"""Whether all points and all photographs of a result were measured alike, by the sizes of their residuals.
+"""Whether points and photographs were measured alike, and which rays cannot be told apart.
 
 A bent target or a blurred photograph leaves residuals small enough for the tests of single image coordinates,
 and yet larger than chance makes them together. All tests are against sigma0 a posteriori, with cameras and

@@ -1,4 +1,4 @@
-"""Correlations of camera parameters with the exterior orientation: what the network cannot distinguish.
+"""Correlations of camera parameters and of neighbouring image points; uncertainty of projection.
 
 In a flat network with parallel views c is strongly correlated with Z0, x0 and y0 with X0, Y0 or with the
 angles: the standard deviations of both are then large together, while distances between points may be good.

@@ -1,4 +1,4 @@
-"""Statistics of a finished adjustment, in the words of the field.
+"""Statistics of a finished adjustment: redundancy numbers, tests, minimal detectable bias.
 
 Global test of the model, tests of the image coordinates, their minimal detectable bias and external
 reliability, significance of parameters, strong correlations.

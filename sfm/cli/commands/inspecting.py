@@ -1,7 +1,4 @@
-"""Commands on finished results: shapes and distances of the object, and acceptance tests.
-
-The command that opens a result to be explored.
-"""
+"""Commands on finished results: inspect, accept and view."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Commands about single photographs: match, resect and targets.
-
-The body of `kolinear match`: two photographs and points in, a table, JSON and a picture out.
-
-The points of one photograph and its interior orientation, read from files for `kolinear resect`.
-"""
+"""Commands about single photographs: match, resect and targets."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Commands before a survey: where to stand, the precision expected, and how large targets must be.
-
-Commands between a plan and its survey: the plan simulated, and photographs to add to a result.
-"""
+"""Commands around a survey: plan, targets of a plan, simulate, and photographs to add."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Input of the commands of planning: object, camera, stations, and lists of numbers in one option.
-
-Cameras by their sensor, for plans made before one is bought or calibrated; the lens comes on top.
+"""Input of the commands of planning: object, cameras, stations, and lists of numbers.
 
 Source: sizes of sensors and photographs as the makers state them; Nikon D60 as in document 000, sec. 2.5.1.
 """

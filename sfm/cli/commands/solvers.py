@@ -1,7 +1,4 @@
-"""Commands about solutions: validate, compare and convert.
-
-The command `epochs`: what moved between two or more surveys of one object.
-"""
+"""Commands about solutions: validate, compare, epochs and convert."""
 
 from __future__ import annotations
 

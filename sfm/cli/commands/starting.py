@@ -1,9 +1,4 @@
-"""The first second of a command, and Ctrl-C at any moment.
-
-The first command of an installation, which compiles the kernels, all cores at it.
-
-The command that looks at an installation: what is there, where things are kept, whether it measures.
-"""
+"""Starting the program: the first compilation, Ctrl-C, and `doctor`, which checks an installation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Commands about a survey: run and adjust.
-
-Command about surveys without a survey file: one is drafted from photographs.
-"""
+"""Commands about a survey: run, init and adjust."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Comparison of two adjusters on one network.
+"""Comparison of two adjusters on one network, with a camera that both can estimate.
 
 Two adjusters are compared on what both can do: the accepted
 image points with equal weights, no control and no scale bars, and one functional model, which for a
@@ -10,8 +10,6 @@ all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is 
 result in both adjusters, and the comparison reports it.
 
 Cameras that share single parameters, for adjusters that know no such sharing.
-
-The network that two adjusters are given alike: one model, equal weights, free datum, the same unknowns.
 
 Whether the other adjuster's camera fits the image points better than that of the survey, and what to free.
 

@@ -1,4 +1,4 @@
-"""Best-fit shapes with the covariance of their points: the general case of least squares.
+"""Best-fit shapes: orthogonal distances with equal weights, or with the covariance of the points.
 
 Each point x has constraints d(x + v, p) = 0, and v' Q^-1 v is least. Linearised at the adjusted points,
 B v + A dp + w = 0 with w = d + B (x - x_adjusted); the equivalent weights of the constraints are those of
@@ -11,8 +11,6 @@ the adjusted points and the shape are moved together: its form, v' Q^-1 v and th
 
 Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
 adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory).
-
-Orthogonal-distance fits with equal or single weights, by Levenberg and Marquardt.
 
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
 Marquardt (1963), SIAM J. 11(2); Nielsen (1999), Damping parameter in Marquardt's method.

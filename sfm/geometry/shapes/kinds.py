@@ -1,4 +1,4 @@
-"""The kinds of shapes: orthogonal distance of points in the axes of the shape, with its derivatives.
+"""Shapes in space and their kinds: orthogonal distances of points, with derivatives.
 
 Each shape has its axes y = R' (x - c): its axis or normal is y3. A kind lists which of the six
 motions of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form
@@ -8,8 +8,6 @@ it. The derivative by a motion follows for all kinds alike from g (`shape.design
 
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8.
-
-A shape in space: its kind, its axes and its form, and how distances change with each of them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Start values of shapes from their points alone, by algebraic fits.
+"""Start values of shapes from their points: algebraic fits, and those that most points agree on.
 
 A line, plane, circle, ellipse and sphere have a direct solution. A cylinder, cone, torus and paraboloid
 become linear, or a circle, once their axis is known: directions all over the half sphere are tried, and the
@@ -6,8 +6,6 @@ best are refined by orthogonal distances.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and
 Flusser (1998), Numerically stable direct least squares fitting of ellipses.
-
-Shapes that most of the points agree on: least median of squares, then Tukey's biweight.
 
 Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, ch. 5; Beaton and Tukey (1974),
 Technometrics 16(2).

@@ -1,9 +1,7 @@
-"""Windows that cover photographs: of how many pixels, and those that do not overlap.
+"""Windows that cover photographs without overlap, and object points projected into them.
 
 Windows that overlap measure the same pixels twice, and their errors have these in common: a result would
 be reported too precise, and no residual shows it.
-
-Pictures of object points in oriented photographs, and of windows on planes through them.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""Normal equations of a patch: gradients of the template, their products, and the solution.
+"""Least squares matching of a patch: window, warp, gradients and normal equations.
 
 Observations are the intensities of the window; unknowns are 2, 6 or 8 geometric parameters, offset and gain,
 and, where the photographs may be blurred differently, three of the difference of their blur.
 The template is in single precision, the sums are in double.
-
-Windows: the intensities of a photograph on the grid of a window, shifted or warped.
-
-The warp of a patch: homography H from its window to pixels of the right photograph.
 """
 
 from __future__ import annotations

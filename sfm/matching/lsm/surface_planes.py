@@ -1,4 +1,4 @@
-"""Planes of the surface at places of an oriented photograph, from the object points that it sees.
+"""Planes of the surface where a photograph sees it, and windows as large as they allow.
 
 Matches with windows as large as the surface is plane over: smaller ones where it is not.
 

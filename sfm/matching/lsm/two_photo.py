@@ -1,4 +1,4 @@
-"""Least squares matching: where the patch of one photograph is in another, to a hundredth of a pixel.
+"""Least squares matching: where a patch of one photograph is in another, and how well.
 
 The patch T around a point of the left photograph and the right photograph S are tied by
 
@@ -9,8 +9,6 @@ Gauss-Newton is written the inverse way: the change dH of a step is applied to t
 and normal equations then stay the same from step to step, and is put on H as H <- H dH^-1. The right
 photograph is resampled in every step, the gradients are symmetric differences of the resampled template.
 At convergence it is the least squares solution of the forward equations, up to the noise of the gradients.
-
-How well a patch was matched: residuals, covariance of the shift, and whether to believe it.
 """
 
 from __future__ import annotations

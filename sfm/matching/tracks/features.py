@@ -1,4 +1,4 @@
-"""SIFT features of natural texture, spread over a photograph, and which of two photographs belong together.
+"""SIFT features of natural texture, and which photographs have enough in common to match.
 
 Source: Lowe (2004), IJCV 60(2); Hartley and Zisserman (2003), sec. 11.6 (epipolar geometry by RANSAC).
 

@@ -1,9 +1,7 @@
-"""Interest points: the Foerstner operator, with the ellipse of precision of every point.
+"""Interest points by the Foerstner operator: the natural points of a photograph.
 
 Where gradients of all directions meet in a window, a match is precise in all directions: the normal
 equations N = sum g g^T of a shift are large (weight w) and round (roundness q).
-
-Natural points of one photograph, found before any other photograph is read.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A network that grows: resection, intersection, adjustment, one estimate replaced step by step.
-
-Which photographs of a network are held up by the others, and which only happen to fit a few points.
-"""
+"""A network that grows: resection, intersection, adjustment, and which photographs are confirmed."""
 
 from __future__ import annotations
 

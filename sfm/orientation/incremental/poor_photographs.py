@@ -1,4 +1,4 @@
-"""Photographs that fit worse than the others: mirrored ones leave, less precise ones stay.
+"""Photographs that fit worse than the others, and other solutions of a flat object.
 
 On an object with little depth a mirrored picture finds a place behind it or at its side where most of its
 image points fit a wide tolerance, and near-duplicates of it bend with it. Turned over it fits the others as

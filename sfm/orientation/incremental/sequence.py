@@ -12,8 +12,6 @@ Given start values of a network: completed and adjusted as they are, judged afte
 
 A photograph is oriented anew only where most of its image points do not fit the others after the adjustment;
 where most photographs do not, the given values are wrong, and the caller starts without them.
-
-Points that no photograph was oriented on: intersected at last, at whatever angle, or named.
 """
 
 from __future__ import annotations

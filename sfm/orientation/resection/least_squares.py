@@ -1,7 +1,4 @@
-"""Space resection by least squares: the collinearity equations, with history and dispersion matrix.
-
-One exterior orientation found by a resection, with the figures that separate good ones from bad ones.
-"""
+"""Space resection by least squares, and the figures that separate good orientations from others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A network designed for what is wanted: stations one by one, exchanged, and left out again where possible.
+"""A network designed for what is wanted: candidates for stations, their gain, and the choice.
 
 The choice goes by the limiting covariance of points, in which the orientations are held (`gain`); each
 point's share of what that ignores - orientation, self-calibration, datum - is taken from the full covariance
@@ -6,8 +6,6 @@ of the network so far. Figures of the design always are of the full covariance.
 
 Source: Fraser (1984) (zero- to first-order design); Fedorov (1972), Theory of Optimal Experiments (greedy
 choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing cameras).
-
-Candidates for stations: where one may stand, and where to look from there.
 
 Source: van der Corput, Halton (1960), Numer. Math. 2 (evenly spread positions).
 

@@ -1,9 +1,7 @@
-"""Which point is seen from which station, and how well: the model of a photograph not yet taken.
+"""Which point is seen from which station, and how well; depth of field and sizes of targets.
 
 Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
 Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution).
-
-Depth of field of a lens.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 3.1.1.3; with the hyperfocal distance
 H = f^2 / (N c) + f, near s (H - f) / (H + s - 2 f) and far s (H - f) / (H - s).
@@ -18,8 +16,6 @@ its centre, which the measurement of targets reaches within some 5 % where the b
     circle of radius R: sigma^2 = 2 s noise^2 / (sqrt(pi) R A^2)
 
 Source: Cramer-Rao bound; Foerstner and Wrobel (2016), sec. 4.2.
-
-Design of a network: how large targets must be, before anything is photographed.
 """
 
 from __future__ import annotations

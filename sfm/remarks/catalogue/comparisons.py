@@ -1,9 +1,4 @@
-"""Remarks on a comparison of two results or of two epochs.
-
-Refining the models of other programs.
-
-Other programs: whether another adjuster or pipeline agrees.
-"""
+"""Remarks on comparisons, epochs, refined models and other programs."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Remarks on scale bars, control and observed orientation, and on the scale that they give.
-
-Datum, scale and given values: what of them was not used or not found.
-"""
+"""Remarks on given values, datum and scale."""
 
 from __future__ import annotations
 

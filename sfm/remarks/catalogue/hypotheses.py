@@ -1,7 +1,4 @@
-"""Remarks on alternative hypotheses that win over the assumptions of a survey.
-
-The adjustment: convergence, rank, sigma0, tests of image points, other solutions.
-"""
+"""Remarks on the adjustment, and on alternative hypotheses that win over its assumptions."""
 
 from __future__ import annotations
 

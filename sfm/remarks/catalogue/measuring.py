@@ -1,7 +1,4 @@
-"""Remarks on measuring a result: shapes, tolerances, and acceptance tests against calibrated lengths.
-
-Object points and image points: rays that are lost, points that are not in the result, copies.
-"""
+"""Remarks on points and image points, and on measuring a result."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Photographs: which are not in the result and why, and which differ from the others.
-
-Remarks on errors of the input that do not stop a survey.
-
-Drafts of survey files: what the photographs of a folder do not show, or show badly.
-"""
+"""Remarks on photographs, on input, and on drafts of survey files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Remarks on a planned network, and on its limits.
-
-Many surveys, and many networks: how they ended.
-"""
+"""Remarks on plans, batches and validations."""
 
 from __future__ import annotations
 

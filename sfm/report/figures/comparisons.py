@@ -1,9 +1,4 @@
-"""Pictures of comparisons: differences of two results, and the time of two adjusters.
-
-Design diagram of targets: how large they must be at which distance.
-
-Pictures of measured results: deviations with their limits, errors of length measurement.
-"""
+"""Figures of comparisons, of measured results, and of the sizes of targets."""
 
 from __future__ import annotations
 

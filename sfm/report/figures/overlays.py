@@ -1,7 +1,4 @@
-"""Overlays: each photograph with its targets, ids, residual vectors and rejected candidates.
-
-The picture of `kolinear match`: template, matched patch and difference of each point.
-"""
+"""Overlays: photographs with their targets and residuals, and patches that were matched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The statistics of a bundle report: tests, reliability, variance components, significance, correlations.
+"""Statistics, geometry and given values of a bundle report, each with its residuals.
 
 Geometry of an adjusted network: rays and angles of points, coverage of photographs, their residuals.
 
@@ -7,8 +7,6 @@ Only image points that were accepted count.
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.1 (network design: rays, intersection
 angles, full format); the figures are those that the report of DBAT gives (Boerlin and Grussenmeyer 2013,
 Photogramm. Record 28(144)).
-
-The given values that took part in an adjustment, with their residuals, kind by kind.
 """
 
 from __future__ import annotations

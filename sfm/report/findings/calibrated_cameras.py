@@ -1,8 +1,6 @@
-"""The cameras of a calibration: what matters in a result whose points are given, as those of a plate.
+"""Calibrated cameras as people ask for them, and where the cameras of rigs are mounted.
 
 Interior orientation as people ask for it: every parameter once, whoever shares it.
-
-Where the cameras of rigs are mounted: base and angles from the reference camera.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Remarks on the cameras of a survey: hardly determined, where no lens has them.
-
-How sharp the photographs are, by the edges of their targets, and which are blurred beside the others.
-"""
+"""Remarks on the cameras of a survey, and on photographs that are blurred."""
 
 from __future__ import annotations
 

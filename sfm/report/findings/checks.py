@@ -1,9 +1,7 @@
-"""How well the observations agree with one another: residuals in standard deviations, checks at control.
+"""How well observations agree with one another and with control, and how precise unknowns are.
 
 The basis of a verdict. Standard deviations are those stated before the adjustment; sigma0 shows by how
 much they were wrong, and must not hide it.
-
-Precision of the unknowns over the whole network; what is fixed has none and does not count.
 """
 
 from __future__ import annotations

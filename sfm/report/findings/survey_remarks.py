@@ -1,4 +1,4 @@
-"""Remarks on a survey as a whole, and its verdict: the adjustment, its rays, photographs and comparisons.
+"""Everything that the reports of a survey state, computed once: findings, remarks and verdict.
 
 Remarks on given values after the adjustment: residuals, checks, and whether the scale can be.
 

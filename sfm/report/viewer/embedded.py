@@ -1,4 +1,4 @@
-"""The viewer as a page embeds it: script, styles, data, pictures, and the policy that allows them.
+"""The viewer embedded in a page, and the scenes of solutions and of what follows from them.
 
 A scene as text inside a page: names as JSON, numbers as arrays, gzip, base64.
 
@@ -9,10 +9,6 @@ A scene as text inside a page: names as JSON, numbers as arrays, gzip, base64.
 The header names them as [type, first byte, values]. Its reader is viewer/src/data.js.
 
 Source: RFC 1952 (gzip), RFC 4648 (base64).
-
-The scene of any solution: a survey's result, tables, a COLMAP model or another program's.
-
-Scenes of what follows from solutions: displacements, measurements and plans.
 """
 
 from __future__ import annotations

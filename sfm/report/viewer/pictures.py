@@ -1,9 +1,7 @@
-"""Pictures of a page to explore: thumbnails, photographs and crops about the targets, within a budget.
+"""What the viewer of a page shows: the scene as parallel arrays, and pictures within a budget.
 
 Thumbnails come first, then photographs, then crops, those of the largest residuals first. Files beside the
 page have what has no room in it: every photograph, and the crops of each in one picture of cells.
-
-ViewerScene: everything that the viewer of a page shows, as parallel arrays, whoever computed it.
 """
 
 from __future__ import annotations

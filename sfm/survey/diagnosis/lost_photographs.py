@@ -1,4 +1,4 @@
-"""Photographs that are not oriented or fit badly: which are not connected, and whether c is the reason.
+"""Photographs without orientation: not connected, turned at one place, or of a second object.
 
 Photographs that a camera took while it turned at one place: rotations alone fit, and no point has a depth.
 

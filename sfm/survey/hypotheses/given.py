@@ -1,4 +1,4 @@
-"""Scale bars, control and observed projection centres, judged by the image points before they are used.
+"""Given values and mounts, judged by the image points before they are used.
 
 A contradicting value is left out and named where the others identify it; where they do not, nothing that it
 touches is believed. The rest takes part in the adjustment.

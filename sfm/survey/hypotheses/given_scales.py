@@ -1,7 +1,4 @@
-"""Lengths of scale bars, and the scales of control and projection centres, judged against one another.
-
-Given values with what they are judged by: the free network, and a kind of given points as judged.
-"""
+"""Scales by bars, control and projection centres, judged against one another."""
 
 from __future__ import annotations
 

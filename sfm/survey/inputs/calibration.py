@@ -1,4 +1,4 @@
-"""Interior orientation of an earlier result: held in another survey, or an observation in it.
+"""Interior orientation of an earlier result, and the calibration plate of a survey.
 
     summary.json                model, size and pixel of each camera
     cameras.csv                 camera,parameter,value,sigma of each parameter; without sigma it was held
@@ -8,8 +8,6 @@ As an observation it counts with the full covariance of its parameters, so that 
 adjusted one after the other give what both give adjusted together, as far as they share nothing else.
 
 Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 5.6 (a priori parameter constraints).
-
-The calibration plate of a survey: its family, and its points as control and start values.
 """
 
 from __future__ import annotations

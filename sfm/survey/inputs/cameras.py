@@ -1,4 +1,4 @@
-"""The cameras of a survey with their start values, from the survey file and the photographs.
+"""The cameras of a survey: start values and interior orientation as asked for.
 
 Interior orientation as the survey asks for it: of all photographs, of groups, or of each; observed or not.
 

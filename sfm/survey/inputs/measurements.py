@@ -1,7 +1,4 @@
-"""Measurements of the photographs of a survey: targets, natural texture, or given image points.
-
-The photographs of a survey: the files that the globs of its cameras name.
-"""
+"""The photographs of a survey and their measurements: targets, texture or given image points."""
 
 from __future__ import annotations
 

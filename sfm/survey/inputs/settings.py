@@ -1,7 +1,4 @@
-"""The sections of the survey file: their keys, types and bounds.
-
-Errors in a survey file, in one line each: file, line, key, what was found and what was needed.
-"""
+"""The sections of the survey file: keys, types and bounds, and errors in one line each."""
 
 from __future__ import annotations
 

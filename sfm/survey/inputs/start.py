@@ -1,4 +1,4 @@
-"""The network that a survey starts from: given observations, control, scale bars, and start values.
+"""The network that a survey starts from: what is given of points, photographs and cameras.
 
 Image points outside their photograph: no photograph has them, so that a setting or a value is wrong.
 
@@ -6,8 +6,6 @@ Single ones are gross errors and are left out by name. More of them refuse the s
 them inside: x and y exchanged, another unit, or a larger photograph.
 
 Image points that are more than once in a table: one point measured twice in one photograph.
-
-The network of a survey: its image points, and all that was given of points, photographs and cameras.
 """
 
 from __future__ import annotations

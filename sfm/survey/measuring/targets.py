@@ -1,9 +1,4 @@
-"""The targets of all photographs of a survey, measured side by side.
-
-Working through the photographs of a survey, side by side, whatever single ones of them are like.
-
-Photographs of another size under one camera: they get a separate camera, or are left out and reported.
-"""
+"""The targets of all photographs of a survey, measured side by side."""
 
 from __future__ import annotations
 

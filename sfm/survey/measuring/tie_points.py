@@ -1,7 +1,4 @@
-"""The tie points of all photographs of a survey without targets, as a network.
-
-Which photographs were taken near one another: by satellite navigation, and in a series.
-"""
+"""The tie points of a survey without targets, and which photographs are near one another."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The orientation of a model from its key points measured anew, and all that is intersected from it.
-
-Coded targets in the photographs of a model: points of it that bring scale and datum.
-"""
+"""The orientation of a model from key points and coded targets measured anew."""
 
 from __future__ import annotations
 

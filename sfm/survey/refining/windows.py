@@ -1,7 +1,4 @@
-"""Key points of a model measured anew, each in all photographs of its point by the window of one of them.
-
-The photographs and masks of a model: where they are, and as many in memory as there is place for.
-"""
+"""Key points of a model measured anew in its photographs."""
 
 from __future__ import annotations
 

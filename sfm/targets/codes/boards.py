@@ -1,4 +1,4 @@
-"""Boards as targets: the crossings of checkerboards, ChArUco boards and AprilGrids, and which they are.
+"""Boards as targets: checkerboards, whole or cut, ChArUco boards and AprilGrids.
 
 A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
 follows from its colours, the first square being the dark one. Of the turns that look alike (see

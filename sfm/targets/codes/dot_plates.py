@@ -1,12 +1,10 @@
-"""Plates of dots: which dot of the plate each of a photograph is.
+"""Plates of dots: the lattice of dots in a photograph, and which dot of the plate each is.
 
 Dots make a lattice (see `lattice`). A placement puts it on the plate: turned by quarters, or for shifted
 rows one of the bases of the lattice, and moved. With marks each placement that overlaps the plate has a
 likelihood: dots are as large as perspective makes them but for errors, marks larger by one common ratio, and
 some dots may be anything (damage, shadows). The placement that is certain is taken; what lies beyond the
 plate gets no name. Without marks the whole plate must be seen, and nothing beside it.
-
-Rows and columns of dots in a photograph, grown from dot to dot as the plate is seen in perspective.
 """
 
 from __future__ import annotations

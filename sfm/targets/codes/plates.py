@@ -1,4 +1,4 @@
-"""Calibration plates: grids of dots, checkerboards, ChArUco boards, AprilGrids; numbers of their points.
+"""Calibration plates with their point numbers, and all code families by name.
 
 Point `row * columns + column` is the dot or crossing in that row and column, both from 0, rows downwards and
 columns to the right as the plate is printed. Any side may be called the upper one, as long as marks and the

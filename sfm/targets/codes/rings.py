@@ -1,7 +1,4 @@
-"""Ring codes: the patterns of the published families, and tables of others in files.
-
-Reading of ring codes: what is in the ring around each measured dot.
-"""
+"""Ring codes: published patterns, tables in files, and how they are read around a dot."""
 
 from __future__ import annotations
 

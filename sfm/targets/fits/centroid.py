@@ -1,7 +1,4 @@
-"""Centroids of targets: binary, weighted with the intensity, weighted with its square.
-
-Ellipses through the sub-pixel edges of targets.
-"""
+"""Centres of targets by centroids, and by ellipses through sub-pixel edges."""
 
 from __future__ import annotations
 

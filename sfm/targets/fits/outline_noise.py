@@ -1,4 +1,4 @@
-"""Noise of the outlines of targets: how much larger than by the noise of intensities the variances are.
+"""Outlines of targets: their noise, and damage against the shape that they share.
 
 Harmonics 3 to 6 of an outline follow no ellipse. They are estimated jointly with it on what is left of the
 edge. Deviations common to the targets of a photograph are shape. The rest shows the variance of the first

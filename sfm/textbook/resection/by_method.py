@@ -1,7 +1,4 @@
-"""Resection by the name of a method: one photograph's points in, what that method finds out.
-
-The critical (danger) cylinder: where the resection from three points has no accuracy.
-"""
+"""Resection by the name of a method, and the critical cylinder."""
 
 from __future__ import annotations
 

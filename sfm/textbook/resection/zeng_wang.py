@@ -1,7 +1,4 @@
-"""Space resection by Zeng and Wang: quartic in n, trilateration, direction test, Pope-Hinsken rotation.
-
-Space resection by Rampal: corrections of the face angles, linearised, then linear equations.
-"""
+"""Space resection by Zeng and Wang, and by Rampal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fronts of a multifrontal factorisation: groups of photographs and what each of them is joined with.
+"""Fronts of a multifrontal factorisation: their order, their sizes, and sums over pairs of rays.
 
 A front is the full matrix of the photographs of a group of nested dissection and of those, eliminated later,
 that share object points with the group or with what was eliminated before it. All photographs that see an

@@ -1,9 +1,7 @@
-"""Interface of the solvers of the reduced normal equations, whichever way the matrix is stored.
+"""Interface of the solvers of the reduced normal equations, and the memory they may use.
 
 The reduced normal matrix S of orientations and kept points is factored once for each step; its factor
 solves for the step and, at the optimum, gives the elements of S^-1 that covariances are made of.
-
-Memory that the normal equations may use, of this computer, its container, or the process.
 """
 
 from __future__ import annotations
