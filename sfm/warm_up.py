@@ -36,7 +36,7 @@ from sfm.matching.tracks.interest import foerstner_points, natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
-from sfm.planning.design.designer import gains
+from sfm.planning.designer import gains
 from sfm.planning.planned_object import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring

@@ -1,8 +1,8 @@
 """The public names of `sfm.planning`, a row each."""
 
-from sfm.planning.design.designer import Design as Design
-from sfm.planning.design.designer import StationLimits as StationLimits
-from sfm.planning.design.designer import design_network as design_network
+from sfm.planning.designer import Design as Design
+from sfm.planning.designer import StationLimits as StationLimits
+from sfm.planning.designer import design_network as design_network
 from sfm.planning.plan import Further as Further
 from sfm.planning.plan import further_photographs as further_photographs
 from sfm.planning.planned_object import BoxTree as BoxTree
@@ -16,18 +16,18 @@ from sfm.planning.prediction import Prediction as Prediction
 from sfm.planning.prediction import ScaleBarPlan as ScaleBarPlan
 from sfm.planning.prediction import WantedPrecision as WantedPrecision
 from sfm.planning.prediction import predict_network as predict_network
-from sfm.planning.sight.visibility import DepthOfField as DepthOfField
-from sfm.planning.sight.visibility import Lens as Lens
-from sfm.planning.sight.visibility import Seeing as Seeing
-from sfm.planning.sight.visibility import Sight as Sight
-from sfm.planning.sight.visibility import TargetImage as TargetImage
-from sfm.planning.sight.visibility import TargetSize as TargetSize
-from sfm.planning.sight.visibility import centre_covariance as centre_covariance
-from sfm.planning.sight.visibility import compute_target_size as compute_target_size
-from sfm.planning.sight.visibility import depth_of_field as depth_of_field
-from sfm.planning.sight.visibility import sight_of as sight_of
 from sfm.planning.stations import Stations as Stations
 from sfm.planning.stations import arrangement as arrangement
 from sfm.planning.stations import choose_coded as choose_coded
+from sfm.planning.visibility import DepthOfField as DepthOfField
+from sfm.planning.visibility import Lens as Lens
+from sfm.planning.visibility import Seeing as Seeing
+from sfm.planning.visibility import Sight as Sight
+from sfm.planning.visibility import TargetImage as TargetImage
+from sfm.planning.visibility import TargetSize as TargetSize
+from sfm.planning.visibility import centre_covariance as centre_covariance
+from sfm.planning.visibility import compute_target_size as compute_target_size
+from sfm.planning.visibility import depth_of_field as depth_of_field
+from sfm.planning.visibility import sight_of as sight_of
 from sfm.planning.weakness import Calibratability as Calibratability
 from sfm.planning.weakness import calibratability as calibratability

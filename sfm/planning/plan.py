@@ -25,7 +25,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.observations.kind import POINT
-from sfm.planning.design.designer import Candidates, Design, StationLimits, candidates, gains, image_rows
+from sfm.planning.designer import Candidates, Design, StationLimits, candidates, gains, image_rows
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import (
     MIN_POINTS,
@@ -36,9 +36,8 @@ from sfm.planning.prediction import (
     predict_network,
     short_of,
 )
-from sfm.planning.sight import MIN_PIXELS
-from sfm.planning.sight.visibility import STEEPEST_DEG, Seeing, TargetSize, compute_target_size
 from sfm.planning.stations import Shot, Stations, choose_coded, shots
+from sfm.planning.visibility import MIN_PIXELS, STEEPEST_DEG, Seeing, TargetSize, compute_target_size
 from sfm.planning.weakness import (
     Calibratability,
     Contribution,
@@ -275,7 +274,7 @@ def further_photographs(
     Raises:
         GeometryError: fewer than 2 photographs or 3 points, no count, or nothing is seen from there.
 
-    Source: Fedorov (1972); limiting error propagation, see `sfm.planning.design.designer`.
+    Source: Fedorov (1972); limiting error propagation, see `sfm.planning.designer`.
     """
     if count < 1:
         raise GeometryError(f"plan: {counted(count, 'further photograph')}, needed 1 or more")

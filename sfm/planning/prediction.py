@@ -38,8 +38,8 @@ from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, row
 from sfm.observations.kind import Group
 from sfm.orientation.image_rays import ray_angles
 from sfm.planning.planned_object import PlannedObject
-from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations
+from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.similarity import similarity_motions
 
 MIN_RAYS = 3  # of a point: with two it is never seen whose a gross error is

@@ -17,7 +17,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Mounts
 from sfm.planning.planned_object import PlannedObject
-from sfm.planning.sight.visibility import best_focus
+from sfm.planning.visibility import best_focus
 
 MIN_CODED_TARGETS = 5  # targets in every photograph, by which it is oriented by resection
 FILLING = 0.9  # share of the format that the object fills

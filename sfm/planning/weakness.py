@@ -37,7 +37,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, spread_evenly, usable
-from sfm.planning.sight.visibility import WORDS, Seeing, Why
+from sfm.planning.visibility import WORDS, Seeing, Why
 from sfm.reduced_network import reduce_network
 from sfm.similarity import OPEN, motions_along
 

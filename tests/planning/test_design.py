@@ -10,7 +10,7 @@ import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
-from sfm.planning.sight.visibility import compute_target_size
+from sfm.planning.visibility import compute_target_size
 from sfm.report.figures.comparisons import DIAGRAM_PIXELS, design_diagram
 
 

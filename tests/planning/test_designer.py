@@ -11,7 +11,7 @@ import pytest
 from sfm.camera import camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.planning.design.designer import POWER, StationLimits, candidates, design_network, gains, image_rows
+from sfm.planning.designer import POWER, StationLimits, candidates, design_network, gains, image_rows
 from sfm.planning.planned_object import PlannedObject, object_of_points, shape_object
 from sfm.planning.prediction import (
     MIN_RAYS,
@@ -21,8 +21,8 @@ from sfm.planning.prediction import (
     predict_network,
     short_of,
 )
-from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import Stations, arrangement, choose_coded, looking, roll_deg, rolled
+from sfm.planning.visibility import Seeing, sight_of
 from sfm.runtime.progress import Silent, StageClock
 from tests.synthetic import seed_of
 

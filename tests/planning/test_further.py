@@ -17,8 +17,8 @@ from sfm.network import Estimate, Network
 from sfm.planning.plan import further_photographs, plan_of, verdict_of_plan
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import WantedPrecision, predict_network
-from sfm.planning.sight.visibility import Seeing, TargetImage
 from sfm.planning.stations import Stations, arrangement
+from sfm.planning.visibility import Seeing, TargetImage
 from sfm.remarks.remark import of_kind
 from sfm.rendering.planned_targets import planned_scene
 from sfm.report.further import headline, weakest

@@ -24,8 +24,8 @@ from sfm.observations.rigid_frames import RigidFrames
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import ScaleBarPlan, WantedPrecision, predict_network
-from sfm.planning.sight.visibility import Seeing, TargetImage, Why
 from sfm.planning.stations import arrangement
+from sfm.planning.visibility import Seeing, TargetImage, Why
 from sfm.planning.weakness import contributions, open_counts, reason_of
 from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan, rows

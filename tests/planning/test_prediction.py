@@ -25,8 +25,8 @@ from sfm.planning.prediction import (
     simulate_network,
     usable,
 )
-from sfm.planning.sight.visibility import Seeing, sight_of
 from sfm.planning.stations import ARRANGEMENTS, Stations, around, arrangement, looking
+from sfm.planning.visibility import Seeing, sight_of
 from sfm.planning.weakness import calibratability, reason_of, rolled_share, weak_points
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene

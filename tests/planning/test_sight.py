@@ -19,7 +19,8 @@ from sfm.planning.planned_object import (
     open_edges,
     shape_object,
 )
-from sfm.planning.sight.visibility import (
+from sfm.planning.stations import looking
+from sfm.planning.visibility import (
     DepthOfField,
     Lens,
     Seeing,
@@ -30,7 +31,6 @@ from sfm.planning.sight.visibility import (
     depth_of_field,
     sight_of,
 )
-from sfm.planning.stations import looking
 from tests.synthetic import seed_of
 from tests.targets.test_bound import CONTRAST, NOISE, coverage
 

@@ -20,13 +20,13 @@ from sfm.cli.commands.planning_inputs import (
 )
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.sight import MIN_PIXELS
+from sfm.planning.visibility import MIN_PIXELS
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.camera import Camera
     from sfm.conventions import FloatArray
-    from sfm.planning.sight.visibility import DepthOfField
+    from sfm.planning.visibility import DepthOfField
 
 MAX_WEAK = 5  # points that the terminal names
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
@@ -74,7 +74,7 @@ def target_size_command(
     with loading():
         from sfm.conventions import METRES
         from sfm.files.whole_files import refuse_existing, whole_file
-        from sfm.planning.sight.visibility import compute_target_size
+        from sfm.planning.visibility import compute_target_size
         from sfm.targets.codes.plates import code_family
         from sfm.targets.codes.rings import CodeFamily
 
@@ -234,10 +234,10 @@ def network_command(
         from sfm.cli.console import print_verdict
         from sfm.conventions import METRES
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.planning.design.designer import StationLimits, design_network
+        from sfm.planning.designer import StationLimits, design_network
         from sfm.planning.plan import describe_plan, plan_of, verdict_of_plan
         from sfm.planning.prediction import WantedPrecision
-        from sfm.planning.sight.visibility import Seeing, TargetImage
+        from sfm.planning.visibility import Seeing, TargetImage
         from sfm.report.pages import write_page
         from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
@@ -315,7 +315,7 @@ def _depth(
     camera: Camera, f_number: float | None, focus: float | None, confusion_um: float | None, to_mm: float
 ) -> DepthOfField | None:
     """Return the depth of field in the object unit; None where no aperture is given."""
-    from sfm.planning.sight.visibility import DepthOfField, Lens, depth_of_field
+    from sfm.planning.visibility import DepthOfField, Lens, depth_of_field
 
     if (f_number is None) != (focus is None):
         raise SurveyFileError("plan: --f-number and --focus are needed together for the depth of field")

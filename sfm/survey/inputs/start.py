@@ -22,7 +22,7 @@ from sfm.display import listed
 from sfm.distributions import chi2_ppf
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
-from sfm.observations.mounts import MountObservations
+from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, refuse_unknown_cameras, start_cameras

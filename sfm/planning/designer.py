@@ -43,8 +43,8 @@ from sfm.planning.prediction import (
     predict_network,
     short_of,
 )
-from sfm.planning.sight.visibility import Seeing, Sight, sight_of
 from sfm.planning.stations import Stations, filling_distance, looking, rolled
+from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
 

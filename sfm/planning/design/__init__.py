@@ -1,1 +1,0 @@
-"""Stations that a designer chooses: candidates, the choice one by one, exchanges."""
