@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
+"""metric units and their length in metres, largest first"""
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -156,7 +157,6 @@ def skew(vector: FloatArray) -> FloatArray:
     return np.stack(rows, axis=-1).reshape(*w.shape[:-1], 3, 3)
 
 
-"""metric units and their length in metres, largest first"""
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMPERIAL = ("in", "ft")
 UNITS = {

@@ -21,6 +21,7 @@ from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
+"""a file that each of the others has, PyPI's sfm and adapters, and Kolinear has not"""
 Face = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
 
 
@@ -59,7 +60,6 @@ def _listed(package: str, stub: str) -> dict[str, str]:
     return module_of
 
 
-"""a file that each of the others has, PyPI's sfm and adapters, and Kolinear has not"""
 ROOT = os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
 COMMANDS = ("kolinear", "kolinear.exe", "-m")  # who starts these reads one line and no traceback
 BAD_INPUT = 2

@@ -31,6 +31,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.plates import points_of_plates
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
+"""another adjuster: network and start values in, its solution out"""
 
 
 def assemble_result(
@@ -159,7 +160,6 @@ def _word(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-"""another adjuster: network and start values in, its solution out"""
 Mapper = Callable[[Path, tuple[tuple[str, ...], ...]], Baseline]
 """another pipeline: folder, and for each camera the names of its photographs in it, in; its solution out"""
 

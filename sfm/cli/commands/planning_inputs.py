@@ -36,6 +36,7 @@ SENSORS = {
     "machine-vision-12": ((4096, 3000), (14.131, 10.35)),
     "nikon-d60": ((3872, 2592), (23.6, 15.8)),
 }
+"""width and height of the photographs, px, and of the sensor, mm"""
 NORMALS = ("nX", "nY", "nZ")
 
 
@@ -312,7 +313,6 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     return PlannedSetup(cameras, rig, bars, given, survey)
 
 
-"""width and height of the photographs, px, and of the sensor, mm"""
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 """what a self-calibrating adjustment usually determines"""
 
