@@ -80,7 +80,7 @@ def fitting_workers() -> int:
 
 
 @contextmanager
-def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[DaskEngine]:
+def local_engine(workers: int) -> Iterator[DaskEngine]:
     """Start worker processes on this computer, each with one thread.
 
     Whoever reaches a Dask scheduler or worker can run programs in it, and everybody on this computer reaches
@@ -88,8 +88,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
     processes and nowhere else; and what workers set aside on the disk lies in a folder of this user alone.
 
     Args:
-        workers: how many.
-        memory_bytes: of each worker, which is ended beyond it; else an equal share of the computer's.
+        workers: how many; each is ended beyond an equal share of the computer's memory.
 
     Raises:
         BackendError: they do not start.
@@ -116,7 +115,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
-                    memory_limit=memory_bytes or "auto",
+                    memory_limit="auto",
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
                     scheduler_kwargs={"dashboard": False},

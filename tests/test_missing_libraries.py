@@ -10,7 +10,7 @@ import pytest
 
 import sfm
 from sfm import cli
-from sfm.cli.commands.batching import in_process_engine
+from sfm.cli.commands.batching import InProcess
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.kernels import warmed
 from sfm.remarks.remark import Remark
@@ -141,8 +141,7 @@ def add(first: int, parts: list[int], *, send: Send) -> int:
 def test_the_engine_tells_in_order_and_one_fault_is_alone() -> None:
     def events(first: int, *parts: int) -> list[Event]:
         work = Work(f"w{first}", tuple(Call(double, (one,)) for one in parts), Call(add, (first,)))
-        with in_process_engine() as engine:
-            return list(engine.run([work, Work("after", work.parts, Call(add, (0,)))], at_a_time=3))
+        return list(InProcess().run([work, Work("after", work.parts, Call(add, (0,)))], at_a_time=3))
 
     told = [Sent("w1", {"photograph": "2"}), Sent("w1", {"photograph": "3"}), Sent("w1", {"stage": "sum"})]
     assert events(1, 2, 3)[:4] == [*told, Done("w1", 11)]

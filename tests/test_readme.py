@@ -12,12 +12,12 @@ import typer
 from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
 from sfm.distortion.models import COLMAP, GENERAL_MODELS
-from sfm.report.output import WRITTEN
 from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.targets.codes.plates import PlateFamily, refuse_unusable_plate
 from tests.places import ROOT
+from tests.written import WRITTEN
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DOCS = ROOT / "docs"

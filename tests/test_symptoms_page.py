@@ -31,7 +31,7 @@ REASONS = (
     "sfm/orientation/incremental",
     "sfm/pipeline.py",
 )
-ERRORS = {name for name, value in vars(errors).items() if isinstance(value, type)}
+ERRORS = {name for name, value in vars(errors).items() if isinstance(value, type)} | {"disk_errors"}
 TABLES = load_page_code("remark_tables")
 PAGE = (ROOT / "docs" / "symptoms.md").read_text(encoding="utf-8")
 

@@ -24,12 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from adapters.colmap.reconstruction import (
-    estimate_of,
-    reconstruction,
-    residuals_of,
-    sensor_of,
-)
+from adapters.colmap.reconstruction import estimate_of, reconstruction, residuals_of, sensor_of
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
 from sfm.display import counted
@@ -61,7 +56,6 @@ class ColmapAdjustment:
     converged: bool  # whether Ceres met a criterion of convergence
     message: str  # Ceres' reason to stop
     seconds: float  # time in Ceres, s; without building the problem
-    threads: int  # threads that Ceres was given
     point_covariance: FloatArray | None = None  # of the points, photographs and cameras held, image points of
 
     # standard deviation 1 px, object unit^2, (n, 3, 3); None where not asked for
@@ -133,7 +127,6 @@ def adjust_with_colmap(
         converged,
         message,
         seconds,
-        threads,
     )
 
 

@@ -28,7 +28,7 @@ from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.open_folders import refuse_links_out
+from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shown
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
@@ -64,13 +64,9 @@ def write_model(
     with quiet(pycolmap):
         scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
     write_scene(folder, scene, text=text)
-    try:
+    with disk_errors(f"{folder}: the COLMAP model cannot be written"):
         as_read = replace(estimate, cameras=tuple(as_opencv(camera) for camera in estimate.cameras))
         write_side_file(folder / SIDE_FILE, network, as_read)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: the COLMAP model cannot be written: {error.strerror or error}"
-        ) from error
 
 
 def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
@@ -277,9 +273,6 @@ def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
     """Return the mounts of the cameras of a scene; None where each is alone.
 
     The reference is that of COLMAP, or the first camera of a rig whose reference is none.
-
-    Raises:
-        SurveyFileError: the pose of a camera in its rig is not known.
     """
     pycolmap = load_pycolmap()
     count, index = len(camera_ids), {number: a for a, number in enumerate(camera_ids)}

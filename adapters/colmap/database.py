@@ -4,12 +4,9 @@ A database has no object points. Which keypoints show the same point is stated b
 photographs, so points are written as matches between all photographs they were measured in and read back as
 the connected parts of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
-Source: COLMAP 4.2 documentation, "Database Format".
-
-Content of a COLMAP database, read as untrusted: cameras, photographs, keypoints and matches.
-
-The file is opened read-only and immutable, so that nothing is written to it or beside it, and only its own
-tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.
+What is read is untrusted. The file is opened read-only and immutable, so that nothing is written to it or
+beside it, and only its own tables are read: no views, virtual tables or computed columns, whose expressions
+could run for ever.
 
 Source: COLMAP 4.2 documentation, "Database Format"; sqlite.org/fileformat.html, sec. 1.3, for the header, and
 sqlite.org/security.html.
@@ -44,7 +41,6 @@ TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100
 PAIRS = 2**31 - 1  # the number of a pair is PAIRS times that of its first photograph, plus that of its second
 MAX_STEPS, STEPS = 1000, 300_000  # of SQLite's machine in one query, counted in so many at a time
-
 MAX_PLACES = 100_000_000  # photographs times points, of which a table is kept
 
 

@@ -58,7 +58,6 @@ def read_bundle_matlab(
     c_mm: float,
     x0_mm: float = 0.0,
     y0_mm: float = 0.0,
-    pixel_mm: float = PIXEL_MM,
 ) -> tuple[Network, Estimate]:
     """Read the files of the MATLAB program as a network and its start values; points are named from 1.
 
@@ -69,7 +68,6 @@ def read_bundle_matlab(
         c_mm: principal distance, which the program asks for, mm.
         x0_mm: principal point, mm.
         y0_mm: principal point, mm.
-        pixel_mm: nominal size of a pixel, mm.
 
     Raises:
         SurveyFileError: what is wrong, with file and line number.
@@ -106,7 +104,7 @@ def read_bundle_matlab(
         text.end()
     interior = (c_mm, x0_mm, y0_mm)
     labels = tuple(f"{j + 1}" for j in range(len(ends) - 1))
-    return _network(names, exterior, labels, xyz, image, point, xy, sigma, interior, pixel_mm)
+    return _network(names, exterior, labels, xyz, image, point, xy, sigma, interior)
 
 
 def write_bundle_matlab(
@@ -148,7 +146,10 @@ def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
     """
     cameras, points, sigmas, interior = matlab_files(folder)
     text = Lines.of(interior)
-    c, x0, y0 = (text.number_of(word) for word in text.due_words(3, "c x0 y0 (mm)"))
+    words = text.due_row("c x0 y0 (mm)")
+    if len(words) != 3:
+        raise text.error(f"{len(words)} words, needed 3: c x0 y0 (mm)")
+    c, x0, y0 = map(text.number_of, words)
     if not c > 0:
         raise text.error(f"c is {c:g} mm, it must be positive")
     text.end()
@@ -199,14 +200,13 @@ def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimat
     write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", values])
 
 
-def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Network, Estimate]:
+def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
     """Read the file of the C# program as a network and its start values.
 
     The program reads two photographs only; here there may be more.
 
     Args:
         path: the file.
-        pixel_mm: nominal size of a pixel, mm.
 
     Raises:
         SurveyFileError: what is wrong, with file and line number.
@@ -251,7 +251,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         sigma.extend(_positive(text, values))
     text.end()
     image, point = np.tile(np.arange(m), n), np.repeat(np.arange(n), m)
-    return _network(names, exterior, tuple(labels), xyz, image, point, xy, sigma, (c, x0, y0), pixel_mm)
+    return _network(names, exterior, tuple(labels), xyz, image, point, xy, sigma, (c, x0, y0))
 
 
 def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> None:
@@ -333,16 +333,15 @@ def _network(
     xy_mm: array[float],
     sigma_mm: array[float] | None,
     interior: tuple[float, float, float],
-    pixel_mm: float,
 ) -> tuple[Network, Estimate]:
     xy = np.array(xy_mm).reshape(-1, 2)
-    pixel = np.array([pixel_mm, pixel_mm])
+    pixel = np.array([PIXEL_MM, PIXEL_MM])
     width, height = 2 * np.ceil(BORDER * np.abs(xy).max(axis=0) / pixel).astype(int)
     size = (int(width), int(height))
     sigma = np.tile(pixel, (len(xy), 1)) if sigma_mm is None else np.array(sigma_mm).reshape(-1, 2)
     c, x0, y0 = interior
     camera = camera_from_values(
-        "camera", "brown", size, (pixel_mm, pixel_mm), c_mm=c, values=(("x0", x0), ("y0", y0))
+        "camera", "brown", size, (PIXEL_MM, PIXEL_MM), c_mm=c, values=(("x0", x0), ("y0", y0))
     )
     table = np.array(exterior)
     network = Network(

@@ -100,11 +100,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     rows = np.array(bars, dtype=float).reshape(-1, 4)
     return GivenValues(
         ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
-        ObjectPoints(
-            np.array(list(control), dtype=np.int64),
-            np.array([xyz for xyz, _ in control.values()]).reshape(-1, 3),
-            np.array([C for _, C in control.values()]).reshape(-1, 3, 3),
-        ),
+        object_points(control),
         tuple(interior),
         ExteriorObservations(
             np.array(list(exterior), dtype=np.int64),
@@ -114,6 +110,15 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         ),
         summary.sigma0 or 1.0,
         summary.sigma0_px,
+    )
+
+
+def object_points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:
+    """Return points of their coordinates (3,) and covariances (3, 3), by their places in a network."""
+    return ObjectPoints(
+        np.array(list(found), dtype=np.int64),
+        np.array([xyz for xyz, _ in found.values()]).reshape(-1, 3),
+        np.array([C for _, C in found.values()]).reshape(-1, 3, 3),
     )
 
 
@@ -158,22 +163,14 @@ def read_known_points(
     found: dict[str, dict[int, tuple[FloatArray, FloatArray]]] = {"control": {}, "check": {}}
     for use, name, axis, (given, sigma) in zip(*table.texts, table.values.tolist(), strict=True):
         if use in found and name in index and axis in AXES and np.isfinite(given):
-            xyz, variance = found[use].setdefault(index[name], (np.zeros(3), np.full(3, np.inf)))
+            xyz, C = found[use].setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
             k = AXES.index(axis)
-            xyz[k], variance[k] = given, sigma**2 if np.isfinite(sigma) else 0.0
-    points = _points(found["control"])
+            xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else 0.0
+    points = object_points(found["control"])
     covariance = points.covariance.copy()
     for j, C in zip(control.point, control.covariance, strict=True):  # of what took part
         covariance[points.point == j] += np.where(np.eye(3, dtype=bool), 0.0, C)
-    return replace(points, covariance=covariance), _points(found["check"])
-
-
-def _points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:
-    return ObjectPoints(
-        np.array(list(found), dtype=np.int64),
-        np.array([xyz for xyz, _ in found.values()]).reshape(-1, 3),
-        np.array([np.diag(variance) for _, variance in found.values()]).reshape(-1, 3, 3),
-    )
+    return replace(points, covariance=covariance), object_points(found["check"])
 
 
 def _of_control(path: Path, network: Network) -> tuple[ObjectPoints, ObjectPoints]:

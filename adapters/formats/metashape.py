@@ -18,8 +18,6 @@ which is `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0), p1 and p2 e
 
 Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models"; structure of the file as
 exported by versions 1.5 to 2.1.
-
-The markers of a Metashape export and their image points, taken one by one while the file is read.
 """
 
 from __future__ import annotations
@@ -292,7 +290,7 @@ def _reference(xyz: FloatArray, sigma: FloatArray | None) -> str:
 
 
 class Markers:
-    """Markers of the first chunk of a file, with image points of its first frame."""
+    """Markers of the first chunk, with image points of its first frame, taken while the file is read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

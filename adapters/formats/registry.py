@@ -197,9 +197,7 @@ FORMATS = (
         names=NUMBERS,
     ),
     FileFormat(
-        *("rig", ("opencv",), None, None, frozenset({"rigs"})),
-        folder=True,
-        write_all=write_rig_files,
+        *("rig", ("opencv",), None, None, frozenset({"rigs"})), folder=True, write_all=write_rig_files
     ),
     FileFormat(
         "ply",

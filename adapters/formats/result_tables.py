@@ -30,7 +30,7 @@ from sfm.files.covariance_file import (
     write_covariances,
 )
 from sfm.files.csv_tables import CsvTable
-from sfm.files.open_folders import refuse_links_out
+from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
 from sfm.files.plain_text import Name, Pixel, Side, Text, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
@@ -52,20 +52,16 @@ def read_result(folder: Path) -> Solution:
     refuse_links_out(folder, COLMAP_SIDE_FILE)
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
-    index = {camera.name: k for k, camera in enumerate(cameras)}
+    names = [camera.name for camera in cameras]
     table = tables.IMAGES.read(folder)
-    images = table.keys("image")
-    for line, name in zip(table.line, table.texts[1], strict=True):
-        if name not in index:
-            raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in cameras.csv")
-    camera = np.array([index[name] for name in table.texts[1]], dtype=np.int64)
+    images, camera = table.keys("image"), table.places("camera", names, "cameras.csv")
     rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
     table = tables.POINTS.read(folder)
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
-    mounts, moment = read_rigs(folder, [one.name for one in cameras], network)
+    mounts, moment = read_rigs(folder, names, network)
     network = replace(network, moment=moment)
     known = table.values.shape[1] > 3
     joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
@@ -177,7 +173,7 @@ def write_content(folder: Path, content: Content) -> None:
             for camera in estimate.cameras
         ],
     }
-    try:
+    with disk_errors(f"{folder}: the tables cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         tables.write_solution(folder, result, seen, np.arange(len(seen)) >= len(network.image_points))
         if result.covariance is not None:
@@ -189,8 +185,6 @@ def write_content(folder: Path, content: Content) -> None:
         write_given(folder, network, estimate, result.unit)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{folder}: the tables cannot be written: {error.strerror}") from error
 
 
 def joined_image_points(first: ImagePoints, second: ImagePoints) -> ImagePoints:
@@ -245,11 +239,7 @@ def read_content(folder: Path) -> Content:
 
 
 def _first_of(folder: Path, cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[int, Camera]:
-    """Return the first camera that a parameter belongs to.
-
-    Raises:
-        SurveyFileError: there is none.
-    """
+    """Return the first camera that a parameter belongs to."""
     for k, camera in enumerate(cameras):
         if parameter in camera.names and camera.owner_of(camera.names.index(parameter)) == owner:
             return k, camera
@@ -329,10 +319,7 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
     positive = np.array([name in PRINCIPAL_DISTANCES for name in table.texts[1]])
     table.refuse(values[:, None], (positive & (values <= 0))[:, None], ("value",), "a positive c, fx or fy")
     rows = {key: k for k, key in enumerate(keys)}
-    known = {camera.name for camera in summary.cameras}
-    for line, name in zip(table.line, table.texts[0], strict=True):
-        if name not in known:
-            raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in summary.json")
+    table.places("camera", [camera.name for camera in summary.cameras], "summary.json")
     cameras, sigmas = [], []
     complete = all(entry.size_px is not None and entry.pixel_mm is not None for entry in summary.cameras)
     beside = () if complete else read_side_file(folder / COLMAP_SIDE_FILE).cameras
@@ -371,21 +358,13 @@ def _image_points(
     folder: Path, images: tuple[str, ...], points: tuple[str, ...]
 ) -> tuple[ImagePoints, BoolArray]:
     """Read the image points, and which of them were rejected."""
-    path = folder / tables.IMAGE_POINTS.file
     table = tables.IMAGE_POINTS.read(folder)
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
-    index = []
-    files = ("images.csv", "points.csv")
-    for column, names, known, file in zip(table.names, table.texts, (images, points), files, strict=True):
-        place = {name: k for k, name in enumerate(known)}
-        for line, name in zip(table.line, names, strict=True):
-            if name not in place:
-                raise SurveyFileError(f"{path}, line {line}: {column} '{name}' is not in {file}")
-        index.append(np.array([place[name] for name in names], dtype=np.int64))
+    image = table.places("image", images, "images.csv")
+    point = table.places("point", points, "points.csv")
     rejected, sigma = np.nan_to_num(table.part(("rejected",))), table.part(SIGMAS_PX)
     table.refuse(rejected, (rejected != 0) & (rejected != 1), ("rejected",), "0 or 1")
     table.refuse(sigma, sigma <= 0, SIGMAS_PX, "more than 0")
-    image, point = index
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     sigma = np.where(stated[:, None], sigma, 1.0)
     covariance = np.eye(2) * sigma[:, None, :] ** 2
@@ -417,11 +396,7 @@ def read_targets(folder: Path, network: Network) -> SeenTargets | None:
     if not path.is_file():
         return None
     table = TARGETS.read(folder)
-    index = {name: i for i, name in enumerate(network.images)}
-    images, reasons = table.texts
-    for line, name in zip(table.line, images, strict=True):
-        if name not in index:
-            raise SurveyFileError(f"{path}, line {line}: image '{name}' is not in images.csv")
+    image, reasons = table.places("image", network.images, "images.csv"), table.texts[1]
     axes = table.values[:, 2:4]
     table.refuse(axes, axes <= 0, ("a_px", "b_px"), "more than 0, or nothing")
     ellipse = np.column_stack([axes, np.deg2rad(table.values[:, 4])])
@@ -429,7 +404,7 @@ def read_targets(folder: Path, network: Network) -> SeenTargets | None:
         if reason == MEASURED and not np.isfinite(outline).all():
             raise SurveyFileError(f"{path}, line {line}: a measured target without a_px, b_px and angle_deg")
     return SeenTargets(
-        np.array([index[name] for name in images], dtype=np.int64),
+        image,
         table.values[:, :2].copy(),
         ellipse,
         tuple("" if reason == MEASURED else reason for reason in reasons),

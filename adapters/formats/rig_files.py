@@ -45,6 +45,7 @@ from adapters.formats.content import Content
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import METRES, FloatArray, rotation_from_vector, skew
 from sfm.errors import OutputError
+from sfm.files.open_folders import disk_errors
 from sfm.network import Mounts, Network
 
 GRID = 9  # points along each side of a photograph
@@ -106,12 +107,10 @@ def write_rig_files(folder: Path, content: Content) -> None:
             add(f"ros-{one.camera.name}.yaml", "\n".join(_ros(scaled, k, in_metres)) + "\n")
             add(f"mrcal-{one.camera.name}.cameramodel", "\n".join(_mrcal(one, in_metres)) + "\n")
     add("rig_config.json", json.dumps(configs, indent=1) + "\n")
-    try:
+    with disk_errors(f"{folder}: the files of the rig cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8", newline="")
-    except OSError as error:
-        raise OutputError(f"{folder}: the files of the rig cannot be written: {error.strerror}") from error
 
 
 def _mounted(camera: Camera, mounts: Mounts, a: int) -> _Mounted:
@@ -325,7 +324,7 @@ def rectify(first: Camera, second: Camera, R: FloatArray, T: FloatArray) -> Rect
     Returns:
         The rectification, None where a photograph would reach behind the common image plane.
     """
-    half = rotation_from_vector(-0.5 * _vector(R))
+    half = rotation_from_vector(-0.5 * np.asarray(Rotation.from_matrix(R).as_rotvec()))
     t = half @ T
     axis = 0 if abs(t[0]) > abs(t[1]) else 1
     along = np.zeros(3)
@@ -365,11 +364,6 @@ def rectify(first: Camera, second: Camera, R: FloatArray, T: FloatArray) -> Rect
         [[1.0, 0.0, 0.0, -c[0]], [0.0, 1.0, 0.0, -c[1]], [0.0, 0.0, 0.0, f], [0.0, 0.0, -1 / base, 0.0]]
     )
     return Rectification(*rotations, P1, P2, Q)
-
-
-def _vector(R: FloatArray) -> FloatArray:
-    """Return the rotation vector of a rotation, rad, (3,)."""
-    return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
 def _rectified(camera: Camera, rotation: FloatArray, count: int) -> FloatArray | None:

@@ -112,17 +112,6 @@ class Lines:
             raise self.error(f"the file ends here, {what} was expected")
         return words
 
-    def due_words(self, count: int, what: str) -> list[str]:
-        """Return the next row, which must be there and have so many words.
-
-        Raises:
-            SurveyFileError: the file ends here, or another number of words.
-        """
-        words = self.due_row(what)
-        if len(words) != count:
-            raise self.error(f"{len(words)} words, needed {count}: {what}")
-        return words
-
     def end(self) -> None:
         """Refuse anything that follows.
 

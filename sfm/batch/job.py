@@ -34,6 +34,7 @@ from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Send
 from sfm.runtime.faults import error_in_words, is_fault
+from sfm.runtime.progress import Silent
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
@@ -297,19 +298,13 @@ def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
 
 
 @dataclass(frozen=True)
-class _Sending:
-    """Progress that reports to the watched batch which stage begins."""
+class _Sending(Silent):
+    """Progress that reports to the watched batch which stage begins, and nothing else."""
 
     send: Send
 
     def stage(self, name: str, total: int | None = None) -> None:
         self.send({"stage": name})
-
-    def advance(self, step: str = "") -> None:
-        """Photographs are reported where they are measured."""
-
-    def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
-        """A batch shows the stages only."""
 
 
 def note_finished(folder: Path) -> None:

@@ -10,7 +10,7 @@ import glob
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -172,11 +172,7 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
 
 
 def _matches(path: Path) -> list[Path]:
-    """Return what a glob on the command line matches; with `**` in it no links out of its folder count.
-
-    Raises:
-        SurveyFileError: nothing, or too much to look through.
-    """
+    """Return what a glob on the command line matches; with `**` in it no links out of its folder count."""
     first = next(k for k, part in enumerate(path.parts) if glob.has_magic(part))
     folder, pattern = Path(*path.parts[:first]), Path(*path.parts[first:])
 
@@ -289,26 +285,25 @@ def _run(
             watch.received(plan.folder, {"photographs": len(work.parts)})
             yield work
 
-    suspects: list[Lost] = []
-    for event in engine.run(begin(), at_a_time=engine.workers + 1):
-        if isinstance(event, Sent):
-            watch.received(event.key, event.message)
-        elif isinstance(event, Done):
-            finish(event.key, event.value)
-        else:
-            watch.received(event.key, {"stage": "waiting for a second try, alone"})
-            suspects.append(event)
-    by_name = {plan.folder: plan for plan in plans}
-    for suspect in suspects:
-        for event in engine.run([works[suspect.key]], at_a_time=1):
+    def lost(works: Iterable[Work], at_a_time: int) -> Iterator[Lost]:
+        for event in engine.run(works, at_a_time=at_a_time):
             if isinstance(event, Sent):
                 watch.received(event.key, event.message)
             elif isinstance(event, Done):
                 finish(event.key, event.value)
             else:
-                died = BackendError(f"set aside: {event.reason}, alone as well as beside others")
-                row = _without_result(by_name[event.key], out, "set aside", died)
-                finish(event.key, replace(row, fault=True))
+                yield event
+
+    suspects = []
+    for event in lost(begin(), engine.workers + 1):
+        watch.received(event.key, {"stage": "waiting for a second try, alone"})
+        suspects.append(event.key)
+    by_name = {plan.folder: plan for plan in plans}
+    for suspect in suspects:
+        for event in lost([works[suspect]], 1):
+            died = BackendError(f"set aside: {event.reason}, alone as well as beside others")
+            row = _without_result(by_name[event.key], out, "set aside", died)
+            finish(event.key, replace(row, fault=True))
     return rows
 
 

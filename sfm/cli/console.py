@@ -132,10 +132,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         ("image points", result.image_point_counts),
         ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
-        (
-            "sigma0",
-            f"{', '.join(describe_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
-        ),
+        ("sigma0", f"{', '.join(describe_sigma0(findings.sigma0))}, redundancy {a.redundancy}"),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
     ]
     if a.error_correlation is not None:

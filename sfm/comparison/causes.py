@@ -30,7 +30,7 @@ Source: Groth (1986), A pattern-matching algorithm for two-dimensional coordinat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -158,8 +158,9 @@ def find_cause(
     for row in rows:
         if row.names and best.agreed and best.stable.sum() == reference.sum():
             continue  # all points agree by the names that they have
-        for fit in _fits(pairs, row, nothing, reference, cost):
-            if fit.agreed and best.L + limit < fit.L:
+        with suppress(GeometryError):
+            fit = _fit(pairs, row, nothing, reference, cost)
+            if fit is not None and fit.agreed and best.L + limit < fit.L:
                 best = fit
     if best is not nothing:
         return _cause(best, pairs, best.L - nothing.L)
@@ -186,33 +187,23 @@ def is_unrelated(a: FloatArray, b: FloatArray) -> bool:
     return any(float(np.linalg.svd(M, compute_uv=False).sum()) >= fit for M in shuffled)
 
 
-def _fits(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost: float) -> Iterator[_Fit]:
-    """Yield the differences under a row, with every assignment of the names that is found."""
+def _fit(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost: float) -> _Fit | None:
+    """Return the differences under a row; None where its names cannot be assigned."""
     if not row.names:
-        try:
-            yield _fitted(pairs, row, reference, cost)
-        except GeometryError:
-            return
-        return
-    try:
-        plain = replace(row, names=False)
-        given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
-    except GeometryError:
-        return
+        return _fitted(pairs, row, reference, cost)
+    plain = replace(row, names=False)
+    given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
     if given.agreed:  # what most names show: others are exchanged among themselves
         found: Similarity | None = given.a_from_b
     else:
         found = find_pattern(pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror)
     if found is None:
-        return
+        return None
     other = _assigned(pairs, found, given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool))
-    if (other >= 0).sum() < max(MIN_STABLE, STABLE_FRACTION * len(pairs.a)):
-        return
     kept = other >= 0
-    try:
-        yield _fitted(pairs.chosen(np.flatnonzero(kept), other[kept]), row, reference[kept], cost, other)
-    except GeometryError:
-        return
+    if kept.sum() < max(MIN_STABLE, STABLE_FRACTION * len(pairs.a)):
+        return None
+    return _fitted(pairs.chosen(np.flatnonzero(kept), other[kept]), row, reference[kept], cost, other)
 
 
 def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntArray:
@@ -228,11 +219,7 @@ def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntA
 def _fitted(
     pairs: PointPairs, row: Row, reference: BoolArray, cost: float, other: IntArray | None = None
 ) -> _Fit:
-    """Form and test the differences under a row.
-
-    Raises:
-        GeometryError: too few points, or points on a line.
-    """
+    """Form and test the differences under a row."""
     n = len(pairs.a)
     whole = row.strain or row.bending
     estimated = row.scale or whole or pairs.scale is None

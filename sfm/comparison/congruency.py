@@ -123,12 +123,7 @@ def congruency(
 
     def search(start: BoolArray) -> StablePoints:
         return find_stable_points(
-            among,
-            least=least,
-            start=start,
-            redundancy=redundancy,
-            alpha=alpha / 2,
-            alpha_single=alpha / 2,
+            among, least=least, start=start, redundancy=redundancy, alpha=alpha / 2, alpha_single=alpha / 2
         )
 
     level = np.where(reference, alpha / 2 / first, alpha / 2 / max(1, n - first))

@@ -30,6 +30,7 @@ NEAR_PX = 1.0  # measurements of one target or one piece of texture by two progr
 MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
 # Of the distance to the next neighbour: what is farther away is not recognised by place.
 MAX_PLACE_FRACTION = 0.3
+ROUNDS = 20  # of weighting
 SAME_PLACE = 0.5  # of the points that must coincide for two results to be in one frame as they are
 
 
@@ -113,13 +114,7 @@ def _free(count: int, taken: IntArray) -> BoolArray:
 
 
 def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
-    """Return the pairs (i, j) with more votes than any other of i and of j, and with enough of them.
-
-    Args:
-        votes: pairs, each once, (v, 2).
-        weight: votes of each, (v,).
-        enough: votes that each needs, (v,).
-    """
+    """Return the pairs (i, j) with more votes than any other of i and of j, and with enough of them."""
     if not len(votes):
         return votes
     most_i = np.zeros(votes[:, 0].max() + 1)
@@ -135,11 +130,7 @@ def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
 def _images_by_image_points(
     a: Solution, b: Solution, images: IntArray
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
-    """Pair photographs without names by measurements at the same places, then by rays of the same direction.
-
-    Returns:
-        Pairs, those given first, (m, 2), and the image points in the frame in which they agree.
-    """
+    """Pair photographs, (m, 2), by measurements at the same places, then by rays of the same direction."""
     as_they_are = a.network.image_points.xy, b.network.image_points.xy
     if a.images_named and b.images_named:
         return images, as_they_are
@@ -184,11 +175,7 @@ def _images_of_places(
 
 
 def _points_by_image_points(
-    a: Solution,
-    b: Solution,
-    xy: tuple[FloatArray, FloatArray],
-    images: IntArray,
-    points: IntArray,
+    a: Solution, b: Solution, xy: tuple[FloatArray, FloatArray], images: IntArray, points: IntArray
 ) -> IntArray:
     """Pair points that lie on the same image points in most of the common photographs that see them."""
     ours, theirs = a.network.image_points, b.network.image_points
@@ -236,16 +223,13 @@ def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Simi
     return as_they_are if len(pairs) >= max(3.0, least) else None
 
 
-def fit_robustly(
-    source: FloatArray, target: FloatArray, *, scale: float | None = None, rounds: int = 20
-) -> Similarity:
+def fit_robustly(source: FloatArray, target: FloatArray, *, scale: float | None = None) -> Similarity:
     """Return the similarity that most of the points agree on: iterated weights 1 / distance (L1 norm).
 
     Args:
         source: points in the source frame, source unit, (n, 3).
         target: the same points in the target frame, target unit, (n, 3).
         scale: scale to keep; fitted too if not given.
-        rounds: of weighting.
 
     Raises:
         GeometryError: fewer than three points, or all points on a line.
@@ -253,7 +237,7 @@ def fit_robustly(
     Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.3 (robust transformation).
     """
     found = fit_similarity(source, target, scale=scale)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         length = np.linalg.norm(found.apply(source) - target, axis=1)
         least = 1e-3 * np.median(length)
         if not least > 0:
@@ -277,7 +261,7 @@ def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: Boo
     axes, along = extended_axes(source)
     X, gap = np.hstack([np.ones((len(a), 1)), along])[reference], (a - source)[reference]
     weight = np.ones(len(X))
-    for _ in range(20):
+    for _ in range(ROUNDS):
         root = np.sqrt(weight)[:, None]
         shift, *shapes = np.linalg.lstsq(root * X, root * gap, rcond=None)[0]
         length = np.linalg.norm(gap - X @ [shift, *shapes], axis=1)
@@ -288,9 +272,7 @@ def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: Boo
     A = np.eye(3) + np.transpose(shapes) @ axes
     centre = source.mean(axis=0)
     return replace(
-        start,
-        rotation=A @ start.rotation,
-        translation=A @ (start.translation - centre) + centre + shift,
+        start, rotation=A @ start.rotation, translation=A @ (start.translation - centre) + centre + shift
     )
 
 

@@ -112,12 +112,7 @@ class ResultComparison:
 
 @checked_arguments()
 def compare_results(
-    a: Solution,
-    b: Solution,
-    *,
-    align: str = "points",
-    control: tuple[str, ...] = (),
-    alpha: float = ALPHA,
+    a: Solution, b: Solution, *, align: str = "points", control: tuple[str, ...] = (), alpha: float = ALPHA
 ) -> ResultComparison:
     """Align b to a and test the differences.
 
@@ -255,11 +250,11 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
             conversion = convert_camera(theirs, ours.model)
             theirs = conversion.camera
         else:
-            sigma = _either(
-                None if a.interior_sigma is None else a.interior_sigma[p],
-                None if b.interior_sigma is None else b.interior_sigma[q],
-                sigma,
-            )
+            known = [
+                sigma if one.interior_sigma is None else one.interior_sigma[k] for one, k in ((a, p), (b, q))
+            ]  # what only one knows is its sigma, what neither knows stays NaN
+            total = np.hypot(*(np.nan_to_num(one) for one in known))
+            sigma = np.where(np.isfinite(known).any(axis=0), total, np.nan)
         found.append(
             InteriorDifference(
                 ours.name,
@@ -285,13 +280,6 @@ def _of_one_name(
         for p, one in enumerate(a)
         if p not in ours and (one.name, one.size_px) in index
     ]
-
-
-def _either(a: FloatArray | None, b: FloatArray | None, unknown: FloatArray) -> FloatArray:
-    """Sigma of a difference; what only one knows is its sigma, what neither knows stays NaN."""
-    known = [unknown if one is None else one for one in (a, b)]
-    total = np.hypot(*(np.nan_to_num(one) for one in known))
-    return np.where(np.isfinite(known[0]) | np.isfinite(known[1]), total, np.nan)
 
 
 @dataclass(frozen=True)
@@ -387,14 +375,7 @@ def judge_points(
 
 
 def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
-    """Return the test of all points where some took no part, held in both results or of unknown correlation.
-
-    Args:
-        found: of the tested points.
-        tested: their indices, (k,).
-        sigma: of all differences, written over where tested, (n, 3).
-        together: points whose covariance together is known, on which alone an alignment may rest, (n,).
-    """
+    """Return the test of all points where some took no part; sigma is written over where tested."""
     n = len(together)
     statistic = np.full(n, np.nan)
     sigma[tested] = np.sqrt(np.diagonal(found.covariance).reshape(-1, 3).clip(0))

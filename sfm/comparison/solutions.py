@@ -128,6 +128,8 @@ def compare(
     squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
     rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
     interior = tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True))
+    interior_px = [interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]
+    rounding = rounding_of(a.points[both])
     return Comparison(
         names,
         a,
@@ -138,19 +140,19 @@ def compare(
         angle,
         points,
         interior,
-        np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
+        np.array(interior_px),
         (rms[0], rms[1]),
         (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
         _in_sigmas(
             network,
             a,
             covariance,
-            _unless_rounding(points, rounding_of(a.points[both])),
-            _unless_rounding(position, rounding_of(a.points[both])),
+            _unless_rounding(points, rounding),
+            _unless_rounding(position, rounding),
             _unless_rounding(np.deg2rad(angle), ROUNDING_RAD),
             tuple(
-                np.zeros_like(d) if interior_effect_px(p, q) < ROUNDING_PX else d
-                for p, q, d in zip(a.cameras, b.cameras, interior, strict=True)
+                np.zeros_like(d) if px < ROUNDING_PX else d
+                for px, d in zip(interior_px, interior, strict=True)
             ),
         ),
     )
@@ -289,7 +291,6 @@ class BaselineComparison:
     rms_px: tuple[float, float]  # of the points and image points of each, per coordinate, px
     targets: int  # object points of the survey that the baseline's photographs determine too
     target_rms_px: float  # of the survey's image points under the baseline's orientations, px
-    survey_from_baseline: Similarity
     points: FloatArray  # baseline minus survey after the similarity, object unit, NaN without, (n, 3)
     position: FloatArray  # likewise of the projection centres, object unit, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations of each photograph, deg, (m,)
@@ -379,7 +380,6 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
         (adjustment.rms_px, baseline.rms_px),
         int(both.sum()),
         float(np.sqrt(np.nanmean(v**2))),
-        transform,
         np.where(both[:, None], transform.apply(points) - adjustment.estimate.points, np.nan),
         position,
         angle,

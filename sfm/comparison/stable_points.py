@@ -41,7 +41,6 @@ class Step:
     statistic: float  # Omega over its degrees of freedom
     critical: float
     removed: int | None  # index of the point, None where none is
-    drop: float  # of Omega, over the coordinates of a point: the largest of any point
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ def find_stable_points(
         ended = agreed or left.sum() - 1 < least
         removed = None if ended else int(chosen[k])
         tested = (int(left.sum()), omega, freedom, omega / freedom, critical)
-        steps.append(Step(*tested, removed, float(drops[k])))
+        steps.append(Step(*tested, removed))
         if ended:
             break
         _remove(P, w, slice(m * k, m * k + m))

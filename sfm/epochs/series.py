@@ -258,11 +258,7 @@ def verdict_of_epochs(found: EpochSeries) -> Verdict:
     ]
     cameras = [
         remark(
-            "one_camera",
-            camera=one.name,
-            epochs=one.epochs,
-            statistic=one.statistic,
-            critical=one.critical,
+            "one_camera", camera=one.name, epochs=one.epochs, statistic=one.statistic, critical=one.critical
         )
         for one in found.cameras
     ]

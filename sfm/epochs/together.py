@@ -27,6 +27,7 @@ from sfm.adjustment.solve import adjust
 from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import listed
 from sfm.epochs.differences import MAX_SAME_DIFFERENCE, Common, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
@@ -138,8 +139,8 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
     shared = {name: numbers for name, numbers in found.items() if len(numbers) > 1}
     if not shared:
         raise GeometryError(
-            f"epochs together: no camera is in two of them ({_some(tuple(found))}); a camera that took "
-            "several epochs needs one name in their survey files, and no parameters per photograph"
+            f"epochs together: no camera is in two of them ({listed(found, most=MAX_NAMED)}); a camera that "
+            "took several epochs needs one name in their survey files, and no parameters per photograph"
         )
     kept = {}
     for name, numbers in shared.items():
@@ -192,9 +193,7 @@ def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
         for parameter, value in zip(camera.names, camera.parameters.tolist(), strict=True)
     }
     alone = replace(
-        epoch,
-        result=replace(result, estimate=a.estimate, covariance_points=points),
-        sigma0=a.sigma0,
+        epoch, result=replace(result, estimate=a.estimate, covariance_points=points), sigma0=a.sigma0
     )
     given = {}
     for key, (gradient, sigma, value) in given_observations(alone):
@@ -326,14 +325,6 @@ def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
         f"epochs together: camera {camera.name} is not the same: T {camera.statistic:.3g}, limit "
         f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "
         "epochs without --together, each with a separate interior orientation"
-    )
-
-
-def _some(names: tuple[str, ...]) -> str:
-    return (
-        ", ".join(names)
-        if len(names) <= MAX_NAMED
-        else f"{', '.join(names[:MAX_NAMED])} and {len(names) - MAX_NAMED} more"
     )
 
 

@@ -101,11 +101,8 @@ def read_covariance(
     points = None
     if (folder / POINTS_NAME).exists():
         table = read_table(folder / POINTS_NAME, ("id",), (), ignored=None)
-        place = {name: j for j, name in enumerate(names)}
-        for line, name in zip(table.line, table.keys("id"), strict=True):
-            if name not in place:
-                raise SurveyFileError(f"{table.path}, line {line}: point '{name}' is not in points.csv")
-        points = np.array([place[name] for name in table.keys("id")], dtype=np.int64)
+        table.refuse_duplicates(table.texts[0], ("id",))
+        points = table.places("id", names, "points.csv", what="point")
         sigma = sigma[points]
     try:
         size = path.stat().st_size

@@ -56,6 +56,25 @@ class CsvTable:
         self.refuse_duplicates(values, (column,))
         return values
 
+    def places(self, column: str, known: Sequence[str], source: str, *, what: str = "") -> IntArray:
+        """Return the place of each name of a column among those known from another file, (rows,).
+
+        Args:
+            column: of names.
+            known: all names that there may be.
+            source: the file with them.
+            what: they are; the column says it if not given.
+
+        Raises:
+            SurveyFileError: a name is not among them.
+        """
+        place = {name: k for k, name in enumerate(known)}
+        names = self.texts[self.names.index(column)]
+        for k, name in enumerate(names):
+            if name not in place:
+                raise SurveyFileError(f"{self.place(k)}: {what or column} '{name}' is not in {source}")
+        return np.array([place[name] for name in names], dtype=np.int64)
+
     def part(self, names: tuple[str, ...]) -> FloatArray:
         """Return columns of numbers, NaN for those that the file does not have, (rows, columns)."""
         found = np.full((len(self.line), len(names)), np.nan)

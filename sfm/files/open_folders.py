@@ -53,6 +53,19 @@ _PLAIN_FILE = _NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 
 
 
 @contextmanager
+def disk_errors(message: str) -> Iterator[None]:
+    """Say what went wrong where the disk refuses: the message, a colon and the reason of the system.
+
+    Raises:
+        OutputError: in place of every OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{message}: {error.strerror or error}") from error
+
+
+@contextmanager
 def open_folder(path: Path, *, make: bool = False) -> Iterator[int | None]:
     """Open a folder for what is done in it by `dir_fd`; its handle is None where the system has none.
 
@@ -229,21 +242,17 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
         FolderInUseError: another run has the lock.
         OutputError: the file cannot be written, or is no lock.
     """
-    try:
+    with disk_errors(f"{path}: the lock cannot be written"):
         make_folder(path.parent)
         handle = _open_and_lock(path, folder or path.parent)
-    except OSError as error:
-        raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
     ours = False
     try:
-        try:
+        with disk_errors(f"{path}: the lock cannot be written"):
             before = _owner(handle)
             if before is None and os.fstat(handle).st_size:
                 raise OutputError(f"{path}: is no lock of Kolinear, and is left alone; remove it")
             ours = True
             _write_owner(handle)
-        except OSError as error:
-            raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
         yield before
     finally:
         if ours:
@@ -314,10 +323,8 @@ def refuse_foreign_folder(out: Path) -> None:
         raise OutputError(f"{out}: cannot be written here: {error.strerror}") from error
     if not stat.S_ISDIR(mode):
         raise OutputError(f"{out}: a file has this name, --out needs a folder")
-    try:
+    with disk_errors(f"{out}: the folder cannot be read"):
         foreign = _foreign(out, names_below(out))
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
     _refuse(out, foreign, "--out needs a new or empty folder or an unchanged earlier result")
 
 
@@ -331,10 +338,8 @@ def refuse_foreign_files(folder: Path, names: Iterable[str]) -> None:
     wanted = (*names, MANIFEST)
     for name in wanted:
         refuse_links(folder / name)
-    try:
+    with disk_errors(f"{folder}: the folder cannot be read"):
         foreign = _foreign(folder, [name for name in wanted if os.path.lexists(folder / name)])
-    except OSError as error:
-        raise OutputError(f"{folder}: the folder cannot be read: {error.strerror}") from error
     _refuse(folder, foreign, "which would be replaced; another folder is needed")
 
 

@@ -51,15 +51,9 @@ SLIPS = (
         "a number has a decimal point, not a comma",
     ),
     (re.compile("[\u201c\u201d\u201e\u2018\u2019]"), "text must be in straight quotation marks, \" or '"),
-    (
-        re.compile(r'"[^"\n]*\\[^"\n]*"'),
-        "write / in a path, or put it between single quotation marks",
-    ),
+    (re.compile(r'"[^"\n]*\\[^"\n]*"'), "write / in a path, or put it between single quotation marks"),
     (re.compile(r"=\s*(?:True|False|yes|no|on|off)\b", re.IGNORECASE), "write true or false"),
-    (
-        re.compile(r"^\s*\[{1,2}[^\]]*$|^\s*\[\[[^\]]*\][^\]]*$"),
-        "a section must be in [ ] or [[ ]]",
-    ),
+    (re.compile(r"^\s*\[{1,2}[^\]]*$|^\s*\[\[[^\]]*\][^\]]*$"), "a section must be in [ ] or [[ ]]"),
     (re.compile(r"=\s*(?:#.*)?$"), "no value follows the ="),
     (re.compile(r"=\s*[^\W\d][^\"']*$"), "text must be in quotation marks"),
     (re.compile(r"^[^=\[#]+$"), "neither a section in [ ] nor a key with = and its value"),

@@ -301,10 +301,9 @@ def read_rigs(
     table.refuse(sigma, sigma < 0, SIGMAS, "0 (held fixed) or more, or nothing")
     position, rotation = np.zeros((len(cameras), 3)), np.tile(np.eye(3), (len(cameras), 1, 1))
     free, rigs = np.zeros((len(cameras), 6), dtype=bool), [""] * len(cameras)
-    for k, (name, rig) in enumerate(zip(table.keys("camera"), table.texts[1], strict=True)):
-        if name not in cameras:
-            raise SurveyFileError(f"{table.place(k)}: camera '{name}' is not in cameras.csv")
-        a = cameras.index(name)
+    table.refuse_duplicates(table.texts[0], ("camera",))
+    places = table.places("camera", cameras, "cameras.csv").tolist()
+    for k, (a, rig) in enumerate(zip(places, table.texts[1], strict=True)):
         position[a], rotation[a] = values[k, :3], rotation_from_angles(*np.radians(values[k, 3:]))
         free[a], rigs[a] = sigma[k] != 0, rig
     mounts = Mounts(position, rotation, free, tuple(rigs))

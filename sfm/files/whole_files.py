@@ -20,6 +20,7 @@ from pathlib import Path
 from sfm.errors import KolinearError, OutputError
 from sfm.files.open_folders import (
     MANIFEST,
+    disk_errors,
     manifest_text,
     move,
     names_below,
@@ -139,11 +140,8 @@ def refuse_unwritable(path: Path) -> None:
     """
     refuse_existing(path)
     above = next(part for part in (Path.cwd() / path).parents if os.path.lexists(part))
-    try:
-        with tempfile.TemporaryDirectory(dir=above):
-            pass
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written here: {error.strerror or error}") from error
+    with disk_errors(f"{path}: cannot be written here"), tempfile.TemporaryDirectory(dir=above):
+        pass
 
 
 def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
@@ -201,12 +199,9 @@ def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
     refuse_links(out)
     path = out.parent / f".{out.name}.{secrets.token_hex(4)}.{ending}"
     with ExitStack() as stack:
-        try:
+        with disk_errors(f"{out}: {_subject(what)}cannot be written here"):
             beside = stack.enter_context(open_folder(out.parent, make=True))
             handle = open_new_folder(path, beside)
-        except OSError as error:
-            reason = error.strerror or error
-            raise OutputError(f"{out}: {_subject(what)}cannot be written here: {reason}") from error
         stack.callback(shutil.rmtree, path, ignore_errors=True)
         if handle is not None:
             stack.callback(os.close, handle)

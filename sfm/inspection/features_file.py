@@ -16,6 +16,10 @@ from sfm.survey.inputs.survey_file import inside
 MAX_ENTRIES = 10_000  # of one kind
 
 
+def _entries(kind: str) -> Any:
+    return Field(strict=False, max_length=MAX_ENTRIES, alias=kind)
+
+
 def _listed(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
@@ -142,28 +146,14 @@ class FeaturesFile(Section):
     """Content of a features file; the tables and meshes that it names are not read yet."""
 
     measure: MeasureSettings = MeasureSettings()
-    groups: Annotated[
-        tuple[GroupSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="group")
-    ] = ()
-    hidden_points: Annotated[
-        tuple[HiddenPointSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="hidden_point")
-    ] = ()
-    shapes: Annotated[
-        tuple[ShapeSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="shape")
-    ] = ()
+    groups: Annotated[tuple[GroupSettings, ...], _entries("group")] = ()
+    hidden_points: Annotated[tuple[HiddenPointSettings, ...], _entries("hidden_point")] = ()
+    shapes: Annotated[tuple[ShapeSettings, ...], _entries("shape")] = ()
     alignment: AlignmentSettings | None = None
-    distances: Annotated[
-        tuple[DistanceSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="distance")
-    ] = ()
-    angles: Annotated[
-        tuple[AngleSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="angle")
-    ] = ()
-    heights: Annotated[
-        tuple[HeightSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="height")
-    ] = ()
-    tolerances: Annotated[
-        tuple[ToleranceSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="tolerance")
-    ] = ()
+    distances: Annotated[tuple[DistanceSettings, ...], _entries("distance")] = ()
+    angles: Annotated[tuple[AngleSettings, ...], _entries("angle")] = ()
+    heights: Annotated[tuple[HeightSettings, ...], _entries("height")] = ()
+    tolerances: Annotated[tuple[ToleranceSettings, ...], _entries("tolerance")] = ()
 
     def tables(self) -> tuple[str, ...]:
         """Return the names of the tables of nominal points."""

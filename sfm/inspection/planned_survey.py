@@ -150,15 +150,9 @@ def read_plan(folder: Path) -> PlannedSurvey:
     rotation = np.array([rotation_from_angles(*np.radians(row)) for row in table.values[:, 3:]])
     stations = Stations(table.keys("image"), table.values[:, :3].copy(), rotation)
     if rig is not None:
-        number = {camera.name: a for a, camera in enumerate(cameras)}
-        order = {name: k for k, name in enumerate(dict.fromkeys(table.texts[2]))}
-        for row, name in enumerate(table.texts[1]):
-            if name not in number:
-                raise SurveyFileError(f"{table.place(row)}: camera '{name}' is not in plan.json")
-        taken_by, taken_at = (
-            np.array([numbers[name] for name in column], dtype=np.int64)
-            for numbers, column in ((number, table.texts[1]), (order, table.texts[2]))
-        )
+        taken_by = table.places("camera", [camera.name for camera in cameras], "plan.json")
+        moments = tuple(dict.fromkeys(table.texts[2]))
+        taken_at = table.places("moment", moments, "exterior.csv")
         stations = replace(stations, rig=rig, taken_by=taken_by, taken_at=taken_at)
     columns = ("X", "Y", "Z", "nX", "nY", "nZ", "sX", "sY", "sZ", "coded")
     table = read_table(folder / "points.csv", ("id",), columns, ignored=None, blank=columns[3:9])
@@ -245,11 +239,7 @@ def _given_mounts(mounts: Sequence[_Mount]) -> MountObservations:
 
 
 def _table(where: Path, kind: str, rows: list[list[str | float]]) -> ObservationTable:
-    """Return survey observations of a plan.
-
-    Raises:
-        SurveyFileError: rows that have not the columns of the kind, or that a survey would refuse.
-    """
+    """Return survey observations of a plan."""
     texts, columns = TABLES[kind].texts, TABLES[kind].columns()
     n = len(texts)
     for row in rows:

@@ -130,15 +130,16 @@ def describe_plan(
     seen = prediction.sight.seen
     coded = np.union1d(choose_coded(seen), _observed(prediction))
     camera = prediction.cameras[0]
-    far = max(float(d) for d in _distances(prediction))
+    m, n = np.nonzero(seen)
+    rays = prediction.stations.position[m] - prediction.planned.xyz[n]
     width = camera.size_px[0]
     size = compute_target_size(
         p=MIN_PIXELS,
         w_mm=width * float(camera.pixel_mm[0]),
-        d=far,
+        d=float(np.linalg.norm(rays, axis=1).max()),
         c_mm=camera.c_px * float(np.mean(camera.pixel_mm)),
         n=width,
-        tilt_deg=min(_tilt(prediction, seeing), STEEPEST_DEG),
+        tilt_deg=min(_tilt(rays, prediction.planned.normals[n], seeing), STEEPEST_DEG),
     )
     return Plan(
         name,
@@ -176,18 +177,11 @@ def _observed(prediction: Prediction) -> IntArray:
     return np.flatnonzero(np.isin(prediction.point, np.concatenate([*points, np.zeros(0, dtype=np.int64)])))
 
 
-def _tilt(prediction: Prediction, seeing: Seeing) -> float:
-    """Return the largest angle between a ray of a plan and the normal of its point, deg."""
-    m, n = np.nonzero(prediction.sight.seen)
-    ray = prediction.stations.position[m] - prediction.planned.xyz[n]
-    cosine = (ray * prediction.planned.normals[n]).sum(axis=1) / np.linalg.norm(ray, axis=1)
+def _tilt(rays: FloatArray, normals: FloatArray, seeing: Seeing) -> float:
+    """Return the largest angle between a ray and the normal of its point, deg."""
+    cosine = (rays * normals).sum(axis=1) / np.linalg.norm(rays, axis=1)
     known = cosine[np.isfinite(cosine)]
     return math.degrees(math.acos(min(float(known.min()), 1.0))) if len(known) else seeing.max_incidence_deg
-
-
-def _distances(prediction: Prediction) -> tuple[float, ...]:
-    m, n = np.nonzero(prediction.sight.seen)
-    return tuple(np.linalg.norm(prediction.planned.xyz[n] - prediction.stations.position[m], axis=1).tolist())
 
 
 def verdict_of_plan(plan: Plan) -> Verdict:

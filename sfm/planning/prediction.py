@@ -245,11 +245,7 @@ def predict_network(
 
 
 def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
-    """Refuse observations without values, as of lines, that the planned points contradict.
-
-    Raises:
-        GeometryError: points more than MAX_OFF_SIGMAS off.
-    """
+    """Refuse observations without values, as of lines, that the planned points contradict."""
     for kind in (kind for kind in network.observations if isinstance(kind, Group) and len(kind)):
         off = np.abs(kind.linearise(values_of(estimate)).difference.ravel())
         beyond = off / kind.sigma.ravel()

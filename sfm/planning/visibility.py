@@ -319,14 +319,7 @@ class TargetSize:
 
 @checked_arguments()
 def compute_target_size(
-    *,
-    p: float,
-    w_mm: float,
-    d: float,
-    c_mm: float,
-    n: int,
-    tilt_deg: float = 0.0,
-    ring_per_dot: float = 3.0,
+    *, p: float, w_mm: float, d: float, c_mm: float, n: int, tilt_deg: float = 0.0, ring_per_dot: float = 3.0
 ) -> TargetSize:
     """Return how large a target must be to show so many pixels: r = p w d / (c n).
 

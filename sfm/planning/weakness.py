@@ -125,10 +125,8 @@ def reason_of(prediction: Prediction, j: int) -> str:
         motion = MOTIONS[int(by.argmax())]
         words.append(f"mostly from the {motion} of the whole network, which its observations give weakly")
     elif angle >= FLAT_DEG:
-        words.append(
-            f"far from the stations or seen by few (median of points: "
-            f"{counted(_median_rays(prediction), 'ray')})"
-        )
+        median = counted(int(np.median(prediction.rays)), "ray")
+        words.append(f"far from the stations or seen by few (median of points: {median})")
     return ", ".join(words)
 
 
@@ -229,10 +227,6 @@ def _contribution(camera: Camera, covariance: FloatArray, xy: FloatArray) -> flo
     some = xy[:: 1 + len(xy) // MAX_PLACES]
     Q = projection_covariance(camera, covariance, some, some)
     return float(np.sqrt(np.nanmean(np.einsum("kii->ki", Q))))
-
-
-def _median_rays(prediction: Prediction) -> int:
-    return int(np.median(prediction.rays))
 
 
 @dataclass(frozen=True)

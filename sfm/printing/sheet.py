@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.open_folders import disk_errors
 from sfm.files.whole_files import whole_file
 from sfm.rendering.scene import (
     ARC,
@@ -202,13 +203,11 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
 
 def _refuse_other_files(path: Path) -> None:
     """Raise OutputError where something is that is no earlier sheet: it would be lost."""
-    try:
+    with disk_errors(f"{path}: the sheet cannot be written"):
         if path.is_dir():
             raise OutputError(f"{path}: is a folder, needed the name of a file")
         if path.exists() and not (path.is_file() and CHECK.encode() in _head(path)):
             raise OutputError(f"{path}: exists and is no earlier sheet, needed another name")
-    except OSError as error:
-        raise OutputError(f"{path}: the sheet cannot be written: {error.strerror or error}") from error
 
 
 def _head(path: Path) -> bytes:

@@ -92,12 +92,7 @@ def page(found: EpochSeries) -> Page:
 
 
 def _columns(factor: float = 1.0, unit: str = "") -> tuple[Column, ...]:
-    """Return the columns of displacements.
-
-    Args:
-        factor: from the object unit to that of the page.
-        unit: of the page.
-    """
+    """Return the columns of displacements."""
     return (
         *(Column(None, "first"), Column(None, "second"), Column("point", "id")),
         *axes("d", unit, factor=factor),

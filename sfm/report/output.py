@@ -16,7 +16,6 @@ Every line has `time` (UTC) and `event`:
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import threading
@@ -33,15 +32,13 @@ from typing import Any, Self
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.covariance_file import ARRAYS, POINTS_NAME, write_covariance
-from sfm.files.covariance_file import NAME as POINT_COVARIANCE
+from sfm.files.covariance_file import write_covariance
 from sfm.files.csv_tables import read_table
-from sfm.files.open_folders import MANIFEST, make_folder, open_regular_file, refuse_foreign_folder
-from sfm.files.plain_text import Content, Name, read_json
-from sfm.files.result_tables import MOMENTS, MOUNTS, TABLES
+from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, refuse_foreign_folder
+from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.kernels.threads import give_back_memory
 from sfm.remarks.remark import remark
@@ -70,19 +67,6 @@ from sfm.runtime.progress import SILENT, Progress
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
-WRITTEN = (
-    *(
-        "summary.json",
-        *(table.file for table in TABLES),
-        MOUNTS,
-        MOMENTS,
-        POINT_COVARIANCE,
-        POINTS_NAME,
-        ARRAYS,
-    ),
-    *("report.txt", "report.html", "points.ply", "colmap", "overlays", "pictures", "plots", "log.jsonl"),
-    MANIFEST,
-)
 
 
 def write_result(
@@ -201,7 +185,9 @@ def plot_data(findings: Findings) -> PlotData:
         sigma=sigma * factor,
         sigma_unit=unit,
         projection=tuple(
-            _projection(adjustment, interior.family == f) for f in range(len(interior.families))
+            None if found is None else ProjectionMap(*found)
+            for f in range(len(interior.families))
+            for found in [projection_of(adjustment, interior.family == f)]
         ),
         epipolar=tuple(
             EpipolarMap(
@@ -216,12 +202,6 @@ def plot_data(findings: Findings) -> PlotData:
             if mount.epipolar is not None and len(mount.epipolar.px)
         ),
     )
-
-
-def _projection(adjustment: Adjustment, photographs: BoolArray) -> ProjectionMap | None:
-    """Return the projection uncertainty of the camera of photographs, (m,); None where it was held."""
-    found = projection_of(adjustment, photographs)
-    return None if found is None else ProjectionMap(*found)
 
 
 def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
@@ -345,7 +325,7 @@ class SurveyLog:
         self._begun = 0.0
         self._steps = 0
         if path is not None:
-            try:
+            with disk_errors(f"{path}: the log cannot be written"):
                 make_folder(path.parent)
                 if append:
                     refuse_other_log(path)
@@ -353,8 +333,6 @@ class SurveyLog:
                     remove_log(path)  # another run may have it open still
                 flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_EXCL)
                 self._file = os.fdopen(open_regular_file(path, flags), "a", encoding="utf-8")
-            except OSError as error:
-                raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
 
     def __enter__(self) -> Self:
         return self
@@ -386,11 +364,9 @@ class SurveyLog:
             self._lines.append(line)
             if self._file is None:
                 return
-            try:
+            with disk_errors(f"{self._path}: the log cannot be written"):
                 self._file.write(line + "\n")
                 self._file.flush()
-            except OSError as error:
-                raise OutputError(f"{self._path}: the log cannot be written: {error.strerror}") from error
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Write down the stage that ends with this one; a second call for a stage gives its total."""
@@ -440,8 +416,8 @@ def result_entries(findings: Findings) -> dict[str, Any]:
     return {
         "survey": result.survey,
         "verdict": findings.verdict.level,
-        "sigma0_px": float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
-        "rms_px": float(a.rms_px) if math.isfinite(a.rms_px) else None,
+        "sigma0_px": or_none(a.sigma0_px),
+        "rms_px": or_none(a.rms_px),
         "photographs": len(a.network.images),
         "photographs_total": result.images_total,
         "points": len(a.network.points),
@@ -474,10 +450,8 @@ def remove_log(path: Path) -> None:
         OutputError: something else stands there, or it cannot be removed.
     """
     refuse_other_log(path)
-    try:
+    with disk_errors(f"{path}: the log cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: the log cannot be removed: {error.strerror}") from error
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], ...]:

@@ -2,7 +2,7 @@
 
 Numbers as people read them: significant digits, exponents, units of a readable size.
 
-Every report writes its numbers with these; the templates know them as filters of the same names.
+Every report writes its numbers with these.
 """
 
 from __future__ import annotations

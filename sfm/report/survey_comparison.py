@@ -63,12 +63,7 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
         ("object point", scientific(d.max_point, 2), unit, scientific(d.max_point / size, 1)),
         ("rotation", scientific(d.max_rotation_deg, 2), "deg", ""),
         ("any parameter, in its standard deviations", scientific(d.max_sigmas, 1), "", ""),
-        (
-            "interior orientation, in the photograph",
-            scientific(interior, 2),
-            "px",
-            "",
-        ),
+        ("interior orientation, in the photograph", scientific(interior, 2), "px", ""),
     )
     yield Table(columns("largest difference", ">value", "unit", ">of the object size"), largest)
     yield Heading("Precision of the points")

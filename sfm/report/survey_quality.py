@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlation
+from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, POWER, Correlation
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.files.result_tables import VARIANCE_COMPONENTS
@@ -71,7 +71,7 @@ def precision_parts(f: Findings) -> Iterator[Part]:
         ("object points, largest sigma", p.largest, factor, finer),
         ("limiting: RMS with cameras free of error", p.limiting, factor, finer),
         ("projection centres, RMS sigma", p.centres, of_centres, centre_unit),
-        ("omega, phi, kappa, RMS sigma", p.angles_arcsec, 1.0, "arc seconds"),
+        ("omega, phi, kappa, RMS sigma", np.degrees(p.angles) * 3600, 1.0, "arc seconds"),
     ]
     shown = [
         (name, *(significant(one) for one in values * times), of)
@@ -240,7 +240,7 @@ def _reliability(f: Findings) -> Iterator[Part]:
     )
     yield Paragraph(
         "Minimal bias: the smallest gross error with which the tau test of an image coordinate exceeds its "
-        f"critical value, {fixed(s.reliability.critical, 2)}, in {fixed(100 * s.power, 0)} of 100 cases. "
+        f"critical value, {fixed(s.reliability.critical, 2)}, in {fixed(100 * POWER, 0)} of 100 cases. "
         "External reliability: its effect on an unknown if it is not found, in standard deviations of the "
         "unknown."
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.display import counted
-from sfm.errors import OutputError
+from sfm.files.open_folders import disk_errors
 from sfm.files.whole_files import refuse_existing, whole_file
 from sfm.remarks.verdict import Line
 from sfm.report.page import Banner, Column, FoldedParts, Page, Section, Table, axes, facts
@@ -112,12 +112,9 @@ def write_view(
 def refuse_foreign_page(out: Path) -> None:
     """Raise OutputError where something is in the place of a page that `kolinear view` has not written."""
     if out.is_file() and not out.is_symlink():
-        try:
-            with out.open("rb") as file:
-                if file.read(len(MARK)) == MARK:
-                    return
-        except OSError as error:
-            raise OutputError(f"{out}: cannot be read: {error.strerror}") from error
+        with disk_errors(f"{out}: cannot be read"), out.open("rb") as file:
+            if file.read(len(MARK)) == MARK:
+                return
     refuse_existing(out)
 
 

@@ -65,15 +65,10 @@ COMMANDS = ("kolinear", "kolinear.exe", "-m")  # who starts these reads one line
 BAD_INPUT = 2
 
 
-def refuse_mixed_installation(root: str | None = None) -> None:
-    """Raise InstallationError where another project's files lie in Kolinear's packages; two calls of stat.
-
-    Args:
-        root: folder of the packages; that of this one if not given.
-    """
-    root = root or ROOT
+def refuse_mixed_installation() -> None:
+    """Raise InstallationError where another project's files lie in Kolinear's packages; two calls of stat."""
     for file in FOREIGN:
-        path = os.path.join(root, file)
+        path = os.path.join(ROOT, file)
         if os.path.exists(path):
             from sfm.errors import InstallationError
 

@@ -15,7 +15,6 @@ import pytest
 from adapters.colmap.adjuster import reason_of
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
-from adapters.formats.mesh import read_ply
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.registry import read_any, read_comparable
 from adapters.formats.result_tables import read_result, write_tables
@@ -253,19 +252,6 @@ def test_refine_stays_in_its_folder(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "form", "match"),
     [
-        ("a.ply", "ply\n" + "property double x\n" * 9, "ply", r"the file ends here"),
-        (
-            "a.ply",
-            "ply\nelement vertex 4000000\n" + "property double x\n" * 5000 + "end_header\n",
-            "ply",
-            r"line 103: more than 100 properties, no more are read",
-        ),
-        (
-            "a.ply",
-            "ply\nelement vertex 4000000\n" + "".join(f"property int {c}\n" for c in "xyz") + "end_header\n",
-            "ply",
-            r"4000000 vertices of 3 numbers do not fit in \d+ bytes",
-        ),
         ("a.txt", "9000000 2 2\n0 0 1 1\n", "bal", r"number of cameras is '9000000', needed .* to 100000"),
         ("a.txt", "9000 2000000 2\n0 0 1 1\n", "bal", r"\d+ bytes in the file, at least 6081014 are due"),
         ("a.txt", "1 1 1\n" + "1 " * 6_000_000, "bal", r"line 2: more than 10000000 characters"),
@@ -281,12 +267,6 @@ def test_refine_stays_in_its_folder(tmp_path: Path, name: str) -> None:
             "bundle-csharp",
             r"photograph is 'a\\u202eb'",
         ),
-        (
-            "a.txt",
-            "ply\ncomment name a\u200bb\n",
-            "ply",
-            r"name of a point is 'a\\u200bb', needed",
-        ),
     ],
 )
 def test_sizes_and_names_in_text_files_are_checked_before_use(
@@ -295,7 +275,7 @@ def test_sizes_and_names_in_text_files_are_checked_before_use(
     (tmp_path / name).write_text(text, encoding="utf-8")
     begun = time.process_time()
     with pytest.raises(SurveyFileError, match=match):
-        read_ply(tmp_path / name) if form == "ply" else read_any(tmp_path / name, form)
+        read_any(tmp_path / name, form)
     assert time.process_time() - begun < SECONDS
 
 

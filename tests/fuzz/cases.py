@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image
 
 from adapters.colmap.camera_models import read_model, write_model
-from adapters.formats.mesh import read_ply
 from adapters.formats.registry import read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text
@@ -152,7 +151,6 @@ def _results(folder: Path) -> list[Seed]:
     write_any(folder / "pm", "photomodeler", network, replace(truth, cameras=(brown,)))
     write_any(folder / "scene.db", "colmap-database", network, truth)
     shutil.copy(folder / "scene.db", folder / "good.db")
-    write_any(folder / "p.ply", "ply", network, truth)
     found: list[Seed] = []
     for name in ("summary.json", "points.csv", "images.csv", "cameras.csv", "image_points.csv"):
         text = (folder / "result" / name).read_text("utf-8")
@@ -175,8 +173,6 @@ def _results(folder: Path) -> list[Seed]:
             _reader_of("scene.db", "colmap-database"),
         )
     )
-    text = (folder / "p.ply").read_text("utf-8")
-    found.append(Seed("results", "p.ply", text, lambda f, _: _drop(read_ply(f / "p.ply"))))
     return found
 
 

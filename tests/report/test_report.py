@@ -33,7 +33,7 @@ from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.findings.bundle_statistics import geometry_of
 from sfm.report.findings.survey_remarks import findings_of
-from sfm.report.output import WRITTEN, plot_data, write_result
+from sfm.report.output import plot_data, write_result
 from sfm.report.page import Paragraph, Section
 from sfm.report.pages import WIDTH, html_of, page_of, wrapped
 from sfm.report.phrases import (
@@ -57,6 +57,7 @@ from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
+from tests.written import WRITTEN
 
 EVIL = "<script>alert('x')</script>&\"é€"
 

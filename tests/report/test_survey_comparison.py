@@ -52,7 +52,7 @@ def test_the_outcome_comes_first_with_its_reasons(
 
 def test_the_other_pipeline_is_compared_in_a_unit_that_reads_well(result: SurveyResult) -> None:
     found = BaselineComparison(
-        "mapper", (5, 4), 5, (0.1, 0.5), 18, 0.25, None,  # type: ignore[arg-type]
+        "mapper", (5, 4), 5, (0.1, 0.5), 18, 0.25,
         np.full((18, 3), 1e-3), np.full((4, 3), 2e-3), np.full(4, 0.01), (2.0, 30.0),
     )  # fmt: skip
     _, both, apart, _ = pipeline_parts(findings_of(replace(result, baseline=found)))

@@ -13,6 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
+from sfm.report.findings.checks import longest_residual
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.result import SurveyResult
@@ -79,7 +80,7 @@ def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_report
     rotation[3], position[3] = rotation[6], position[6]
     result = run_survey(survey_of(network, truth, start=replace(truth, position=position, rotation=rotation)))
     assert len(result.network.images) == 8 and result.adjustment.converged
-    assert findings_of(result).longest.over_sigma < 6
+    assert longest_residual(result.adjustment).over_sigma < 6
     (replaced,) = of_kind(result.remarks, "orientation_replaced")
     assert replaced.names("photograph") == ("image 4",) and replaced.number("image_points") == 40
 

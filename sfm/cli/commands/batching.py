@@ -8,29 +8,25 @@ An engine without processes: one call after the other, here, where no library fo
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from threadpoolctl import threadpool_limits
 
 from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.cli.commands.surveying import AllowOutside, PicturesMb, Verbose
-from sfm.errors import KolinearError
+from sfm.errors import KolinearError, MissingLibraryError, one_line
+from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 from sfm.runtime.faults import FAULT
 
 if TYPE_CHECKING:
     from sfm.survey.assembly import OtherPrograms
     from sfm.survey.inputs.survey import Survey
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from types import ModuleType
-from typing import Any
-
-from threadpoolctl import threadpool_limits
-
-from sfm.errors import MissingLibraryError, one_line
-from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 
 INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
@@ -85,7 +81,6 @@ def batch(
         from sfm.batch.job import Comparers
         from sfm.batch.run import calls_of, find_surveys, run_batch
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
-        from sfm.cli.commands.batching import batch_engine
 
     files = find_surveys(surveys)
     compile_first()
@@ -140,7 +135,7 @@ def batch_engine(
         if cluster is not None:
             raise MissingLibraryError(f"--cluster {cluster}: Dask is not installed: {INSTALL_DASK}")
         send(f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}")
-        return in_process_engine()
+        return nullcontext(InProcess())
     engine: AbstractContextManager[Engine]
     if cluster is not None:
         engine = dask.remote_engine(cluster)
@@ -189,12 +184,6 @@ class InProcess:
                 continue
             yield from (Sent(work.key, message) for message in said)
             yield Done(work.key, value)
-
-
-@contextmanager
-def in_process_engine() -> Iterator[InProcess]:
-    """Give an engine that works in this process."""
-    yield InProcess()
 
 
 def _called(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:

@@ -201,8 +201,7 @@ def view(
         str | None, typer.Option("--from", metavar="F", help="Format of FOLDER; by default from its content.")
     ] = None,
     budget: Annotated[
-        float,
-        typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest size of the pictures."),
+        float, typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest size of the pictures.")
     ] = 15.0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
 ) -> None:

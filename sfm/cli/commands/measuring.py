@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -14,7 +14,7 @@ from sfm.cli.commands.starting import loading
 from sfm.conventions import AnyArray, FloatArray, pixel_from_image
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.csv_tables import read_table
-from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, match_points
+from sfm.matching.conjugate import MIN_CORRELATION, match_points
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.overlays import draw_patches
 from sfm.report.measuring import (
@@ -50,8 +50,7 @@ def match(
         typer.Option("--points", metavar="FILE", help="Table point,x_px,y_px[,x_right_px,y_right_px]."),
     ] = None,
     method: Annotated[
-        str,
-        typer.Option("--method", help="ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift."),
+        str, typer.Option("--method", help="ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift.")
     ] = "lsm",
     template: Annotated[
         int, typer.Option("--template", metavar="N", help="Side of the patch, odd, px.")
@@ -241,11 +240,7 @@ def targets(
 
 
 def _two(text: str) -> tuple[float, float]:
-    """Return the two numbers of `2,3`.
-
-    Raises:
-        SurveyFileError: not two numbers.
-    """
+    """Return the two numbers of `2,3`."""
     try:
         first, second = (float(part) for part in text.split(","))
     except ValueError as error:
@@ -254,11 +249,7 @@ def _two(text: str) -> tuple[float, float]:
 
 
 def _numbers(text: str) -> IntArray:
-    """Return the code numbers that `1-100,205` names.
-
-    Raises:
-        SurveyFileError: not numbers and ranges, or too many.
-    """
+    """Return the code numbers that `1-100,205` names."""
     import numpy as np
 
     numbers: list[int] = []
@@ -281,17 +272,12 @@ def match_command(
     *,
     point: str | None = None,
     points: Path | None = None,
-    method: str = "lsm",
     template_px: int = 21,
-    search_px: int = 121,
-    equalise: bool = False,
-    interpolation: str = "six_tap",
     min_correlation: float = MIN_CORRELATION,
-    back_px: float | None = BACK_PX,
-    wide: bool = True,
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
+    **how: Any,
 ) -> tuple[str, bool]:
     """Match points of two photograph files.
 
@@ -300,17 +286,12 @@ def match_command(
         right_path: the photograph in which they are found.
         point: "COL,ROW" in the left photograph, px; either this or `points`.
         points: table of points, see `read_points_to_match`.
-        method: this and the next six as in `sfm.matching.conjugate.match_points`.
         template_px: width of the template, px.
-        search_px: width of the search area, px.
-        equalise: whether the histograms of both photographs are equalised before.
-        interpolation: between pixels.
         min_correlation: least correlation coefficient.
-        back_px: largest distance of matching back, px; None for no matching back.
-        wide: whether points that are not found are looked for again, turned and scaled.
         as_json: JSON in place of the table.
         out: file .csv or .json that gets the table, in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.
+        how: more of what `sfm.matching.conjugate.match_points` takes.
 
     Returns:
         The text that the command line prints, and whether any point was matched.
@@ -335,14 +316,9 @@ def match_command(
             right,
             xy,
             xy_right=start,
-            method=method,
             template_px=template_px,
-            search_px=search_px,
-            equalise=equalise,
-            interpolation=interpolation,
             min_correlation=min_correlation,
-            back_px=back_px,
-            wide=wide,
+            **how,
         )
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:

@@ -191,8 +191,7 @@ def network_command(
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a grey value.")] = 2.0,
     blur: Annotated[float, typer.Option("--blur-px", help="Standard deviation of an edge, px.")] = 0.8,
     incidence: Annotated[
-        float,
-        typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the normal."),
+        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the normal.")
     ] = 60.0,
     f_number: Annotated[
         float | None, typer.Option("--f-number", metavar="N", help="For the depth of field; needs --focus.")
@@ -205,12 +204,10 @@ def network_command(
         typer.Option("--confusion-um", metavar="UM", help="Circle of confusion.  [default: two pixels]"),
     ] = None,
     distance: Annotated[
-        str | None,
-        typer.Option("--distance", metavar="MIN,MAX", help="Range of stations from points."),
+        str | None, typer.Option("--distance", metavar="MIN,MAX", help="Range of stations from points.")
     ] = None,
     space: Annotated[
-        str | None,
-        typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Region of stations."),
+        str | None, typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Region of stations.")
     ] = None,
     floor: Annotated[float | None, typer.Option("--floor", metavar="Z", help="Lowest station.")] = None,
     photographs: Annotated[
@@ -388,8 +385,7 @@ def more_command(
         int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new ones.")
     ] = 3,
     incidence: Annotated[
-        float,
-        typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the mean ray."),
+        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the mean ray.")
     ] = 60.0,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of page and tables.")] = Path(
         "out/more"

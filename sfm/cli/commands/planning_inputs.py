@@ -68,13 +68,7 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
     from sfm.files.csv_tables import read_table
 
     table = read_table(
-        path,
-        ("id",),
-        ("X", "Y", "Z"),
-        NORMALS,
-        aliases=(("point", "id"),),
-        ignored=None,
-        blank=NORMALS,
+        path, ("id",), ("X", "Y", "Z"), NORMALS, aliases=(("point", "id"),), ignored=None, blank=NORMALS
     )
     normals = table.values[:, 3:] if table.values.shape[1] > 3 else None
     return object_of_points(table.keys("id"), table.values[:, :3].copy(), normals)

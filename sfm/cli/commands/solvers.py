@@ -120,8 +120,7 @@ def convert(
         str | None, typer.Option("--from", metavar="F", help="Format to read; by default from its content.")
     ] = None,
     straighten: Annotated[
-        bool,
-        typer.Option("--undistort", help="Correct image points for distortion, for formats without it."),
+        bool, typer.Option("--undistort", help="Correct image points for distortion, for formats without it.")
     ] = False,
     control: Annotated[
         Path | None,
@@ -256,12 +255,7 @@ def epochs(
         given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
     with working_on(" ".join(map(str, results))):
         found = analyse_epochs(
-            given,
-            reference=_listed(reference),
-            groups=groups,
-            model=model,
-            alpha=alpha,
-            together=together,
+            given, reference=_listed(reference), groups=groups, model=model, alpha=alpha, together=together
         )
     page = write_page(found, out)
     print_verdict(verdict_of_epochs(found))

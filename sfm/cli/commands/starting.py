@@ -150,7 +150,8 @@ def doctor() -> None:
     table.add_row("browser", next((name for name in BROWSERS if shutil.which(name)), "none found by name"))
     table.add_row("kernels", f"{KEPT}, {'compiled' if is_warm() else 'not yet compiled'}")
     store = user_folder("measured", "measured points")
-    table.add_row("measured points", f"{store}, {_megabytes(store):.0f} MB")
+    size = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
+    table.add_row("measured points", f"{store}, {size / 1e6:.0f} MB")
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     table.add_row("free space", f"{free:.1f} GB in {Path.cwd()}")
     console.print(table)
@@ -247,7 +248,3 @@ def _memory() -> str:
     if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
         return "unknown"
     return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
-
-
-def _megabytes(folder: Path) -> float:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6

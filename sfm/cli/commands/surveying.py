@@ -144,8 +144,8 @@ def run(
         images,
         out,
         jobs,
-        allow_outside,
-        verbose,
+        allow_outside=allow_outside,
+        verbose=verbose,
         from_photographs=True,
         camera=camera,
         weighted=camera_weighted,
@@ -170,7 +170,10 @@ def adjust(
     must put something right.
     """
     _run_survey(
-        *(survey_file, None, out, None, allow_outside, verbose),
+        survey_file,
+        out=out,
+        allow_outside=allow_outside,
+        verbose=verbose,
         from_photographs=False,
         camera=camera,
         weighted=camera_weighted,
@@ -180,28 +183,21 @@ def adjust(
 
 def run_file(survey_file: Path) -> Path:
     """Run a survey file, with photographs or without, and return the folder of its result, out/NAME."""
-    return _run_survey(
-        *(survey_file, None, None, None, False, False),
-        from_photographs=None,
-        camera=None,
-        weighted=False,
-        overwrite=False,
-        pictures_mb=15.0,
-    )
+    return _run_survey(survey_file, pictures_mb=15.0)
 
 
 def _run_survey(
     survey_file: Path,
-    images: Path | None,
-    out: Path | None,
-    jobs: int | None,
-    allow_outside: bool,
-    verbose: bool,
+    images: Path | None = None,
+    out: Path | None = None,
+    jobs: int | None = None,
     *,
-    from_photographs: bool | None,
-    camera: Path | None,
-    weighted: bool,
-    overwrite: bool,
+    allow_outside: bool = False,
+    verbose: bool = False,
+    from_photographs: bool | None = None,
+    camera: Path | None = None,
+    weighted: bool = False,
+    overwrite: bool = False,
     pictures_mb: float = 0.0,
 ) -> Path:
     """Run a survey, write and print its result, return its folder; the command is for photographs or not."""
@@ -260,10 +256,9 @@ def _run_survey(
         find_photographs(survey, images_dir=images)  # a wrong folder is reported before anything is compiled
     compile_first()
     jobs = jobs or cores()
-    workers = jobs if from_photographs else 1
-    store = None
+    workers, store = 1, None
     if from_photographs:
-        store = MeasuredStore.of_user()
+        workers, store = jobs, MeasuredStore.of_user()
         store.remove_old()
     with (
         working_on(str(survey_file)),

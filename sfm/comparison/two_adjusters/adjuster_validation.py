@@ -120,12 +120,7 @@ class Validation:
 
 
 def validate(
-    backend: ValidationBackend,
-    *,
-    networks: int,
-    seed: int,
-    jobs: int = 1,
-    progress: Progress = SILENT,
+    backend: ValidationBackend, *, networks: int, seed: int, jobs: int = 1, progress: Progress = SILENT
 ) -> Validation:
     """Adjust random networks with both adjusters and compare everything.
 
@@ -197,14 +192,12 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
 
 
 def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Iterator[Trial]:
-    if jobs <= 1:
-        with threadpool_limits(1):
-            warm_up(backend)
-            for number in range(networks):
-                yield make_trial(number, seed, backend)
-        return
     with threadpool_limits(1):
         warm_up(backend)  # compiles, where it must, once and not in every worker
+        if jobs <= 1:
+            for number in range(networks):
+                yield make_trial(number, seed, backend)
+            return
     # Fresh processes: threads of compiled libraries do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with (
@@ -340,11 +333,7 @@ def _covariances(
         for ours, theirs in zip(full.covariance.interior, found.interior, strict=True)
         if len(theirs)
     ]
-    return (
-        max(points, default=np.nan),
-        max(interior, default=np.nan),
-        float(np.median(ratio)),
-    )
+    return (max(points, default=np.nan), max(interior, default=np.nan), float(np.median(ratio)))
 
 
 def _relative(ours: FloatArray, theirs: FloatArray) -> float:

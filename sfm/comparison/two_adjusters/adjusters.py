@@ -7,6 +7,7 @@ survey in `brown` is `full_opencv`.
 With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
 the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
 all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's
+from functools import partial
 result in both adjusters, and the comparison reports it.
 
 Cameras that share single parameters, for adjusters that know no such sharing.
@@ -22,6 +23,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
@@ -81,7 +83,6 @@ class AdjusterComparison:
     adjustment: Adjustment  # the in-house one in that model
     backend_iterations: int  # steps of the other adjuster
     backend_converged: bool
-    backend_seconds: float  # s
     comparison: Comparison
     backend_points: (
         FloatArray | None
@@ -204,7 +205,6 @@ def compare_adjusters(
         ours,
         theirs.iterations,
         theirs.converged,
-        theirs.seconds,
         found,
         None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
         unshared,
@@ -215,12 +215,7 @@ def compare_adjusters(
 
 def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
     return adjust(
-        network,
-        start,
-        datum=Datum("free"),
-        sigma_px=sigma_px,
-        reject="none",
-        max_iterations=MAX_ITERATIONS,
+        network, start, datum=Datum("free"), sigma_px=sigma_px, reject="none", max_iterations=MAX_ITERATIONS
     )
 
 
@@ -329,8 +324,8 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     more = _held_there(own_cameras, compared.estimate.cameras)
     if not more or not compared.converged:
         return None
-    start = replace(compared.estimate, cameras=own_cameras)
-    freer = _adjusted_freely(network, start, survey.sigma_px, covariance=False)
+    adjusted = partial(adjust, network, datum=Datum("free"), sigma_px=survey.sigma_px, reject="none")
+    freer = adjusted(replace(compared.estimate, cameras=own_cameras), covariance=False)
     freed = freer.redundancy - compared.redundancy
     if not freer.converged or freed <= 0 or compared.redundancy <= 0:
         return None
@@ -338,9 +333,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     found = BetterFit(freer.rms_px, compared.rms_px, more)
     if f_isf(CAMERA_ALPHA, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
         return None
-    tested = contradicted_parameters(
-        _adjusted_freely(network, freer.estimate, survey.sigma_px, covariance=True)
-    )
+    tested = contradicted_parameters(adjusted(freer.estimate, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
     return replace(found, free=clear or more)
 
@@ -352,9 +345,3 @@ def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tu
         free = corresponding_free(theirs, ours.model) & ~ours.free
         names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
     return tuple(names)
-
-
-def _adjusted_freely(network: Network, start: Estimate, sigma_px: float, *, covariance: bool) -> Adjustment:
-    return adjust(
-        network, start, datum=Datum("free"), sigma_px=sigma_px, reject="none", covariance=covariance
-    )

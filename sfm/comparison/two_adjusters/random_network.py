@@ -166,18 +166,13 @@ def _camera(rng: np.random.Generator, plan: Plan, number: int) -> Camera:
 def _object(rng: np.random.Generator, plan: Plan) -> FloatArray:
     """Points in a disc or a ball, flat strips in a rectangle along the strip."""
     if plan.arrangement == "strip":
-        length = _strip_length(plan)
+        length = 0.7 * (plan.images - 1) + 1.6  # that the photographs cover
         xyz = rng.uniform(-1, 1, (plan.points, 3)) * [length / 2, 1.0, 0.3]
     else:
         xyz = rng.standard_normal((plan.points, 3))
         radius = rng.random(plan.points) ** (1 / 3)
         xyz *= (radius / np.linalg.norm(xyz, axis=1))[:, None]
     return xyz * [1, 1, 0 if plan.planar else 1]
-
-
-def _strip_length(plan: Plan) -> float:
-    """Length that the photographs of a strip cover at an advance of 0.7 object units."""
-    return 0.7 * (plan.images - 1) + 1.6
 
 
 def _stations(rng: np.random.Generator, plan: Plan) -> tuple[FloatArray, FloatArray]:

@@ -6,11 +6,12 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.display import program_name
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochSeries
@@ -33,7 +34,7 @@ from sfm.report.figures.plots import (
 from sfm.report.phrases import finer_unit, significant
 
 BINS = 30
-COLOURS = ((IN, GREEN), (OUT, RED))
+COLOURS = {IN: GREEN, OUT: RED}
 SIZE_IN = (7.0, 4.5)
 DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # lines of the diagram
 MAX_DRAWN = 12  # points of a series that are drawn, those that moved farthest
@@ -69,16 +70,9 @@ def difference_figure(
         *flat.T, *(factor * d[:, :2]).T, color=colours, angles="xy", scale_units="xy", scale=1, width=0.002
     )
     limit = across * finer or 1.0
+    x, y = flat.T
     dots = axes.scatter(
-        flat[:, 0],
-        flat[:, 1],
-        c=d[:, 2] * finer,
-        s=14,
-        cmap="coolwarm",
-        vmin=-limit,
-        vmax=limit,
-        edgecolors="grey",
-        lw=0.3,
+        x, y, c=d[:, 2] * finer, s=14, cmap="coolwarm", vmin=-limit, vmax=limit, edgecolors="grey", lw=0.3
     )
     picture.colorbar(dots, ax=axes, label=f"{names[2]} [{fine_unit}]", shrink=0.7, fraction=0.04)
     if longest > 0:
@@ -87,8 +81,7 @@ def difference_figure(
     axes.plot(*(flat + factor * d[:, :2]).T, alpha=0.0)  # arrows do not widen the axes by themselves
     axes.set_aspect("equal")
     suffix = f" [{unit}]" if unit else ""
-    axes.set_xlabel(f"{names[0]}{suffix}")
-    axes.set_ylabel(f"{names[1]}{suffix}")
+    axes.set(xlabel=f"{names[0]}{suffix}", ylabel=f"{names[1]}{suffix}")
     return picture
 
 
@@ -100,35 +93,9 @@ def time_figure(validation: Validation) -> Figure:
     axes = picture.subplots()
     axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label=program_name("kolinear"))
     axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=program_name(validation.backend))
-    axes.set_xlabel("image points")
-    axes.set_ylabel("s")
+    axes.set(xlabel="image points", ylabel="s")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="upper left")
-    return picture
-
-
-def _series_figure(
-    names: tuple[str, ...], points: tuple[str, ...], length: FloatArray, sigma: FloatArray, unit: str
-) -> Figure:
-    """Draw the displacement of points from epoch to epoch, with the band of two standard deviations.
-
-    Args:
-        names: of the epochs, k of them.
-        points: names of p points.
-        length: displacement since the first epoch along its last direction, unit, (p, k).
-        sigma: standard deviations of these, unit, (p, k).
-        unit: of lengths.
-    """
-    picture = alone(3.8)
-    axes = picture.subplots()
-    at = np.arange(len(names))
-    for name, values, s in zip(points, length, sigma, strict=True):
-        (line,) = axes.plot(at, values, marker="o", ms=3, label=name)
-        axes.fill_between(at, values - 2 * s, values + 2 * s, color=line.get_color(), alpha=0.15, lw=0)
-    axes.axhline(0.0, color="grey", lw=0.8)
-    axes.set_xticks(at, names)
-    axes.set_ylabel(f"displacement [{unit}]")
-    axes.legend(fontsize=8, ncols=4, loc="upper left")
     return picture
 
 
@@ -146,9 +113,20 @@ def plot_series(found: EpochSeries) -> Plot | None:
     if not chosen:
         return None
     factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
-    rows = [_along(name, pairs) for name in chosen]
-    length, sigma = (factor * np.array([row[k] for row in rows]) for k in (0, 1))
-    return plot("series", BANDS, _series_figure(found.names, tuple(chosen), length, sigma, unit))
+    picture = alone(3.8)
+    axes = picture.subplots()
+    at = np.arange(len(found.names))
+    for name in chosen:
+        length, sigma = (factor * np.array(one) for one in _along(name, pairs))
+        (line,) = axes.plot(at, length, marker="o", ms=3, label=name)
+        axes.fill_between(
+            at, length - 2 * sigma, length + 2 * sigma, color=line.get_color(), alpha=0.15, lw=0
+        )
+    axes.axhline(0.0, color="grey", lw=0.8)
+    axes.set_xticks(at, found.names)
+    axes.set_ylabel(f"displacement [{unit}]")
+    axes.legend(fontsize=8, ncols=4, loc="upper left")
+    return plot("series", BANDS, picture)
 
 
 def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
@@ -224,29 +202,14 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
     picture = panelled(3.6)
     left, right = picture.subplots(1, 2)
     left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
-    left.set_xlabel(f"deviation [{fine}]")
-    left.set_ylabel("points")
+    left.set(xlabel=f"deviation [{fine}]", ylabel="points")
     order = np.argsort(value, kind="stable")
-    decision = np.array(found.decision)[order]
     x = np.arange(1, len(order) + 1)
-    for name in dict.fromkeys(decision.tolist()):
-        rows = decision == name
-        colour = dict(COLOURS).get(name, ORANGE)
-        right.errorbar(
-            x[rows],
-            value[order][rows],
-            yerr=U[order][rows],
-            fmt="o",
-            ms=3,
-            lw=0.8,
-            color=colour,
-            label=f"{name} ({rows.sum()})",
-        )
+    _draw_decided(right, x, value[order], U[order], np.array(found.decision)[order], 3)
     for limit in limits:
         left.axvline(limit * factor, color=GREY, lw=1, ls="--")
         right.axhline(limit * factor, color=GREY, lw=1, ls="--")
-    right.set_xlabel("points in order of their deviation")
-    right.set_ylabel(f"deviation and U [{fine}]")
+    right.set(xlabel="points in order of their deviation", ylabel=f"deviation and U [{fine}]")
     right.legend(fontsize=8, loc="upper left")
     return picture
 
@@ -263,20 +226,20 @@ def length_error_figure(found: Acceptance) -> Figure:
     axes.plot(x, limit, color=GREY, lw=1.2)
     axes.plot(x, -limit, color=GREY, lw=1.2)
     axes.axhline(0, color=GREY, lw=0.6)
-    decision = np.array(found.decision)
-    for name in dict.fromkeys(found.decision):
-        rows = decision == name
-        axes.errorbar(
-            length[rows],
-            error[rows] * factor,
-            yerr=U[rows] * factor,
-            fmt="o",
-            ms=4,
-            lw=0.8,
-            color=dict(COLOURS).get(name, ORANGE),
-            label=f"{name} ({rows.sum()})",
-        )
-    axes.set_xlabel(f"calibrated length [{found.unit}]")
-    axes.set_ylabel(f"measured minus calibrated [{fine}]")
+    _draw_decided(axes, length, error * factor, U * factor, np.array(found.decision), 4)
+    axes.set(
+        xlabel=f"calibrated length [{found.unit}]",
+        ylabel=f"measured minus calibrated [{fine}]",
+    )
     axes.legend(fontsize=8, loc="upper left")
     return picture
+
+
+def _draw_decided(
+    axes: Axes, x: AnyArray, y: FloatArray, U: FloatArray, decision: AnyArray, size: float
+) -> None:
+    """Draw values with their uncertainty, in a colour for each decision."""
+    for name in dict.fromkeys(decision.tolist()):
+        rows = decision == name
+        colour, label = COLOURS.get(name, ORANGE), f"{name} ({rows.sum()})"
+        axes.errorbar(x[rows], y[rows], yerr=U[rows], fmt="o", ms=size, lw=0.8, color=colour, label=label)

@@ -139,26 +139,33 @@ _EPIPOLAR = (
 
 def epipolar_figure(shown: PlotData) -> Figure:
     """Draw the distances from epipolar lines over the format of each mounted camera, two in a row."""
-    rows = -(-len(shown.epipolar) // 2)
-    figure = panelled(4.4 * rows, rows=rows)
-    panels = figure.subplots(rows, 2, squeeze=False).ravel()
-    for panel, one in zip(panels, shown.epipolar, strict=False):
+    figure, panels = _two_in_a_row(len(shown.epipolar))
+    for panel, one in zip(panels, shown.epipolar, strict=True):
         keep = slice(None, None, max(1, len(one.xy) // MAX_ARROWS))
         limit = 3 * max(one.rms_px, 1e-12)
-        drawn = panel.scatter(
-            *one.xy[keep].T, c=one.distance_px[keep], s=6, cmap="coolwarm", vmin=-limit, vmax=limit
-        )
+        x, y = one.xy[keep].T
+        drawn = panel.scatter(x, y, 6, one.distance_px[keep], cmap="coolwarm", vmin=-limit, vmax=limit)
         figure.colorbar(drawn, ax=panel, label="distance [px]", shrink=0.85, fraction=BAR_FRACTION)
-        width, height = one.size_px
-        panel.set_xlim(-0.5, width - 0.5)
-        panel.set_ylim(height - 0.5, -0.5)
-        panel.set_aspect("equal")
-        panel.set_xlabel("x [px]")
-        panel.set_ylabel("y [px]")
-        entitled(panel, f"{_plain(one.name)}: RMS {one.rms_px:.3g} px")
-    for panel in panels[len(shown.epipolar) :]:
-        panel.set_axis_off()
+        _show_format(panel, one.size_px, f"{_plain(one.name)}: RMS {one.rms_px:.3g} px")
     return figure
+
+
+def _two_in_a_row(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with so many panels for formats of photographs."""
+    rows = -(-count // 2)
+    figure = panelled(4.4 * rows, rows=rows)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for panel in panels[count:]:
+        panel.set_axis_off()
+    return figure, list(panels[:count])
+
+
+def _show_format(panel: Axes, size_px: tuple[int, int], title: str) -> None:
+    """Let a panel show the format of a photograph, below a title."""
+    width, height = size_px
+    panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
+    panel.set_aspect("equal")
+    entitled(panel, title)
 
 
 def network_figure(shown: PlotData) -> Figure:
@@ -178,17 +185,21 @@ def network_figure(shown: PlotData) -> Figure:
             panel.add_collection(LineCollection(list(edges[:, :, plane]), colors=colour, linewidths=0.8))
             label = _plain(camera.name)
             panel.plot(*position[of_camera][:, plane].T, "o", color=colour, markersize=4, label=label)
-        panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.1)  # for the names of the photographs
         panel.autoscale_view()
-        panel.set_xlabel(f"{labels[across]} [{_plain(shown.unit)}]")
-        panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
-        entitled(panel, title)
-        panel.grid(color="#ddd", linewidth=0.5)
+        _show_object(panel, labels[across], labels[up], shown.unit, title)
     figure.axes[0].legend(loc="upper right", fontsize=7)
     if len(position) <= MAX_NAMED:
         _write_names(figure.axes[0], [_plain(_short(name)) for name in shown.images], position[:, :2])
     return figure
+
+
+def _show_object(panel: Axes, across: str, up: str, unit: str, title: str) -> None:
+    """Let a panel show a plane of the object, its axes by their names, below a title."""
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set(xlabel=f"{across} [{_plain(unit)}]", ylabel=f"{up} [{_plain(unit)}]")
+    panel.grid(color="#ddd", linewidth=0.5)
+    entitled(panel, title)
 
 
 def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
@@ -202,12 +213,13 @@ def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
     for name, (x, y) in zip(names, places, strict=True):
         inwards = -1 if x > middle else 1
         for side, height in ((inwards, 4), (inwards, -9), (-inwards, 4), (-inwards, -9)):
+            near = "left" if side > 0 else "right"
             text = panel.annotate(
                 name,
                 (x, y),
-                xytext=(4 * side, height),
-                ha="left" if side > 0 else "right",
+                (4 * side, height),
                 textcoords="offset points",
+                ha=near,
                 fontsize=7,
                 color="#444",
             )
@@ -228,34 +240,22 @@ def precision_figure(shown: PlotData) -> Figure:
     figure = panelled(4.6)
     for panel, title, (across, up) in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
         panel.plot(points[~known, across], points[~known, up], ".", color=GREY, markersize=3)
-        drawn = panel.scatter(
-            *points[worst_last][:, [across, up]].T,
-            c=shown.sigma[worst_last],
-            s=14,
-            cmap=SHADES,
-        )
-        figure.colorbar(
-            drawn, ax=panel, label=f"sigma [{_plain(shown.sigma_unit)}]", shrink=0.85, fraction=BAR_FRACTION
-        )
-        panel.set_aspect("equal", adjustable="datalim")
-        panel.set_xlabel(f"{labels[across]} [{_plain(shown.unit)}]")
-        panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
-        panel.grid(color="#ddd", linewidth=0.5)
-        entitled(panel, title)
+        x, y = points[worst_last][:, [across, up]].T
+        drawn = panel.scatter(x, y, c=shown.sigma[worst_last], s=14, cmap=SHADES)
+        label = f"sigma [{_plain(shown.sigma_unit)}]"
+        figure.colorbar(drawn, ax=panel, label=label, shrink=0.85, fraction=BAR_FRACTION)
+        _show_object(panel, labels[across], labels[up], shown.unit, title)
     return figure
 
 
 def projection_figure(shown: PlotData) -> Figure:
     """Draw the projection uncertainty of each adjusted camera over its format, two in a row."""
     adjusted = [k for k, one in enumerate(shown.projection) if one is not None]
-    rows = -(-len(adjusted) // 2)
-    figure = panelled(4.4 * rows, rows=rows)
-    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    figure, panels = _two_in_a_row(len(adjusted))
     owner = shown.camera[shown.image]
-    for panel, k in zip(panels, adjusted, strict=False):
+    for panel, k in zip(panels, adjusted, strict=True):
         camera, found = shown.cameras[k], shown.projection[k]
         assert found is not None
-        width, height = camera.size_px
         known = found.sigma[found.sigma > 0]
         levels = np.geomspace(np.quantile(known, OUTSIDE), known.max() * (1 + 1e-9), LEVELS)
         drawn = panel.contourf(
@@ -263,23 +263,11 @@ def projection_figure(shown: PlotData) -> Figure:
         )
         xy = shown.xy[owner == k]
         panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="black", markersize=1, alpha=0.5)
-        figure.colorbar(
-            drawn,
-            ax=panel,
-            label="sigma [px]",
-            shrink=0.85,
-            fraction=BAR_FRACTION,
-            ticks=levels,
-            format="%.2g",
+        bar = figure.colorbar(
+            drawn, ax=panel, shrink=0.85, fraction=BAR_FRACTION, ticks=levels, format="%.2g"
         )
-        panel.set_xlim(-0.5, width - 0.5)
-        panel.set_ylim(height - 0.5, -0.5)
-        panel.set_aspect("equal")
-        panel.set_xlabel("x [px]")
-        panel.set_ylabel("y [px]")
-        entitled(panel, _plain(_clipped(camera.name)))
-    for panel in panels[len(adjusted) :]:
-        panel.set_axis_off()
+        bar.set_label("sigma [px]")
+        _show_format(panel, camera.size_px, _plain(_clipped(camera.name)))
     return figure
 
 
@@ -293,21 +281,16 @@ def residual_figure(shown: PlotData) -> Figure:
         of_owner = owner == k
         xy, v = shown.xy[of_owner], shown.residuals[of_owner]
         width, height = camera.size_px
+        name = _plain(_clipped(camera.name))
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
-        entitled(panels[k, 0], f"{_plain(_clipped(camera.name))}: {len(xy)} residuals, × {factor:g}")
+        _show_format(panels[k, 0], camera.size_px, f"{name}: {len(xy)} residuals, × {factor:g}")
         centres, means = _cell_means(xy, v, width, height)
         if len(centres):
             factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
             _arrows(panels[k, 1], centres, means * factor, RED)
-        entitled(panels[k, 1], f"{_plain(_clipped(camera.name))}: mean of each cell, × {factor:g}")
-        for panel in panels[k]:
-            panel.set_xlim(-0.5, width - 0.5)
-            panel.set_ylim(height - 0.5, -0.5)
-            panel.set_aspect("equal")
-            panel.set_xlabel("x [px]")
-            panel.set_ylabel("y [px]")
+        _show_format(panels[k, 1], camera.size_px, f"{name}: mean of each cell, × {factor:g}")
     return figure
 
 
@@ -323,8 +306,7 @@ def distribution_figure(shown: PlotData) -> Figure:
     )
     t = np.linspace(-5, 5, 201)
     histogram.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color="black", linewidth=1, label="normal")
-    histogram.set_xlabel("residual / its sigma (beyond 5 in the last bar)")
-    histogram.set_ylabel("frequency")
+    histogram.set(xlabel="residual / its sigma (beyond 5 in the last bar)", ylabel="frequency")
     histogram.legend(fontsize=8, loc="upper right")
     distance = np.linalg.norm(ray, axis=1)
     direction = ray / np.maximum(distance, 1e-9)[:, None]
@@ -338,8 +320,7 @@ def distribution_figure(shown: PlotData) -> Figure:
         radial.plot(middle, rms, "-o", color=colour, markersize=3, label=f"{label} RMS")
         radial.plot(middle, mean, "--", color=colour, linewidth=1, label=f"{label} mean")
     radial.axhline(0, color="black", linewidth=0.5)
-    radial.set_xlabel("distance from the centre of the photograph [px]")
-    radial.set_ylabel("residual [px]")
+    radial.set(xlabel="distance from the centre of the photograph [px]", ylabel="residual [px]")
     lowest, highest = radial.get_ylim()
     radial.set_ylim(lowest, highest + 0.25 * (highest - lowest))  # for the legend
     radial.legend(fontsize=8, loc="upper left", ncols=2)  # "best" takes seconds with many points
@@ -409,18 +390,7 @@ def _pyramids(shown: PlotData, images: IntArray, camera: PlotCamera, size: float
 
 
 def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:
-    panel.quiver(
-        xy[:, 0],
-        xy[:, 1],
-        v[:, 0],
-        v[:, 1],
-        color=colour,
-        angles="xy",
-        scale_units="xy",
-        scale=1,
-        width=0.0015,
-        headwidth=4,
-    )
+    panel.quiver(*xy.T, *v.T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.0015, headwidth=4)
 
 
 def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:

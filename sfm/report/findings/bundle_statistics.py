@@ -17,7 +17,6 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from sfm.adjustment.quality.statistics import (
-    POWER,
     CoordinateTest,
     Correlation,
     GlobalTest,
@@ -31,12 +30,7 @@ from sfm.adjustment.quality.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.quality.variance_components import (
-    VarianceComponents,
-    by_camera,
-    by_kind,
-    by_photograph,
-)
+from sfm.adjustment.quality.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
@@ -69,7 +63,6 @@ class Statistics:
     largest_w: float  # absolute, NaN where none is known
     largest_tau: float
     reliability: Reliability  # internal and external, of every image coordinate
-    power: float  # with which the w test finds the minimal detectable bias
     minimal_bias: Spread  # of the image coordinates, px
     external: Spread  # effect of the same on an unknown, in its standard deviations
     redundancy: Spread  # redundancy numbers of the image coordinates
@@ -121,7 +114,6 @@ def statistics_of(result: SurveyResult) -> Statistics:
         largest_w=spread(np.abs(w.statistic)).largest,
         largest_tau=spread(np.abs(tau.statistic)).largest,
         reliability=found,
-        power=POWER,
         minimal_bias=spread(found.minimal_bias),
         external=spread(found.external),
         redundancy=spread(adjustment.redundancy_numbers),

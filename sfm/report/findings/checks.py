@@ -180,11 +180,6 @@ class Precision:
         """Standard deviations of each photograph, object unit and deg, (m, 6)."""
         return np.asarray(self.exterior * np.repeat([1.0, np.degrees(1.0)], 3))
 
-    @property
-    def angles_arcsec(self) -> FloatArray:
-        """RMS of omega, phi, kappa, arc seconds, (4,)."""
-        return np.degrees(self.angles) * 3600
-
 
 def precision_of(adjustment: Adjustment) -> Precision:
     """Return the precision of the unknowns."""

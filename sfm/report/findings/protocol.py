@@ -183,20 +183,14 @@ def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
     )
 
 
-def _check(point: str, c: int, given: float, prior: float, *found: float) -> ControlCoordinate:
-    """Return a coordinate that took no part, and its difference over the standard deviation of that.
-
-    Args:
-        point: its name.
-        c: which of its coordinates.
-        given: the coordinate.
-        prior: its standard deviation.
-        found: the adjusted coordinate, its standard deviation, and adjusted minus given.
-    """
-    _, posterior, difference = found
+def _check(
+    point: str, c: int, given: float, prior: float, adjusted: float, posterior: float, difference: float
+) -> ControlCoordinate:
+    """Return a coordinate that took no part, and its difference over the standard deviation of that."""
     expected = float(np.hypot(prior, posterior))
     test = difference / expected if expected > 0 else np.nan
-    return ControlCoordinate("check", point, "XYZ"[c], *map(float, (given, prior, *found, test)))
+    numbers = map(float, (given, prior, adjusted, posterior, difference, test))
+    return ControlCoordinate("check", point, "XYZ"[c], *numbers)
 
 
 def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:

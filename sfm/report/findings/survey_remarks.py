@@ -397,7 +397,6 @@ class Findings:
     verdict: Verdict
     sigma0: Sigma0
     counts: ObservationCounts
-    longest: LongestResidual  # in standard deviations, of the accepted image points
     largest: tuple[tuple[Any, ...], ...]  # photograph, point, vx and vy in px, w, tau of the accepted
     statistics: Statistics
     geometry: Geometry
@@ -446,7 +445,6 @@ def findings_of(result: SurveyResult) -> Findings:
         verdict=judge(remarks, headlines_of(result)),
         sigma0=sigma0,
         counts=count_observations(a),
-        longest=longest,
         largest=largest_residuals(a),
         statistics=statistics,
         geometry=geometry,

@@ -41,13 +41,7 @@ def summary(findings: Findings) -> dict[str, Any]:
 
 
 def _finite(value: Any, name: str, names: list[str]) -> Any:
-    """Return a value with None for every number that is not finite; the names of these are appended.
-
-    Args:
-        value: as for JSON.
-        name: of the value, the keys that lead to it joined by dots.
-        names: which numbers were not finite so far.
-    """
+    """Return a value with None for every number that is not finite; the names of these are appended."""
     if isinstance(value, dict):
         return {key: _finite(one, f"{name}.{key}".lstrip("."), names) for key, one in value.items()}
     if isinstance(value, list | tuple):

@@ -359,10 +359,6 @@ def _scene_of_displacements(found: Displacements, first: Solution) -> ViewerScen
     """Return the scene of an epoch with the displacement of every point and the outcome of its test.
 
     Standard deviations and ellipsoids are those of the displacements.
-
-    Args:
-        found: displacements from this epoch to another one.
-        first: the epoch.
     """
     names = first.network.points
     row = {name: j for j, name in enumerate(names)}

@@ -1,0 +1,16 @@
+"""What the folder of a result may hold."""
+
+from __future__ import annotations
+
+from sfm.files.manifest import MANIFEST
+from sfm.files.rig_tables import MOMENTS, MOUNTS
+
+from sfm.files.covariance_file import ARRAYS, NAME, POINTS_NAME
+from sfm.files.result_tables import TABLES
+
+WRITTEN = (
+    *(table.file for table in TABLES),
+    *(MOUNTS, MOMENTS, NAME, POINTS_NAME, ARRAYS, MANIFEST),
+    *("summary.json", "report.txt", "report.html", "points.ply", "log.jsonl"),
+    *("colmap", "overlays", "pictures", "plots"),
+)
