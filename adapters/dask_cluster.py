@@ -39,8 +39,9 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
-from sfm.files.user_cache import closed_current_folder, scratch_folder
+from sfm.files.user_cache import scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
+from sfm.runtime.installation import closed_current_folder
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1

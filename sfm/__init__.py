@@ -22,7 +22,7 @@ Every name is listed in `__init__.pyi` and is imported when it is first asked fo
 
 from __future__ import annotations
 
-from sfm.runtime.public_names import public_names, refuse_mixed_installation
+from sfm.runtime.installation import public_names, refuse_mixed_installation
 
 refuse_mixed_installation()
 

@@ -28,8 +28,8 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult
+from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
-from sfm.runtime.public_names import load_adapters
 from sfm.solution import Solution, solution_of
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey

@@ -22,7 +22,6 @@ from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.errors import KolinearError
-from sfm.files.user_cache import closed_current_folder
 from sfm.geometry.tolerance import Mesh
 from sfm.kernels.sampling import resample
 from sfm.kernels.threads import cores
@@ -40,6 +39,7 @@ from sfm.planning.designer import gains
 from sfm.planning.planned_object import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring
+from sfm.runtime.installation import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family

@@ -12,12 +12,15 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
-from sfm.cli.console import guard_streams
+from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, guard_streams, loading, stopped_once
 from sfm.errors import KolinearError
-from sfm.files.user_cache import closed_current_folder, refuse_folder_settings
-from sfm.kernels.threads import share_freed_memory
-from sfm.runtime.public_names import load_adapters, refuse_mixed_installation
+from sfm.runtime.installation import (
+    closed_current_folder,
+    load_adapters,
+    refuse_folder_settings,
+    refuse_mixed_installation,
+)
+from sfm.runtime.progress import share_freed_memory
 
 YOUNG_OBJECTS = 100_000  # that Python waits for before it looks for cycles, far more than usual
 BAD_INPUT = 2  # exit code where a person must put something right

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sfm.cli.commands import batching, inspecting, measuring, planning, refining, solvers, starting, surveying
+from sfm.cli.commands import batching, inspecting, measuring, planning, solvers, starting, surveying
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all messages of typer on wrong arguments; it has no name
 
@@ -54,7 +54,7 @@ for _command in (
     solvers.compare,
     solvers.epochs,
     solvers.convert,
-    refining.refine,
+    solvers.refine,
     starting.doctor,
     inspecting.view,
 ):

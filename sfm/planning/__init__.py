@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
-from sfm.runtime.public_names import public_names
+from sfm.runtime.installation import public_names
 
 __getattr__, __dir__, __all__ = public_names(__name__, __path__[0])
+
+MIN_PIXELS = 7.0
+"""on a target, as document 000 takes it; the measurement itself begins at 3"""

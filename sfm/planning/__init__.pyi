@@ -31,3 +31,5 @@ from sfm.planning.visibility import depth_of_field as depth_of_field
 from sfm.planning.visibility import sight_of as sight_of
 from sfm.planning.weakness import Calibratability as Calibratability
 from sfm.planning.weakness import calibratability as calibratability
+
+MIN_PIXELS: float

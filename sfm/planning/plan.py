@@ -25,6 +25,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.observations.kind import POINT
+from sfm.planning import MIN_PIXELS
 from sfm.planning.designer import Candidates, Design, StationLimits, candidates, gains, image_rows
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import (
@@ -37,7 +38,7 @@ from sfm.planning.prediction import (
     short_of,
 )
 from sfm.planning.stations import Shot, Stations, choose_coded, shots
-from sfm.planning.visibility import MIN_PIXELS, STEEPEST_DEG, Seeing, TargetSize, compute_target_size
+from sfm.planning.visibility import STEEPEST_DEG, Seeing, TargetSize, compute_target_size
 from sfm.planning.weakness import (
     Calibratability,
     Contribution,

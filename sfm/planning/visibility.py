@@ -60,7 +60,6 @@ class DepthOfField:
 
 
 MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
-MIN_PIXELS = 7.0  # on a target, as document 000 takes it; the measurement itself begins at 3
 MIN_DIAMETER_PX = 5.0  # shorter axis of a target from which on it is measured
 SAME_RAY = 1e-6  # tangents of one ray; a polynomial folds far ones back into the format
 BORDER_PX = 2.0  # between a target and the edge of the photograph

@@ -30,12 +30,12 @@ from sfm.display import counted
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import refuse_foreign_files
 from sfm.files.plain_text import csv_text
-from sfm.files.user_cache import refuse_folder_settings
 from sfm.files.whole_files import whole_files
 from sfm.rendering.area import Lamp, cover_with, fill_face, paint_mark
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.runtime.faults import ending_of
+from sfm.runtime.installation import refuse_folder_settings
 
 # A ray meets this many points of the rim when the truth asks whether a target is hidden.
 RIM = 16

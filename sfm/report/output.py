@@ -40,7 +40,6 @@ from sfm.files.csv_tables import read_table
 from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, refuse_foreign_folder
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
-from sfm.kernels.threads import give_back_memory
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plot_process import (
@@ -62,7 +61,7 @@ from sfm.report.tables.summary import write_summary
 from sfm.report.viewer.embedded import scene_of_result, viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
 from sfm.result import StageTime
-from sfm.runtime.progress import SILENT, Progress
+from sfm.runtime.progress import SILENT, Progress, give_back_memory
 
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back

@@ -16,10 +16,10 @@ from sfm.files.result_tables import IN_FILES
 from sfm.observations import TABLES
 from sfm.observations.given import ScaleBars
 from sfm.observations.pose import MountObservations
+from sfm.planning import MIN_PIXELS
 from sfm.planning.plan import Plan, verdict_of_plan
 from sfm.planning.prediction import ALPHA, found_displacement
 from sfm.planning.stations import Shot, Stations
-from sfm.planning.visibility import MIN_PIXELS
 from sfm.planning.weakness import Calibratability, Contribution
 from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.page import (

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.cli.commands.measuring import match_command
+from sfm.cli.commands.matching import match_command
 from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.report.figures.overlays import LINE, MAX_PICTURES
 from tests.textures import random_texture, with_noise

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sfm.cli.commands.measuring import read_task
+from sfm.cli.commands.matching import read_task
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.report.measuring import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS

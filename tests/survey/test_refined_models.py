@@ -21,7 +21,7 @@ from datasets.textured import render
 from sfm.adjustment.quality import correlations as error_correlation
 from sfm.adjustment.result import ErrorCorrelation
 from sfm.camera import camera_from_values, project, tangents_from_pixel
-from sfm.cli.commands.refining import refine
+from sfm.cli.commands.solvers import refine
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.matching.radiometry import GreyPhotographs

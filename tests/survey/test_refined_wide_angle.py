@@ -14,7 +14,7 @@ import pytest
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.reconstruction import colmap_parameters
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.cli.commands.refining import refine
+from sfm.cli.commands.solvers import refine
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.network import Estimate, ImagePoints, Network
 from tests.synthetic import seed_of

@@ -31,7 +31,7 @@ from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.kernels.threads import keep_freed_memory
+from sfm.runtime.progress import keep_freed_memory
 
 TOLERANCE = 1e-6
 MIN_SHIFT = 1e-6

@@ -4,37 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from sfm.camera import camera_from_values, tangents_from_pixel
 from sfm.cli.commands.starting import loading
-from sfm.conventions import AnyArray, FloatArray, pixel_from_image
-from sfm.errors import PhotographError, SurveyFileError
-from sfm.files.csv_tables import read_table
-from sfm.matching.conjugate import MIN_CORRELATION, match_points
-from sfm.photographs.reading import read_photograph
-from sfm.report.figures.overlays import draw_patches
-from sfm.report.measuring import (
-    NAMES,
-    matches_json,
-    matches_table,
-    picture_file,
-    refuse_outputs,
-    whole_outputs,
-)
+from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 from sfm.textbook.resection import METHODS
-from sfm.textbook.resection.by_method import Task
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray
-
-_DISTORTION = ("K1", "K2", "K3", "P1", "P2", "b1", "b2")
-_CAMERA = ("c", "x0", "y0", *_DISTORTION)
-_UNIT_PIXEL = np.array([1.0, 1.0])
 NONE_MATCHED = 1  # exit code
 MAX_TARGETS = 10_000  # on one sheet; no family has more codes
 
@@ -101,6 +81,7 @@ def match(
     code 1 if no point was matched.
     """
     with loading():
+        from sfm.cli.commands.matching import match_command
         from sfm.matching.conjugate import BACK_PX
 
     with working_on(f"{left} and {right}"):
@@ -159,6 +140,7 @@ def resect(
     By any of the methods, or all of them for a comparison.
     """
     with loading():
+        from sfm.cli.commands.matching import read_task
         from sfm.report.measuring import comparison_json, comparison_table, resection_json, resection_text
         from sfm.textbook.resection.by_method import resect as resect_by
         from sfm.textbook.resection.by_method import resect_by_all
@@ -264,174 +246,3 @@ def _numbers(text: str) -> IntArray:
             )
         numbers += range(begin, end + 1)
     return np.array(numbers, dtype=np.int64)
-
-
-def match_command(
-    left_path: Path,
-    right_path: Path,
-    *,
-    point: str | None = None,
-    points: Path | None = None,
-    template_px: int = 21,
-    min_correlation: float = MIN_CORRELATION,
-    as_json: bool = False,
-    out: Path | None = None,
-    picture: Path | None = None,
-    **how: Any,
-) -> tuple[str, bool]:
-    """Match points of two photograph files.
-
-    Args:
-        left_path: the photograph in which points are given.
-        right_path: the photograph in which they are found.
-        point: "COL,ROW" in the left photograph, px; either this or `points`.
-        points: table of points, see `read_points_to_match`.
-        template_px: width of the template, px.
-        min_correlation: least correlation coefficient.
-        as_json: JSON in place of the table.
-        out: file .csv or .json that gets the table, in place of the terminal.
-        picture: PNG file that gets template, matched patch and their difference.
-        how: more of what `sfm.matching.conjugate.match_points` takes.
-
-    Returns:
-        The text that the command line prints, and whether any point was matched.
-
-    Raises:
-        KolinearError: unreadable photographs, points or table, even windows, or files that cannot be written.
-    """
-    if (point is None) == (points is None):
-        raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
-    if not 0.0 <= min_correlation <= 1.0:
-        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
-    inputs = (left_path, right_path, *(() if points is None else (points,)))
-    refuse_outputs(out, picture, inputs, as_json)
-    if points is not None:
-        names, xy, start = read_points_to_match(points)
-    else:
-        names, xy, start = ("1",), _parse_point(str(point)), None
-    left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
-    with whole_outputs(out, picture) as (table_file, picture_part):
-        found = match_points(
-            left,
-            right,
-            xy,
-            xy_right=start,
-            template_px=template_px,
-            min_correlation=min_correlation,
-            **how,
-        )
-        as_json = as_json or (out is not None and out.suffix.lower() == ".json")
-        if picture_part is not None:
-            drawing = draw_patches(names, left, right, found, template_px)
-            picture_part.write_bytes(picture_file(drawing))
-        if table_file is not None:
-            text = matches_json(names, found) if as_json else matches_table(names, found).csv
-            table_file.write_bytes(text.encode())
-    matched = int(found.good.sum())
-    if out is not None:
-        return f"{matched} of {len(found)} points matched: {out}\n", matched > 0
-    return matches_json(names, found) if as_json else matches_table(names, found).text, matched > 0
-
-
-def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
-    """Read point,x_px,y_px[,x_right_px,y_right_px]; the last two are centres of the search windows.
-
-    Returns:
-        Names, left points (k, 2) and centres (k, 2) or None, px.
-
-    Raises:
-        SurveyFileError: unreadable, wrong columns, no rows, a name twice, or not a finite number.
-    """
-    table = read_table(path, NAMES[:1], NAMES[1:3], NAMES[3:5])
-    values = table.values
-    return table.keys("point"), values[:, :2], values[:, 2:] if values.shape[1] > 2 else None
-
-
-def _photograph(which: str, path: Path) -> AnyArray:
-    """Read a photograph; a folder has no name to be called by, so the argument is named."""
-    if path.is_dir():
-        raise PhotographError(f"{which} {path}: a folder, a photograph is needed")
-    return read_photograph(path)
-
-
-def _parse_point(text: str) -> FloatArray:
-    try:
-        xy = np.array([[float(part) for part in text.split(",")]])
-    except ValueError:
-        xy = np.zeros((1, 0))
-    if xy.shape != (1, 2) or not np.isfinite(xy).all():
-        raise SurveyFileError(f"match: --point {text!r}, needed COL,ROW such as 812.5,403")
-    return xy
-
-
-def read_task(
-    points_file: Path,
-    *,
-    c_mm: float | None = None,
-    camera_file: Path | None = None,
-    start: str | None = None,
-    tolerance_mm: float | None = None,
-    opposite_signs: bool = False,
-) -> Task:
-    """Return the points of a photograph from files.
-
-    Args:
-        points_file: CSV with point,X,Y,Z,x_mm,y_mm.
-        c_mm: principal distance, mm; not needed if the camera file has it.
-        camera_file: CSV with parameter,value[,...] for c, x0, y0, K1-K3, P1, P2, b1, b2 of `brown`
-            (corrections of the measured point, mm).
-        start: "X,Y,Z" or "X,Y,Z,omega,phi,kappa" with angles in deg.
-        tolerance_mm: largest residual that `robust` takes for right, mm; from the data if not given.
-        opposite_signs: whether distortion is subtracted from measured coordinates, as some programs do.
-
-    Raises:
-        SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or there
-            is no c.
-    """
-    names, points, xy = _read_points(points_file)
-    values = _read_camera(camera_file) if camera_file is not None else {}
-    if opposite_signs:
-        values |= {name: -values[name] for name in _DISTORTION if name in values}
-    if c_mm is not None:
-        values["c"] = c_mm
-    if "c" not in values:
-        raise SurveyFileError("resect: the principal distance is missing, give --c or a camera file with c")
-    if not values["c"] > 0:
-        raise SurveyFileError(f"resect: the principal distance is {values['c']:g} mm, it must be positive")
-    # a camera of 1 mm pixels, whose pixel frame serves as the image frame
-    camera = camera_from_values(
-        "resect", "brown", (1, 1), (1.0, 1.0), c_mm=values["c"], values=tuple(values.items())
-    )
-    tangents = tangents_from_pixel(camera, pixel_from_image(xy, (1, 1), _UNIT_PIXEL))
-    c = values["c"]
-    return Task(names, xy, tangents, points, c, _parse_start(start), tolerance_mm)
-
-
-def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    units = tuple((f"{axis}_m", axis) for axis in "XYZ")
-    table = read_table(path, ("point",), ("X", "Y", "Z", "x_mm", "y_mm"), aliases=units, ignored=None)
-    return table.texts[0], table.values[:, :3], table.values[:, 3:]
-
-
-def _read_camera(path: Path) -> dict[str, float]:
-    table = read_table(path, ("parameter",), ("value",), ignored=None)
-    parameters = table.keys("parameter")
-    for line, name in zip(table.line, parameters, strict=True):
-        if name not in _CAMERA:
-            raise SurveyFileError(
-                f"{path}, line {line}: no parameter '{name}', known are {', '.join(_CAMERA)}"
-            )
-    return dict(zip(parameters, table.values[:, 0].tolist(), strict=True))
-
-
-def _parse_start(text: str | None) -> FloatArray | None:
-    if text is None:
-        return None
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise SurveyFileError(f"--start '{text}': X,Y,Z or X,Y,Z,omega,phi,kappa (deg) is needed")
-    values[3:] = np.radians(values[3:])
-    return values

@@ -20,7 +20,7 @@ from sfm.cli.commands.planning_inputs import (
 )
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.visibility import MIN_PIXELS
+from sfm.planning import MIN_PIXELS
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfm.camera import Camera, camera_from_values
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, SurveyFileError
 
@@ -321,6 +320,8 @@ def listed_camera(name: str, c_mm: float | None) -> Camera:
     Raises:
         GeometryError: another name, or no principal distance.
     """
+    from sfm.camera import camera_from_values
+
     if name not in SENSORS:
         raise GeometryError(
             f"camera '{name:.60}': expected a survey file, a result folder or one of {', '.join(SENSORS)}"

@@ -31,9 +31,9 @@ from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetw
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import program_name
 from sfm.errors import KolinearError
-from sfm.files.user_cache import closed_current_folder
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
+from sfm.runtime.installation import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 

@@ -17,7 +17,8 @@ from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochSeries
 from sfm.geometry.tolerance import IN, OUT, Deviations
 from sfm.inspection.acceptance import Acceptance
-from sfm.planning.visibility import MIN_PIXELS, compute_target_size
+from sfm.planning import MIN_PIXELS
+from sfm.planning.visibility import compute_target_size
 from sfm.report.figures.plot_process import Plot
 from sfm.report.figures.plots import (
     ALONE_IN,

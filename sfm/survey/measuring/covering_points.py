@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.threads import give_back_memory, in_threads
+from sfm.kernels.threads import in_threads
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, pictures_of, plane_warps
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
@@ -26,7 +26,7 @@ from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.runtime.progress import reported
+from sfm.runtime.progress import give_back_memory, reported
 
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
 FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it

@@ -1,4 +1,6 @@
-"""The public names of a package, imported when asked for, and the check of its installation.
+"""The installation: public names, foreign packages among its own, and settings of the current folder.
+
+Public names are imported when they are first asked for, and listed once, in the stub of their package.
 
 `__init__.pyi` is what type checkers and editors read. Every row of it is one public name, `from module import
 name as name`, or one room, `from . import room as room`; a new name is a new row and nothing else.
@@ -10,16 +12,30 @@ Kolinear's two packages found by their place, and whether files of other project
 Two projects on the registry have packages of the same names, and a user may have a folder of such a name.
 Python packages of one name are merged into one folder without a word, and the `__init__.py` of whichever came
 last is left.
+
+Settings of libraries and libraries themselves in the current folder, which may have come with a survey.
+
+numba reads `.numba_config.yaml` there, which can name a folder of compiled functions; they are pickles, and
+so programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. And cv2 puts its
+libraries and a colon before LD_LIBRARY_PATH; where that is empty, nothing follows the colon, by which the
+linker of every process that is started afterwards understands the current folder. Python looks there first
+for modules in the processes of multiprocessing and Dask, which are started with `python -c`.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
+from sfm.errors import KolinearError
+
+SETTINGS = (".numba_config.yaml", "matplotlibrc")
+LIBRARIES = "LD_LIBRARY_PATH"
+MODULES, SAFE_PATH = "PYTHONPATH", "PYTHONSAFEPATH"
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
 """a file that each of the others has, PyPI's sfm and adapters, and Kolinear has not"""
 Face = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
@@ -108,3 +124,42 @@ def load_adapters() -> None:
         raise ImportError(f"{installed}: not a package", name="adapters")
     sys.modules["adapters"] = package = module_from_spec(spec)
     spec.loader.exec_module(package)
+
+
+def refuse_folder_settings() -> None:
+    """Raise KolinearError where the current folder contains settings of a library; before any is imported."""
+    for name in SETTINGS:
+        if os.path.lexists(name):
+            raise KolinearError(
+                f"the current folder, {os.getcwd()}, contains '{name}', by which it would decide what is "
+                "computed or run; start Kolinear from another folder, or remove the file"
+            )
+
+
+@contextmanager
+def closed_current_folder() -> Iterator[None]:
+    """Take the current folder out of where processes that are started look for modules and libraries.
+
+    The path of libraries is never left empty meanwhile, so that OpenCV can be imported before or after.
+    """
+    before = {name: os.environ.get(name) for name in (SAFE_PATH, MODULES, LIBRARIES)}
+    os.environ[SAFE_PATH] = "1"
+    if modules := _folders(MODULES):
+        os.environ[MODULES] = modules
+    else:
+        os.environ.pop(MODULES, None)
+    if os.name != "nt":
+        os.environ[LIBRARIES] = _folders(LIBRARIES) or os.path.dirname(os.path.abspath(__file__))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _folders(variable: str) -> str:
+    """Return a path of folders without empty ones, which mean the current folder."""
+    return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)
