@@ -1,5 +1,5 @@
 // What a page holds: names and other texts as JSON, numbers as arrays, pictures as base64.
-// The writer is sfm/report/viewer/container.py.
+// The writer is sfm/report/viewer/embedded.py.
 
 const TYPES = { f8: Float64Array, f4: Float32Array, u4: Uint32Array, u1: Uint8Array }
 

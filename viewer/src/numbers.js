@@ -1,4 +1,4 @@
-// Numbers as the report writes them (sfm/report/numbers.py).
+// Numbers as the report writes them (sfm/report/phrases.py).
 
 export const UNKNOWN = "not known"
 
