@@ -14,7 +14,7 @@ from sfm.display import counted, listed
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
 from sfm.report.figures.comparisons import difference_figure, plot_series
-from sfm.report.figures.plot_process import Plot
+from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot
 from sfm.report.page import (
     YES,

@@ -1,4 +1,4 @@
-"""The page of a measured result."""
+"""The pages of a measured result and of an acceptance test."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from sfm.files.covariance_file import MAX_POINTS, write_covariance
 from sfm.geometry.alignment import Alignment
 from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
+from sfm.inspection.acceptance import Acceptance
 from sfm.inspection.measure import Measurement
-from sfm.report.figures.comparisons import deviation_figure
+from sfm.report.figures.comparisons import deviation_figure, length_error_figure
 from sfm.report.figures.plots import plot
 from sfm.report.page import (
     Column,
@@ -36,6 +37,10 @@ from sfm.report.phrases import fixed, general, signed, significant, with_sigma
 from sfm.report.viewer.embedded import measurement_viewer
 from sfm.solution import Solution
 
+PICTURE = (
+    "Error of length measurement over length: bars are the expanded uncertainty of the calibration, lines "
+    "the limit A + K L, at most B."
+)
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}
 USED = ("no", "yes")
 
@@ -331,3 +336,65 @@ def describe_measured(found: Measurement) -> str:
     total = sum(counts.values())
     parts = [f"{count} {decision}" for decision, count in counts.items() if count]
     return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(parts)}."
+
+
+def acceptance_page(found: Acceptance) -> Page:
+    """Return the page: limit, decisions, and every length."""
+    a, lengths, u = found, found.lengths, found.unit
+    most = f", at most B = {significant(a.b)} {u}" if np.isfinite(a.b) else ""
+    limit = f"A + K L with A = {significant(a.a)} {u}, K = {general(a.k, 4)}{most}"
+    lines = len(set(lengths.line))
+    figures = facts(
+        [
+            ("Limit", limit),
+            ("Lengths", f"{len(a.error)} on {counted(lines, 'line')}"),
+            ("Largest error", f"{significant(a.largest)} {u}"),
+            *((one.capitalize(), counted(a.count(one), "length")) for one in DECISIONS if a.count(one)),
+            ("Body diagonal", f"{general(a.diagonal, 6)} {u}"),
+        ]
+    )
+    note = Note(
+        "Error of a length measurement: measured minus calibrated length. ISO 14253-1 with U = "
+        f"{general(a.coverage, 3)} sigma of the calibration: in and out are proven, undecided is what lies "
+        "within U of the limit. The scale of the result comes from other bars."
+    )
+    columns = (
+        *(Column(name, name) for name in ("line", "from", "to")),
+        Column("calibrated", "length", u, ".9g"),
+        Column("sigma", "sigma", u, significant),
+        Column("measured", "measured", u, ".9g"),
+        Column("sigma", "sigma_measured", u, significant),
+        Column("error", "error", u, signed),
+        Column("limit", "limit", u, significant),
+        Column("decision", "decision"),
+    )
+    rows = zip(
+        *(lengths.line, lengths.start, lengths.end, lengths.length, lengths.sigma, lengths.length + a.error),
+        *(a.sigma, a.error, a.limit, a.decision),
+        strict=True,
+    )
+    summary = {
+        "test": "VDI/VDE 2634 part 1",
+        "result": a.name,
+        "length_unit": u,
+        **a.verdict.as_dict(),
+        "limit": {"A": a.a, "K": a.k, "B": a.b},
+        "coverage": a.coverage,
+        "lines": lines,
+        "lengths": len(a.error),
+        **{one.replace(" ", "_"): a.count(one) for one in DECISIONS},
+        "largest_error": a.largest,
+        "rms_error": float(np.sqrt((a.error**2).mean())),
+        "body_diagonal": a.diagonal,
+    }
+    return Page(
+        "acceptance",
+        "Acceptance test, VDI/VDE 2634 part 1",
+        a.name,
+        a.verdict,
+        (
+            Section("Figures", figures, note, plot("errors", PICTURE, length_error_figure(found))),
+            Section("Lengths", Table(columns, list(rows), "lengths")),
+        ),
+        summary=summary,
+    )

@@ -42,14 +42,8 @@ from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import draw_overlays
-from sfm.report.figures.plot_process import (
-    EpipolarMap,
-    PlotCamera,
-    PlotData,
-    PlotProcess,
-    ProjectionMap,
-    draw_plots,
-)
+from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
+from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.checks import adjusted_sigmas, root_mean_square
 from sfm.report.findings.survey_remarks import Findings, with_remark

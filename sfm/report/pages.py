@@ -30,7 +30,7 @@ from markupsafe import Markup
 from sfm.display import NO_BREAK, bound
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_folder
-from sfm.report.figures.plot_process import Plot
+from sfm.report.figures.plot_data import Plot
 from sfm.report.page import (
     Cards,
     FoldedParts,
@@ -51,18 +51,18 @@ NAME_WIDTH = 36  # of what a fact is about, at most
 MARGIN = "  "
 NOTHING = "'none'"
 PAGES: Mapping[str, str] = {
-    "Acceptance": "sfm.report.acceptance",
-    "EpochSeries": "sfm.report.epochs",
-    "Findings": "sfm.report.survey_report",
-    "Further": "sfm.report.further",
-    "Measurement": "sfm.report.measurement",
-    "Plan": "sfm.report.planning",
-    "Refinement": "sfm.report.refinement",
-    "ResultComparison": "sfm.report.differences",
-    "Validation": "sfm.report.validation",
-    "ViewerScene": "sfm.report.view_page",
+    "Acceptance": "sfm.report.measurement:acceptance_page",
+    "EpochSeries": "sfm.report.epochs:page",
+    "Findings": "sfm.report.survey_report:page",
+    "Further": "sfm.report.further:page",
+    "Measurement": "sfm.report.measurement:page",
+    "Plan": "sfm.report.planning:page",
+    "Refinement": "sfm.report.refinement:page",
+    "ResultComparison": "sfm.report.differences:page",
+    "Validation": "sfm.report.differences:validation_page",
+    "ViewerScene": "sfm.report.view_page:page",
 }
-"""The type of a result, and the module, imported when needed, whose function `page` declares its page."""
+"""The type of a result, and the module, imported when needed, with the function that declares its page."""
 
 
 def page_of(found: Any, **beside: Any) -> Page:
@@ -72,7 +72,8 @@ def page_of(found: Any, **beside: Any) -> Page:
         found: a result of a type of `PAGES`.
         beside: what its declaration needs besides.
     """
-    return cast(Page, import_module(PAGES[type(found).__name__]).page(found, **beside))
+    module, function = PAGES[type(found).__name__].split(":")
+    return cast(Page, getattr(import_module(module), function)(found, **beside))
 
 
 def html_of(found: Any, **beside: Any) -> str:

@@ -81,7 +81,7 @@ def page(found: Levelling) -> Page:
 
 @pytest.fixture
 def levelling(monkeypatch: pytest.MonkeyPatch) -> Levelling:
-    monkeypatch.setitem(PAGES, "Levelling", __name__)  # the row
+    monkeypatch.setitem(PAGES, "Levelling", f"{__name__}:page")  # the row
     return Levelling((EVIL, "=B", "C"), np.array([0.0012345, -0.02, np.nan]), 0.001)
 
 
@@ -112,7 +112,8 @@ def test_a_new_page_is_one_file_and_one_row(levelling: Levelling, tmp_path: Path
 
 @pytest.mark.parametrize("shown", PAGES)
 def test_every_row_leads_to_a_declaration_of_its_type(shown: str) -> None:
-    hints = get_type_hints(import_module(PAGES[shown]).page)
+    module, function = PAGES[shown].split(":")
+    hints = get_type_hints(getattr(import_module(module), function))
     assert next(iter(hints.values())).__name__ == shown and hints["return"] is Page
 
 

@@ -22,9 +22,8 @@ from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.remarks.remark import Remark, kinds_of, remark
-from sfm.report.differences import largest_difference
+from sfm.report.differences import TRIALS, largest_difference, verdict_of_validation
 from sfm.report.pages import write_page
-from sfm.report.validation import TRIALS, verdict_of_validation
 from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of
 

@@ -17,7 +17,8 @@ import pytest
 import sfm.report.figures.plot_process as drawing
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.report.figures.plot_process import PlotData, PlotProcess, draw_plots, plot_process
+from sfm.report.figures.plot_data import PlotData
+from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data
 from sfm.result import SurveyResult

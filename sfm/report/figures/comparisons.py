@@ -19,7 +19,7 @@ from sfm.geometry.tolerance import IN, OUT, Deviations
 from sfm.inspection.acceptance import Acceptance
 from sfm.planning import MIN_PIXELS
 from sfm.planning.visibility import compute_target_size
-from sfm.report.figures.plot_process import Plot
+from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import (
     ALONE_IN,
     BLUE,
