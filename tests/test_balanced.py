@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 
 SIZE_PX, PIXEL_MM = (6000, 4000), (0.006, 0.006)
 # a 24 mm lens on 36 x 24 mm with 2 % of distortion in the corners
@@ -95,8 +95,7 @@ def test_a_survey_takes_and_gives_it(tmp_path: Path) -> None:
         result = run_survey(_survey(negative, free=free))
         assert result.adjustment.converged and result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.2)
         write_tables(findings_of(result), tmp_path)
-        with (tmp_path / "cameras_balanced.csv").open(encoding="utf-8") as file:
-            table = list(csv.DictReader(file))
+        table = rows_of(tmp_path / "cameras_balanced.csv")
         rows = [(row["parameter"], float(row["value"])) for row in table]
         sigma = {row["parameter"]: row["sigma"] for row in table}
         if free:

@@ -1,12 +1,20 @@
-"""Every page of docs/ is on the site."""
+"""Pages of docs/: on the site, their commands run, what they name exists."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import importlib.util
+import io
 import re
+import shlex
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
 
+from sfm import cli
 from sfm.survey.inputs.survey_file import SurveyFile
 from tests.places import ROOT, load_page_code
 
@@ -71,3 +79,74 @@ def test_faults_of_a_site_are_found(tmp_path: Path) -> None:
         "a.html: link to b.html#gone, which has no such place",
         "a.html: link to c.html, which is not there",
     ]
+
+
+TICKED = r"`((?:sfm|adapters)(?:\.\w+)+)`"
+PAGES = {
+    page.name: page.read_text(encoding="utf-8")
+    for page in sorted((ROOT / "docs/theory").glob("*.md"))
+    if page.name != "index.md"
+}
+NAMED = set(re.findall(TICKED, "\n".join(PAGES.values())))
+METHODS = (ROOT / "docs/methods.md").read_text(encoding="utf-8").partition("## The modules of these rooms")[0]
+
+
+def module_of(name: str) -> str:
+    """Return the longest part of a name that is a module."""
+    module, _, _ = name.rpartition(".")
+    try:
+        return name if importlib.util.find_spec(name) else module_of(module)
+    except ModuleNotFoundError:  # the part before the last is a module, the last one of its functions
+        return module_of(module)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_function_of_the_pages_exists(page: str) -> None:
+    names = re.findall(TICKED, PAGES[page])
+    assert len(names) > 10
+    for name in names:
+        module = module_of(name)
+        rest = name.removeprefix(module).strip(".")
+        assert not rest or hasattr(importlib.import_module(module), rest), f"{page}: there is no {name}"
+
+
+def source_of(name: str) -> str:
+    """Return the module in which a function of a room is written."""
+    module = module_of(name)
+    value = getattr(importlib.import_module(module), name.removeprefix(module).strip("."), None)
+    return getattr(value, "__module__", module)
+
+
+def test_every_method_is_reached_from_the_theory() -> None:
+    """Its function is named there, or another one of its module."""
+    reached = {source_of(name) for name in NAMED}
+    missing = sorted({name for name in re.findall(TICKED, METHODS) if source_of(name) not in reached})
+    assert not missing, missing
+
+
+PAGE = (ROOT / "docs" / "how-to" / "reproduce-the-sources.md").read_text(encoding="utf-8")
+STEPS = re.findall(r"^## (Document \d+).*?\n```(sh|python)\n(.*?)```\n+```text\n(.*?)```", PAGE, re.S | re.M)
+
+
+def test_every_document_is_reproduced() -> None:
+    assert [title for title, *_ in STEPS] == [f"Document {number:03}" for number in range(5)]
+
+
+@pytest.mark.parametrize(("title", "language", "code", "told"), STEPS, ids=[step[0] for step in STEPS])
+def test_the_numbers_of_a_document_come_out(
+    title: str, language: str, code: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ROOT / "datasets", tmp_path / "datasets", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.chdir(tmp_path)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        if language == "python":
+            exec(compile(code, title, "exec"), {})
+        else:
+            for line in code.splitlines():
+                monkeypatch.setattr(sys, "argv", shlex.split(line))
+                with contextlib.suppress(SystemExit):
+                    cli.main()
+    words = " ".join(printed.getvalue().split())
+    for number in told.splitlines():
+        assert number in words, f"{number} is not in: {words}"

@@ -69,7 +69,8 @@ def test_a_room_explains_its_functions_and_its_example_runs(room: str) -> None:
 
 def test_importing_the_rooms_imports_no_library() -> None:
     rooms = ", ".join(f"sfm.{room}.__all__" for room in ROOMS)
-    code = f"import sys, sfm; {rooms}; print([m for m in ('numpy', 'numba', 'cv2') if m in sys.modules])"
+    libraries = ("numpy", "numba", "cv2", "pydantic")
+    code = f"import sys, sfm; {rooms}; print([one for one in {libraries} if one in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
@@ -86,6 +87,8 @@ def test_an_argument_of_another_type_is_refused_by_its_name(name: str) -> None:
     "call",
     [
         lambda: sfm.network_from_colmap(3),
+        lambda: sfm.compare(NETWORK, NETWORK),
+        lambda: sfm.orient(NETWORK, ["lens"]),
         lambda: sfm.project(TRUTH.cameras[0], [0, 0, 0], np.eye(3), [1, 2, 3]),
         lambda: sfm.fit_similarity(XYZ, XYZ, weights=np.zeros(4)),
         lambda: sfm.adjust(NETWORK, TRUTH, image_sigma_factor=STACK),

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 import sfm
-from sfm import cli
 from sfm.cli.commands.batching import InProcess
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.kernels import warmed
 from sfm.remarks.remark import Remark
 from sfm.runtime.executor import Call, Done, Event, Lost, Send, Sent, Work
+from tests.commands import kolinear
 from tests.surveys import write_observed_survey
 
 INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*'"
@@ -31,26 +31,16 @@ def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warmed, "is_warm", lambda: True)
 
 
-def kolinear(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> tuple[int, str]:
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
     """Return exit code and what is printed."""
-    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
-    code = 0
-    try:
-        cli.main()
-    except SystemExit as end:
-        code = int(end.code or 0)
-    told = capsys.readouterr()
-    return code, told.out + told.err
+    code, shown = kolinear(*arguments), capsys.readouterr()
+    return code, shown.out + shown.err
 
 
-def test_a_survey_is_not_compared_and_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_survey_is_not_compared_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = write_observed_survey(tmp_path / "s", "alone", images=5, points=12, backend="colmap")
     out = tmp_path / "out"
-    code, told = kolinear(monkeypatch, capsys, "adjust", survey, "--out", out)
+    code, told = run(capsys, "adjust", survey, "--out", out)
     assert code == 0 and INSTALL_PYCOLMAP in " ".join(told.split())
     line = f"Not compared with another adjuster: {INSTALL_PYCOLMAP}."
     remarks = json.loads((out / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
@@ -71,7 +61,7 @@ def test_commands_that_need_pycolmap_end_in_one_line(
     (tmp_path / "MODEL").mkdir()
     for name in ("cameras", "images", "points3D"):
         (tmp_path / "MODEL" / f"{name}.txt").write_text("")
-    code, told = kolinear(monkeypatch, capsys, *arguments)
+    code, told = run(capsys, *arguments)
     assert code == 2 and told.count("\n") == 1 and INSTALL_PYCOLMAP in told
     assert sorted(path.name for path in tmp_path.iterdir()) == ["MODEL"]
 
@@ -85,33 +75,27 @@ def test_a_broken_pycolmap_is_not_called_missing(monkeypatch: pytest.MonkeyPatch
     assert not isinstance(told.value, MissingLibraryError)
 
 
-def test_a_batch_runs_in_this_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_batch_runs_in_this_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     surveys = [
         write_observed_survey(tmp_path / name, name, images=5, points=12) for name in ("first", "second")
     ]
-    code, told = kolinear(monkeypatch, capsys, "batch", *surveys, "--out", tmp_path / "out", "--jobs", 2)
+    code, told = run(capsys, "batch", *surveys, "--out", tmp_path / "out", "--jobs", 2)
     assert code == 0, told
     assert f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}" in told
     for name in ("first", "second"):
         assert (tmp_path / "out" / name / "report.html").exists()
 
 
-def test_a_scheduler_cannot_be_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scheduler_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = write_observed_survey(tmp_path / "b", "second")
     out = tmp_path / "out"
-    code, told = kolinear(monkeypatch, capsys, "batch", survey, "--out", out, "--cluster", "tcp://10.0.0.1:8")
+    code, told = run(capsys, "batch", survey, "--out", out, "--cluster", "tcp://10.0.0.1:8")
     assert code == 2 and f"--cluster tcp://10.0.0.1:8: Dask is not installed: {INSTALL_DASK}" in told
     assert not out.exists()
 
 
-def test_doctor_calls_the_core_sound(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, told = kolinear(monkeypatch, capsys, "doctor")
+def test_doctor_calls_the_core_sound(capsys: pytest.CaptureFixture[str]) -> None:
+    code, told = run(capsys, "doctor")
     assert code == 0 and "This installation works." in told
     assert f"colmap: no comparison, {INSTALL_PYCOLMAP}" in " ".join(told.split())
 

@@ -1,14 +1,19 @@
-"""Networks: reducing keeps what belongs together."""
+"""Networks: reducing keeps what belongs together; what cannot be adjusted is refused."""
 
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+import sfm
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError, KolinearError
+from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.reduced_network import reduce_network
 from tests.synthetic import make_network, seed_of
 
@@ -98,3 +103,150 @@ def test_photographs_that_all_see_the_same_points_are_paired_in_bounded_memory(
     tracemalloc.stop()
     assert pairs == m * (m - 1) // 2
     assert peak < 24e6  # 78 MB with all at once
+
+
+Spoil = Callable[[Network, Estimate], tuple[Network, Estimate]]
+
+
+def seen(network: Network, **changes: Any) -> Network:
+    return replace(network, image_points=replace(network.image_points, **changes))
+
+
+def with_value(array: np.ndarray, row: int, value: Any) -> np.ndarray:
+    changed = np.array(array)
+    changed[row] = value
+    return changed
+
+
+SPOILED: tuple[tuple[Spoil, str], ...] = (
+    (
+        lambda n, e: (seen(n, xy=with_value(n.image_points.xy, 3, np.nan)), e),
+        r"image image 1, point 4: image coordinates nan nan px",
+    ),
+    (
+        lambda n, e: (seen(n, covariance=with_value(n.image_points.covariance, 3, 0.0)), e),
+        r"image image 1, point 4: covariance 0 0 0 0 px\^2, expected a symmetric positive definite matrix",
+    ),
+    (lambda n, e: (seen(n, covariance=n.image_points.covariance[:, 0]), e), r"of shape \(\d+, 2\), expected"),
+    (lambda n, e: (seen(n, image=with_value(n.image_points.image, 0, 99)), e), "index 99 of a photograph"),
+    (lambda n, e: (seen(n, point=with_value(n.image_points.point, 0, -1)), e), "index -1 of a object point"),
+    (
+        lambda n, e: (seen(n, image=n.image_points.image.astype(float)), e),
+        "indices of a photograph of type float64, expected whole numbers",
+    ),
+    (
+        lambda n, e: (
+            replace(n, control=ObjectPoints(np.arange(3), e.points[:3], np.zeros((3, 3)))),
+            e,
+        ),
+        r"covariances of the control of shape \(3, 3\), expected \(3, 3, 3\)",
+    ),
+    (lambda n, e: (replace(n, camera=n.camera + 5), e), "index 5 of a camera, expected 0 to 0"),
+    (lambda n, e: (n, replace(e, points=e.points[:-1])), r"object points of shape \(19, 3\), expected"),
+    (lambda n, e: (n.with_control(["1"], [[0, 0, np.nan]], 0.1), e), "control point 1: expected finite"),
+    (lambda n, e: (n.with_control(["1", "1"], np.zeros((2, 3))), e), "control point 1: duplicate"),
+    (lambda n, e: (n.with_control(["1"], np.zeros((1, 2))), e), r"coordinates \(1, 2\)"),
+    (lambda n, e: (n.with_scale_bar("1", "1", 1.0, 0.1), e), "scale bar 1 - 1: length 1"),
+    (lambda n, e: (n.with_scale_bar("1", "2", np.nan, 0.1), e), "scale bar 1 - 2: length nan"),
+    (lambda n, e: (e, n), "network is a Estimate, expected Network"),  # type: ignore
+)
+
+
+@pytest.mark.parametrize("k", range(len(SPOILED)))
+def test_what_no_adjustment_can_use_is_named(k: int) -> None:
+    spoil, message = SPOILED[k]
+    network, truth = make_network(seed_of("check"), images=5, points=20)
+    with pytest.raises(GeometryError, match=message):
+        sfm.adjust(*spoil(network, truth))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sigma_px": 0.0}, "sigma_px = 0.0, expected a number more than 0"),
+        ({"sigma_px": float("nan")}, "sigma_px = nan"),
+        ({"alpha": 2.0}, "alpha = 2.0, expected a number between 0 and 1"),
+        (
+            {"image_sigma_factor": np.ones(3)},
+            r"image_sigma_factor of shape \(3,\), expected",
+        ),
+        ({"image_sigma_factor": 0.0}, "image_sigma_factor of shape"),
+        ({"datum": "middle"}, "datum: kind 'middle', expected one of"),
+    ],
+)
+def test_options_that_cannot_be_are_named(options: dict[str, Any], message: str) -> None:
+    network, truth = make_network(seed_of("check"), images=5, points=20)
+    with pytest.raises(GeometryError, match=message):
+        sfm.adjust(network, truth, **options)
+
+
+def test_short_ways_of_saying_it_work() -> None:
+    network, truth = make_network(seed_of("check"), images=5, points=20)
+    a = sfm.adjust(network, truth, datum="free", reject="none")
+    assert a.datum == "free" and sfm.change_datum(a, "minimal").datum == "minimal"
+    assert sfm.Solution("a", network, truth).point(7).name == "7"
+    with pytest.raises(KolinearError, match=r"unknown point '77', expected one of 7"):
+        sfm.Solution("a", network, truth).point(77)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sfm.find_targets("a.jpg"), "photograph is 'a.jpg', expected an array"),  # type: ignore
+        (lambda: sfm.find_targets(np.zeros((0, 5), np.uint8)), r"shape \(0, 5\)"),
+        (lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), codes=14), "codes is 14, expected text"),  # type: ignore
+        (
+            lambda: sfm.find_targets(np.zeros((50, 50), np.uint8), min_diameter_px=-1),
+            "diameters from -1 to inf",
+        ),
+        (
+            lambda: sfm.fit_similarity(np.zeros((3, 2)), np.zeros((3, 2))),
+            r"source is an array of shape \(3, 2\), expected",
+        ),
+        (lambda: sfm.fit_similarity(np.full((3, 3), np.nan), np.zeros((3, 3))), "NaN or infinity"),
+        (lambda: sfm.run_survey("nowhere.toml"), r"nowhere\.toml"),
+    ],
+)
+def test_other_functions_refuse_in_one_line(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(KolinearError, match=message):
+        call()
+
+
+def control_of(r: float) -> FloatArray:
+    """Return a covariance of sigmas 1, 2 and 0.5 with correlations of one size, one negative."""
+    return np.array([[1, r, r], [r, 1, -r], [r, -r, 1]]) * np.outer([1, 2, 0.5], [1, 2, 0.5])
+
+
+def test_control_that_no_measurement_can_have_is_refused() -> None:
+    network, truth = make_network(seed_of("control"), images=4, points=12)
+    names, xyz = network.points[:4], truth.points[:4]
+    for sigma in (-1.0, np.nan, [1.0, -1.0, 1.0]):
+        with pytest.raises(GeometryError, match="control: sigma"):
+            network.with_control(names, xyz, sigma)
+    with pytest.raises(GeometryError, match="expected finite"):
+        network.with_control(names, np.full((4, 3), np.nan), 1.0)
+    partly = network.with_control(names, xyz, [0.0, 1.0, np.inf])
+    assert np.array_equal(partly.control.covariance[0], np.diag([0.0, 1.0, np.inf]))
+    for covariance, good in (
+        (control_of(0.3), True),
+        (control_of(0.6), False),  # every pair is possible, the three together are not
+        (np.diag([0.0, 1.0, np.inf]), True),
+        (np.diag([0.0, 1.0, np.inf]) + 0.1 * (1 - np.eye(3)), False),
+        (np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), False),
+    ):
+        held = ObjectPoints(np.arange(4), xyz, np.tile(covariance, (4, 1, 1)))
+        if good:
+            a = sfm.adjust(replace(network, control=held), truth, datum=sfm.Datum("control"))
+            assert len(a.network.control) == 4
+        else:
+            with pytest.raises(GeometryError, match="positive definite"):
+                sfm.adjust(replace(network, control=held), truth)
+
+
+@pytest.mark.parametrize("mixed", [[1.0, 0, 0], [0.6, 0.6, -0.6], [np.nan, 0, 0]])
+def test_known_points_with_impossible_covariances_are_refused(mixed: list[float]) -> None:
+    xyz, sigma = np.eye(3), np.ones((3, 3))
+    with pytest.raises(KolinearError, match="control point b: "):
+        sfm.KnownPoints(("a", "b", "c"), xyz, sigma, np.array([[0.0, 0, 0], mixed, [0, 0, 0]]))
+    with pytest.raises(KolinearError, match="control point a: "):
+        sfm.KnownPoints(("a", "b", "c"), xyz, -sigma)

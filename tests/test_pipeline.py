@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.targets.outlines import Flag
 from tests.places import ROOT
+from tests.tables import rows_of
 
 DATASETS = ROOT / "datasets"
 
@@ -110,8 +110,7 @@ def test_camcal_needs_no_control_to_start(
 def test_panel_orients_every_photograph_and_reads_every_code(panel: SurveyResult, shared_data: Path) -> None:
     assert panel.failed == ()
     network = panel.adjustment.network
-    with (shared_data / "retro-panel" / "reference-image-points.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(shared_data / "retro-panel" / "reference-image-points.csv")
     seen = network.image_points
     for row in rows:
         own = seen.image == network.images.index(row["image"])
@@ -141,7 +140,10 @@ def test_panel_agrees_with_the_reference_points(panel: SurveyResult, shared_data
 
 @pytest.mark.parametrize(
     ("name", "sigma0", "redundancy", "c"),
-    [("fixed", 0.16148, 3725, 7.45700), ("free", 0.142614, 3720, 7.456893)],
+    [
+        pytest.param("fixed", 0.16148, 3725, 7.45700, marks=pytest.mark.slow),
+        ("free", 0.142614, 3720, 7.456893),
+    ],
 )
 def test_camcal_reference_points(
     name: str, sigma0: float, redundancy: int, c: float, shared_data: Path, tmp_path: Path

@@ -8,7 +8,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -86,12 +85,6 @@ def test_the_public_names_are_these() -> None:
     assert (ROOT / "py.typed").is_file()
     with pytest.raises(AttributeError, match="no attribute 'adjusted'"):
         sfm.adjusted  # noqa: B018
-
-
-def test_importing_sfm_imports_no_library() -> None:
-    code = "import sys, sfm; print([m for m in ('numpy', 'numba', 'cv2', 'pydantic') if m in sys.modules])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
@@ -292,24 +285,6 @@ def test_a_network_from_arrays_becomes_a_solution_as_the_page_on_python_shows(
     np.testing.assert_allclose(again.covariance_of((), ["a.jpg"]), of_first)
     with pytest.raises(sfm.KolinearError, match="joint covariance"):
         again.covariance_of(["1"], ["a.jpg"])
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda network: sfm.compare(network, network),
-        lambda network: sfm.fit_shape(network, "plane"),
-        lambda network: sfm.measure(network),
-        lambda network: sfm.distance(network, "1", "2"),
-        lambda network: sfm.write_result(network, "never"),
-        lambda network: sfm.orient(network, network),
-        lambda network: sfm.orient(network, ["lens"]),
-    ],
-)
-def test_what_is_no_solution_is_refused_in_one_line(call: Callable[[sfm.Network], object]) -> None:
-    network, _ = make_network(seed_of("refused"), images=3, points=8)
-    with pytest.raises(sfm.KolinearError, match="expected"):
-        call(network)
 
 
 def test_the_version_is_that_of_the_installation() -> None:

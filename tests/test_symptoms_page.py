@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 
 import pytest
 
@@ -92,6 +93,7 @@ def sentences(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 yield node.lineno, text
 
 
+@cache
 def messages() -> dict[str, str]:
     """Return where each message stands, by message."""
     found: dict[str, str] = {}
@@ -102,6 +104,7 @@ def messages() -> dict[str, str]:
     return found
 
 
+@cache
 def entries() -> list[str]:
     """Return the texts in backticks of the first columns, but for those of the candidates."""
     tables = PAGE.partition(TABLES.END)[2].partition("## Candidates")[0]
@@ -116,20 +119,17 @@ def pattern_of(entry: str) -> re.Pattern[str]:
     return re.compile(before + inner + after, re.S)
 
 
-MESSAGES, ENTRIES = messages(), entries()
-
-
 def test_the_remarks_are_those_of_the_catalogue() -> None:
     assert TABLES.with_tables(PAGE) == PAGE, "python docs/remark_tables.py docs/symptoms.md"
     assert all(f"`{kind}`" in PAGE for kind in KINDS)
 
 
 def test_every_message_has_an_entry() -> None:
-    assert len(MESSAGES) > 500
-    patterns = [pattern_of(entry) for entry in ENTRIES]
+    assert len(messages()) > 500
+    patterns = [pattern_of(entry) for entry in entries()]
     missing = [
         f"{place}: {text}"
-        for text, place in MESSAGES.items()
+        for text, place in messages().items()
         if not any(one.search(text) for one in patterns)
     ]
     assert not missing, "docs/symptoms.md has no entry for\n" + "\n".join(missing)
@@ -138,11 +138,11 @@ def test_every_message_has_an_entry() -> None:
 def test_every_entry_is_a_message() -> None:
     wrong = [
         entry
-        for entry in ENTRIES
-        if not any(pattern_of(entry).search(text) for text in MESSAGES) or words(entry) < 1
+        for entry in entries()
+        if not any(pattern_of(entry).search(text) for text in messages()) or words(entry) < 1
     ]
     assert not wrong, "no message of the program is\n" + "\n".join(wrong)
-    assert len(set(ENTRIES)) == len(ENTRIES)
+    assert len(set(entries())) == len(entries())
 
 
 def test_every_reason_against_a_candidate_is_explained() -> None:
@@ -162,7 +162,7 @@ def test_every_reason_against_a_candidate_is_explained() -> None:
 def test_a_new_message_is_seen_and_has_no_entry(code: str) -> None:
     said = [text for _, text in error_messages(ast.parse(code))]
     assert len(said) == 1 and said[0].startswith("a new one")
-    assert not any(pattern_of(entry).search(said[0]) for entry in ENTRIES)
+    assert not any(pattern_of(entry).search(said[0]) for entry in entries())
 
 
 def test_the_page_on_natural_texture_quotes_remarks_as_they_are() -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from sfm.files.manifest import MANIFEST
-from sfm.files.rig_tables import MOMENTS, MOUNTS
-
 from sfm.files.covariance_file import ARRAYS, NAME, POINTS_NAME
-from sfm.files.result_tables import TABLES
+from sfm.files.open_folders import MANIFEST
+from sfm.files.result_tables import MOMENTS, MOUNTS, TABLES
 
 WRITTEN = (
     *(table.file for table in TABLES),

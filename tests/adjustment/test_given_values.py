@@ -175,7 +175,7 @@ def test_an_affinity_is_a_strain_of_no_axis() -> None:
 
 
 def test_five_stretched_points_are_not_one_wrong() -> None:
-    for k in range(10):
+    for k in range(4):
         one = points(5, f"five stretched {k}")
         found = judge_points(replace(one, given=one.given * (1.05, 1, 1)), LEVEL)
         assert found is not None and found.judgement.wrong == ()
@@ -183,7 +183,7 @@ def test_five_stretched_points_are_not_one_wrong() -> None:
 
 
 def test_a_wrong_point_is_no_strain() -> None:
-    for k in range(10):
+    for k in range(3):
         one = points(5, f"no strain {k}")
         found = judge_points(moved(one, 2, 30 * SIGMA * np.eye(3)[k % 3]), LEVEL)
         assert found is not None and found.judgement.wrong == (2,) and found.strain is None
@@ -239,7 +239,7 @@ def test_two_names_of_a_pyramid_may_be_exchanged_in_several_ways() -> None:
 
 
 def test_a_pyramid_as_named_is_right_and_one_wrong_point_is_identified() -> None:
-    for k in range(5):
+    for k in range(3):
         one = figure(PYRAMID, list(range(5)), f"right pyramid {k}")
         right, wrong = judge_points(one, LEVEL), judge_points(moved(one, 1, np.array([0.05, 0, 0])), LEVEL)
         assert right is not None and right.judgement.fits and not right.exchangeable
@@ -253,7 +253,7 @@ def test_a_pyramid_as_named_is_right_and_one_wrong_point_is_identified() -> None
 def test_names_whose_exchange_mirrors_a_figure_are_named(
     X: FloatArray, order: list[int], names: tuple[int, ...]
 ) -> None:
-    for k in range(5):
+    for k in range(2):
         found = judge_points(figure(X, order, f"mirrored figure {k}"), LEVEL)
         assert found is not None and found.mirrored and set(found.exchangeable) == set(names)
 
@@ -270,14 +270,14 @@ def test_points_most_of_which_are_wrong_diverge_to_no_infinite_scale() -> None:
 @pytest.mark.parametrize("n", [4, 5])
 def test_few_left_handed_points_are_mirrored(n: int) -> None:
     """Three that remain lie in a plane and fit either way."""
-    for k in range(5):
+    for k in range(2):
         one = points(n, f"left-handed {n} {k}")
         found = judge_points(replace(one, given=one.given[:, [1, 0, 2]]), LEVEL)
         assert found is not None and found.mirrored and found.judgement.fits
 
 
 def test_three_of_eight_points_are_identified() -> None:
-    for k in range(4):
+    for k in range(2):
         one = points(8, f"three of eight {k}")
         given = one.given.copy()
         given[[0, 3, 5]] += 0.3 * seed_of(f"three wrong {k}").standard_normal((3, 3))
@@ -366,7 +366,7 @@ def test_twenty_bars_five_times_worse_than_stated_are_imprecise() -> None:
 @pytest.mark.parametrize(("wrong", "told"), [(2, True), (3, False), (4, False), (5, True)])
 def test_a_part_of_seven_points_is_right_where_it_is_clearly_the_larger(wrong: int, told: bool) -> None:
     """Some were shifted together; chi-square of three against four differs by less than the margin."""
-    for k in range(5):
+    for k in range(3):
         one = points(7, f"parts {wrong} {k}")
         given = one.given.copy()
         given[:wrong, 2] += 40 * SIGMA

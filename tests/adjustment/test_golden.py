@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +18,7 @@ from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation, pixel_from_image, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from tests.places import ROOT
+from tests.tables import rows_of
 
 FLYOVER, LAB2 = ROOT / "datasets/flyover", ROOT / "datasets/lab2"
 SHARED = ROOT.parent / "shared/data"
@@ -28,11 +27,6 @@ SBA = SHARED / "sba"
 needs_camcal = pytest.mark.skipif(not CAMCAL.exists(), reason="needs ../shared/data/camcal")
 needs_sba = pytest.mark.skipif(not SBA.exists(), reason="needs ../shared/data/sba")
 GRID_PX, GRID_MM = (10_001, 10_001), np.array([0.001, 0.001])  # pixels for image coordinates given in mm
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def mm_network(
@@ -54,12 +48,12 @@ def mm_network(
 
 
 def flyover() -> tuple[Network, Estimate]:
-    points = table(FLYOVER / "flyover_object_points_m.csv")
+    points = rows_of(FLYOVER / "flyover_object_points_m.csv")
     names = tuple(row["point"] for row in points)
     images, image_points = mm_network(
-        table(FLYOVER / "flyover_image_points_mm.csv"), names, ("sigma_x", "sigma_y")
+        rows_of(FLYOVER / "flyover_image_points_mm.csv"), names, ("sigma_x", "sigma_y")
     )
-    exterior = table(FLYOVER / "flyover_exterior_orientation.csv")
+    exterior = rows_of(FLYOVER / "flyover_exterior_orientation.csv")
     angles = np.radians([[float(row[f"{a}_deg"]) for a in ("omega", "phi", "kappa")] for row in exterior])
     estimate = Estimate(
         (camera_from_values("35 mm", "brown", GRID_PX, (GRID_MM[0], GRID_MM[1]), c_mm=35.0),),
@@ -121,7 +115,7 @@ def test_flyover_corrections_added_to_degrees_do_not_adjust() -> None:
 
 def test_lab2_resections_in_one_network() -> None:
     """Document 003's photographs with fixed camera and points: datasets/lab2/README.md."""
-    values = {row["parameter"]: float(row["value"]) for row in table(LAB2 / "lab2_camera.csv")}
+    values = {row["parameter"]: float(row["value"]) for row in rows_of(LAB2 / "lab2_camera.csv")}
     camera = camera_from_values(
         "lab 2",
         "brown_dbat",
@@ -130,11 +124,11 @@ def test_lab2_resections_in_one_network() -> None:
         c_mm=values.pop("c"),
         values=tuple((name, v if name in ("x0", "y0") else -v) for name, v in values.items()),  # see README
     )
-    points = table(LAB2 / "lab2_object_points_m.csv")
+    points = rows_of(LAB2 / "lab2_object_points_m.csv")
     names = tuple(row["point"] for row in points)
     xyz = np.array([[float(row[a]) for a in "XYZ"] for row in points])
-    images, image_points = mm_network(table(LAB2 / "lab2_image_points_mm.csv"), names, 0.01)
-    rows = table(LAB2 / "lab2_exterior_orientation.csv")
+    images, image_points = mm_network(rows_of(LAB2 / "lab2_image_points_mm.csv"), names, 0.01)
+    rows = rows_of(LAB2 / "lab2_exterior_orientation.csv")
     first = {row["image"]: row for row in rows if row["kind"] == "initial"}
     angles = np.radians([[float(first[i][f"{a}_deg"]) for a in ("omega", "phi", "kappa")] for i in images])
     start = Estimate(

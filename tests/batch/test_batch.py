@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import gc
+import io
 import json
 import logging
 import os
@@ -21,13 +21,14 @@ from urllib.request import urlopen
 import psutil
 import pytest
 from dask.distributed import KilledWorker
+from rich.console import Console
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.job import LOCK, SurveyJob, SurveyRow, note_finished, reconstruct
 from sfm.batch.run import calls_of, find_surveys, run_batch
-from sfm.batch.table import batch_page, batch_remarks
-from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
+from sfm.batch.table import BatchTable, batch_page, batch_remarks
+from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.files.open_folders import MANIFEST, Owner, locked, sha256_of
 from sfm.files.whole_files import write_manifest
 from sfm.remarks.remark import kinds_of
@@ -37,6 +38,7 @@ from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
+from tests.tables import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +91,7 @@ def test_surveys_are_found_by_file_folder_and_glob(tmp_path: Path) -> None:
 
 
 def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
-    with (finished / "batch.csv").open(encoding="utf-8", newline="") as file:
-        table = list(csv.DictReader(file))
+    table = rows_of(finished / "batch.csv")
     data = json.loads((finished / "batch.json").read_text(encoding="utf-8"))
     assert [row["survey"] for row in table] == ["first", "second", "third"]
     assert [row["survey"] for row in data["surveys"]] == ["first", "second", "third"]
@@ -629,10 +630,6 @@ def test_a_scheduler_started_separately_gives_the_same_bytes(
             process.wait(timeout=20)
 
 
-def test_errors_of_a_batch_are_errors_of_kolinear() -> None:
-    assert issubclass(BackendError, KolinearError)
-
-
 def test_the_remarks_of_a_batch_name_its_surveys() -> None:
     def row(name: str, status: str = "done", **other: str) -> SurveyRow:
         return SurveyRow(name, f"{name}.toml", name, status, **other)  # type: ignore[arg-type]
@@ -653,3 +650,52 @@ def test_the_remarks_of_a_batch_name_its_surveys() -> None:
         "adjuster_differs_in_surveys": ("b",),
     }
     assert kinds_of(batch_remarks(rows[:1])) == ()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Seconds that time.monotonic tells."""
+    now = [100.0]
+    monkeypatch.setattr("sfm.batch.table.time.monotonic", lambda: now[0])
+    return now
+
+
+def seen(table: BatchTable) -> str:
+    """Return the table as it is drawn now."""
+    console = Console(file=io.StringIO(), width=110)
+    console.print(table._render())
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_stage_photographs_and_time_left_are_seen(clock: list[float]) -> None:
+    table = BatchTable(Console(file=io.StringIO(), force_terminal=True))
+    table.planned(["a", "b"])
+    assert "0 of 2 surveys" in seen(table) and "left" not in seen(table)
+    table.received("a", {"photographs": 4})
+    clock[0] += 5  # no worker has time for it, and its own has not begun
+    line = next(line for line in seen(table).splitlines() if line.startswith("a "))
+    assert line.split() == ["a", "waiting", "0", "of", "4"]
+    clock[0] -= 5
+    table.received("a", {"photograph": "1.jpg"})
+    assert "targets" in seen(table)
+    table.received("a", {"photograph": "2.jpg"})
+    clock[0] += 10
+    # Half of its photographs are a quarter of one survey of two: an eighth of the batch took 10 s.
+    assert "about 1 min 10 s left" in seen(table)
+    table.received("a", {"stage": "adjustment"})
+    line = next(line for line in seen(table).splitlines() if line.startswith("a "))
+    assert line.split() == ["a", "adjustment", "2", "of", "4", "10"]
+    table.finished("a", SurveyRow("plate", "a.toml", "a", "done", "good", 0.05, 0.04, 4, 4, 9), kept=False)
+    assert "1 of 2 surveys, about 10 s left" in seen(table)
+    assert seen(table).splitlines()[1].startswith("a ")  # by the name that it had while it ran
+    table.finished("b", SurveyRow("plate", "b.toml", "b", "failed", reason="no"), kept=False)
+    assert "2 of 2 surveys, 1 failed" in seen(table) and "left" not in seen(table)
+
+
+def test_compiling_is_reported_once(clock: list[float]) -> None:
+    file = io.StringIO()
+    table = BatchTable(Console(file=file, width=200))
+    table.planned(["a", "b"])
+    for name in ("a", "b"):
+        table.received(name, {"compiling": True})
+    assert file.getvalue().count("kernels are compiled first") == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import shutil
@@ -24,9 +23,11 @@ from sfm.cli.commands import starting
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
 from sfm.report.output import write_result
+from tests.commands import kolinear, refused
 from tests.engines import PLOTLESS
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
+from tests.tables import rows_of
 
 SLOW = pytest.mark.slow
 SURVEY = """\
@@ -132,48 +133,22 @@ def survey(tmp_path: Path, photographs: Path) -> Path:
     return path
 
 
-def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command as the shell does and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as end:
-        return int(end.code or 0) if not isinstance(end.code, str) else 1
-    return 0
-
-
 def coded_points(path: Path) -> dict[int, np.ndarray]:
     """Return the coordinates of the coded points of a table by code."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return {
-            int(row["code"]): np.array([float(row[c]) for c in "XYZ"])
-            for row in csv.DictReader(file)
-            if row["code"] not in ("", "-1")
-        }
-
-
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """Run a command that must end with exit code 2 and one line; return the line."""
-    assert kolinear(monkeypatch, *arguments) == 2
-    shown = capsys.readouterr()
-    lines = shown.err.splitlines()
-    assert shown.out == ""
-    assert len(lines) == 1, shown.err
-    assert lines[0].startswith("kolinear: ")
-    return lines[0]
+    return {
+        int(row["code"]): np.array([float(row[c]) for c in "XYZ"])
+        for row in rows_of(path)
+        if row["code"] not in ("", "-1")
+    }
 
 
 def test_a_survey_from_photographs_to_report(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    photographs: Path,
-    plots: None,
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, photographs: Path, plots: None
 ) -> None:
     path = tmp_path / "survey.toml"
     path.write_text(SURVEY.format(backend="colmap"), encoding="utf-8")
     out = tmp_path / "result 1"
-    code = kolinear(monkeypatch, "run", path, "--images", photographs, "--out", out, "--jobs", 2, "-v")
+    code = kolinear("run", path, "--images", photographs, "--out", out, "--jobs", 2, "-v")
     shown = capsys.readouterr()
     assert code == 0, shown.err
     assert shown.err == ""
@@ -201,24 +176,24 @@ def test_a_survey_from_photographs_to_report(
 
 
 def test_a_second_run_replaces_the_first_and_nothing_else(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
+    capsys: pytest.CaptureFixture[str], survey: Path
 ) -> None:
     out = survey.parent / "out"
     out.mkdir()
     (out / "thesis.doc").touch()
-    line = refused(monkeypatch, capsys, "run", survey, "--out", out)
+    line = refused(capsys, "run", survey, "--out", out)
     assert "contains 'thesis.doc'" in line
     assert list(out.iterdir()) == [out / "thesis.doc"]
 
 
 def test_photographs_that_cannot_be_read_do_not_stop_the_others(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
+    capsys: pytest.CaptureFixture[str], survey: Path
 ) -> None:
     whole = (survey.parent / "bild é 1.jpg").read_bytes()
     (survey.parent / "cut.jpg").write_bytes(whole[: len(whole) // 2])
     (survey.parent / "text.jpg").write_text("no photograph", encoding="utf-8")
     out = survey.parent / "out"
-    assert kolinear(monkeypatch, "run", survey, "--out", out) == 0
+    assert kolinear("run", survey, "--out", out) == 0
     shown = capsys.readouterr()
     assert "6 of 8 photographs oriented" in shown.out
     assert "cut.jpg: Not readable: the file is truncated" in shown.out
@@ -229,121 +204,78 @@ def test_photographs_that_cannot_be_read_do_not_stop_the_others(
     assert "cut.jpg" in page and "truncated" in page
 
 
-def test_no_photographs_found(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "empty").mkdir()
-    line = refused(monkeypatch, capsys, "run", survey, "--images", tmp_path / "empty")
-    assert "no photographs found: camera kamera needs '*.jpg'" in line
-    line = refused(monkeypatch, capsys, "run", survey, "--images", tmp_path / "nowhere")
-    assert "nowhere: there is no such folder" in line
-
-
-def test_photographs_of_different_sizes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
-) -> None:
-    text = survey.read_text(encoding="utf-8").replace("pixel_mm", "size_px = [600, 800]\npixel_mm")
-    survey.write_text(text, encoding="utf-8")
-    line = refused(monkeypatch, capsys, "run", survey)
-    assert "camera kamera: photograph 'bild é 1.jpg' has 800 x 600 px, size_px 600 x 800 px" in line
-
-
-def test_fewer_than_two_orientable_photographs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
-) -> None:
+def test_fewer_than_two_orientable_photographs(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
     for k in range(2, 7):
         (survey.parent / f"bild é {k}.jpg").unlink()
-    assert "1 readable photograph" in refused(monkeypatch, capsys, "run", survey)
+    assert "1 readable photograph" in refused(capsys, "run", survey)
     blank = np.full((600, 800), 200, dtype=np.uint8)
     for k in range(2, 5):
         cv2.imencode(".jpg", blank)[1].tofile(survey.parent / f"blank {k}.jpg")
-    line = refused(monkeypatch, capsys, "run", survey)
+    line = refused(capsys, "run", survey)
     assert "photograph" in line
     assert not (survey.parent / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "match"),
-    [
-        ("unit =", "units =", "survey.toml, line 3: unknown key 'units' in [survey]"),
-        ("c_mm = 10.2", 'c_mm = "10.2"', "line 8: camera 1.c_mm: found '10.2', needed a number"),
-        ('"ring14"', '"ring15"', "targets.codes = 'ring15' is neither one of"),
-        ("[[scale_bar]]", "[[scale_bar]", "a section must be in [ ] or [[ ]]"),
-    ],
-)
-def test_wrong_survey_files(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    survey: Path,
-    old: str,
-    new: str,
-    match: str,
-) -> None:
-    survey.write_text(survey.read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
-    assert match in refused(monkeypatch, capsys, "run", survey)
+def test_wrong_survey_files(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
+    survey.write_text(survey.read_text(encoding="utf-8").replace("unit =", "units =", 1), encoding="utf-8")
+    assert "survey.toml, line 3: unknown key 'units' in [survey]" in refused(capsys, "run", survey)
 
 
-def test_no_survey_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "none.toml: neither a survey file nor a folder" in refused(monkeypatch, capsys, "run", "none.toml")
+def test_no_survey_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "none.toml: neither a survey file nor a folder" in refused(capsys, "run", "none.toml")
 
 
 def test_what_is_no_folder_is_said_and_the_nearest_name_is_offered(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "one.jpg").touch()
     for command in ("run", "init"):
-        assert f"mean {tmp_path / 'photos'}?" in refused(monkeypatch, capsys, command, tmp_path / "fotos")
-        assert "mean" not in refused(monkeypatch, capsys, command, tmp_path / "else.where")
-    assert "is a file" in refused(monkeypatch, capsys, "init", tmp_path / "one.jpg")
-    assert "is a photograph" in refused(monkeypatch, capsys, "run", tmp_path / "one.jpg")
+        assert f"mean {tmp_path / 'photos'}?" in refused(capsys, command, tmp_path / "fotos")
+        assert "mean" not in refused(capsys, command, tmp_path / "else.where")
+    assert "is a file" in refused(capsys, "init", tmp_path / "one.jpg")
+    assert "is a photograph" in refused(capsys, "run", tmp_path / "one.jpg")
 
 
-def test_run_and_adjust_know_their_surveys(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
-) -> None:
-    assert "kolinear run" in refused(monkeypatch, capsys, "adjust", survey)
+def test_run_and_adjust_know_their_surveys(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
+    assert "kolinear run" in refused(capsys, "adjust", survey)
     text = survey.read_text(encoding="utf-8") + '[observations]\nfile = "image_points.csv"\n'
     survey.write_text(text, encoding="utf-8")
-    assert "kolinear adjust" in refused(monkeypatch, capsys, "run", survey)
+    assert "kolinear adjust" in refused(capsys, "run", survey)
     (survey.parent / "image_points.csv").write_text(
         "image,point,x_px,y_px\nphoto 1.png,1,5,5\n", encoding="utf-8"
     )
-    line = refused(monkeypatch, capsys, "adjust", survey)
+    line = refused(capsys, "adjust", survey)
     assert "kamera: size_px = [width, height] is needed" in line
 
 
-def test_usage_errors_are_one_line_with_exit_code_2(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refused(monkeypatch, capsys, "run")
+def test_usage_errors_are_one_line_with_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "run")
     assert line == "kolinear: Missing argument 'SURVEY.toml|PHOTOS' (see kolinear run --help)"
-    assert "--jobs" in refused(monkeypatch, capsys, "run", "a.toml", "--jobs", "0")
-    assert "No such command 'fly'" in refused(monkeypatch, capsys, "fly")
-    assert "No such option: --bogus" in refused(monkeypatch, capsys, "run", "a.toml", "--bogus")
+    assert "--jobs" in refused(capsys, "run", "a.toml", "--jobs", "0")
+    assert "No such command 'fly'" in refused(capsys, "fly")
+    assert "No such option: --bogus" in refused(capsys, "run", "a.toml", "--bogus")
 
 
-def test_no_command_shows_the_help(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert kolinear(monkeypatch) == 2
+def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert kolinear() == 2
     assert "Commands:" in capsys.readouterr().err
-    assert kolinear(monkeypatch, "run", "--help") == 0
+    assert kolinear("run", "--help") == 0
     assert "Exit code 0" in capsys.readouterr().out
 
 
 def test_a_result_that_cannot_be_depended_on_has_exit_code_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     survey = write_observed_survey(tmp_path / "s", "broken")
     good = tmp_path / "good"
-    assert kolinear(monkeypatch, "adjust", survey, "--out", good, "-v") == 0
+    assert kolinear("adjust", survey, "--out", good, "-v") == 0
     shown = capsys.readouterr().out
     assert "global test" in shown and "report included" in shown
     text = survey.read_text(encoding="utf-8").replace('free = ["c"]', "free = []")
     survey.write_text(text.replace("c_mm = 10.0", "c_mm = 11.0"), encoding="utf-8")
     bad = tmp_path / "bad"
-    assert kolinear(monkeypatch, "adjust", survey, "--out", bad) == 1
+    assert kolinear("adjust", survey, "--out", bad) == 1
     shown = capsys.readouterr()
     assert "The survey has no dependable result." in shown.out and shown.err == ""
     assert "Sigma0 is" in shown.out
@@ -362,7 +294,7 @@ def test_the_time_counts_the_report(
         return write_result(*arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr("sfm.report.output.write_result", slow)
-    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
+    assert kolinear("adjust", survey, "--out", tmp_path / "out") == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("time"))
     stages = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["seconds"]
     assert float(line.split()[1]) > sum(stages.values()) + 1.4
@@ -400,23 +332,21 @@ def test_ctrl_c_is_no_traceback(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sfm.pipeline.run_survey", interrupt)
-    assert kolinear(monkeypatch, "run", survey, "--out", survey.parent / "out") == 130
+    assert kolinear("run", survey, "--out", survey.parent / "out") == 130
     assert "Traceback" not in capsys.readouterr().err
     assert not (survey.parent / "out").exists()
 
 
-def test_adjust_runs_on_the_tables_of_a_result(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], survey: Path
-) -> None:
+def test_adjust_runs_on_the_tables_of_a_result(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
     out = survey.parent / "out"
-    assert kolinear(monkeypatch, "run", survey, "--out", out) == 0
+    assert kolinear("run", survey, "--out", out) == 0
     text = survey.read_text(encoding="utf-8").replace("pixel_mm", "size_px = [800, 600]\npixel_mm")
     text += f'[observations]\nfile = "{out.name}/image_points.csv"\n'
     text += f'[approximate]\nimages = "{out.name}/images.csv"\npoints = "{out.name}/points.csv"\n'
     survey.write_text(text, encoding="utf-8")
     again = survey.parent / "again"
     capsys.readouterr()
-    assert kolinear(monkeypatch, "adjust", survey, "--out", again) == 0, capsys.readouterr().err
+    assert kolinear("adjust", survey, "--out", again) == 0, capsys.readouterr().err
     first = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     second = json.loads((again / "summary.json").read_text(encoding="utf-8"))
     c = [text["cameras"][0]["parameters"]["c"] for text in (first, second)]

@@ -12,13 +12,13 @@ from typing import Any, NoReturn
 import cv2
 import pytest
 
-from sfm import cli
 from sfm.batch.run import run_batch
 from sfm.cli.app import app
 from sfm.cli.commands import starting
 from sfm.errors import KolinearError
 from sfm.report.output import read_log
 from sfm.runtime.faults import error_in_words, is_fault, working_on
+from tests.commands import kolinear
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -60,14 +60,9 @@ def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(starting, "_announce_compiling", lambda: None)
 
 
-def kolinear(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> tuple[int, list[str]]:
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[str]]:
     """Run the command and return its exit code and the lines on stderr."""
-    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(str(end.value.code)), capsys.readouterr().err.splitlines()
+    return kolinear(*arguments), capsys.readouterr().err.splitlines()
 
 
 def raising(error: Exception) -> Callable[..., NoReturn]:
@@ -102,7 +97,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
         "inspecting",
     ):
         monkeypatch.setattr(f"sfm.cli.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
-    code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
+    code, lines = run(capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()
     assert code == 70
     told = "kolinear: a fault of Kolinear: ValueError: new line  [31m (test_exit_codes.py, line "
@@ -118,7 +113,7 @@ def test_a_traceback_that_cannot_be_kept_is_said(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
     monkeypatch.setattr("sfm.cli.commands.solvers.loading", raising(KeyError("x")))
-    code, (line,) = kolinear(monkeypatch, capsys, "compare", "a", "b")
+    code, (line,) = run(capsys, "compare", "a", "b")
     assert code == 70 and line.endswith("; its traceback cannot be written")
 
 
@@ -128,7 +123,7 @@ def test_memory_that_is_not_enough_says_for_which_photograph(
 ) -> None:
     survey = write_photograph_survey(tmp_path / "survey", "huge", photographs=2)
     monkeypatch.setattr("sfm.survey.measuring.targets.find_targets", raising(error))
-    code, (line,) = kolinear(monkeypatch, capsys, "run", survey, "--out", tmp_path / "out", "--jobs", 1)
+    code, (line,) = run(capsys, "run", survey, "--out", tmp_path / "out", "--jobs", 1)
     own = f" ({error})" if str(error) else ""
     assert line == f"kolinear: not enough memory for photograph photo 1.png, stage targets, {survey}{own}"
     assert code == 2
@@ -139,7 +134,7 @@ def test_memory_that_is_not_enough_says_for_which_file(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("adapters.formats.registry.read_comparable", raising(MemoryError()))
-    code, lines = kolinear(monkeypatch, capsys, "compare", "a result", "b")
+    code, lines = run(capsys, "compare", "a result", "b")
     assert (code, lines) == (2, ["kolinear: not enough memory for a result"])
 
 
@@ -208,7 +203,7 @@ def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
         monkeypatch.setattr("sfm.survey.measuring.targets.measure_photograph", faulty)
     monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda workers: HERE)
     out = tmp_path / "out"
-    code, _ = kolinear(monkeypatch, capsys, "batch", first, second, "--out", out)
+    code, _ = run(capsys, "batch", first, second, "--out", out)
     assert code == 70
     assert (out / "sound" / "report.html").exists() and not (out / "faulty").exists()
     (log,) = (out / "logs").iterdir()

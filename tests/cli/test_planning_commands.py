@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adapters.formats.result_tables import write_tables
-from sfm import cli
 from sfm.solution import Solution
+from tests.commands import kolinear
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 
 CAMERA = ("--camera", "full-frame-24", "--c-mm", "28")
 LENS = (*CAMERA, "--sigma-px", "0.05")
 
 
 def plan(*arguments: object, command: str = "network") -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["kolinear", "plan", command, *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            return int(str(end.code or 0))
-    return 0
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return kolinear("plan", command, *arguments)
 
 
 def test_a_plan_is_written_with_page_tables_and_json(
@@ -47,16 +35,16 @@ def test_a_plan_is_written_with_page_tables_and_json(
     found = json.loads((out / "plan.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "good" and found["headline"] == printed.splitlines()[0]
     assert found["reached"] and found["determined"] == 30 and found["fraser"]["k"] == 1
-    points = rows(out / "points.csv")
+    points = rows_of(out / "points.csv")
     sigma = np.array([[float(row[k]) for k in ("sX", "sY", "sZ")] for row in points])
     assert np.sqrt((sigma**2).mean()) == pytest.approx(found["sigma_rms"])
     coded = {row["id"] for row in points if row["coded"] == "1"}
     seen: dict[str, int] = {}
-    for row in rows(out / "image_points.csv"):
+    for row in rows_of(out / "image_points.csv"):
         seen[row["image"]] = seen.get(row["image"], 0) + (row["point"] in coded)
     assert min(seen.values()) >= 5
-    assert [row["coded"] for row in rows(out / "shots.csv")] == [str(seen[f"S{k}"]) for k in range(1, 7)]
-    assert {row["roll_deg"] for row in rows(out / "shots.csv")} == {"0.0", "90.0"}
+    assert [row["coded"] for row in rows_of(out / "shots.csv")] == [str(seen[f"S{k}"]) for k in range(1, 7)]
+    assert {row["roll_deg"] for row in rows_of(out / "shots.csv")} == {"0.0", "90.0"}
     page = (out / "plan.html").read_text(encoding="utf-8")
     assert "viewer-data" in page and "azimuth [deg]" in page and "plate:1000,700" in page
     # its exterior orientation is what --stations reads, and a plan of the points gives the same again
@@ -116,13 +104,13 @@ def test_a_plan_has_one_focus_and_says_what_it_takes_as_known(
     assert plan(*given) == 0
     capsys.readouterr()
     assert {"plan_without_scale", "plan_without_surface", "plan_without_normals"} <= kinds(out)
-    assert len({row["focus"] for row in rows(out / "shots.csv")}) == 1
+    assert len({row["focus"] for row in rows_of(out / "shots.csv")}) == 1
     assert (
         plan(*given, *("--f-number", 22, "--focus", 150, "--confusion-um", 200), "--scale-bar", "a,d,0.01")
         == 0
     )
     assert "plan_without_scale" not in kinds(out)
-    assert {row["focus"] for row in rows(out / "shots.csv")} == {"150.0"}
+    assert {row["focus"] for row in rows_of(out / "shots.csv")} == {"150.0"}
     # what has no normal cannot be painted
     assert plan(out, "--out", tmp_path / "simulation", command="simulate") == 2
     assert "point 'b' has no normal" in capsys.readouterr().err
@@ -239,5 +227,5 @@ def test_more_photographs_for_a_result(tmp_path: Path, capsys: pytest.CaptureFix
     assert plan(tmp_path / "five", "--photographs", 2, "--out", out, command="more") == 0
     printed = capsys.readouterr().out
     assert "2 more photographs: sigma of the worst point from" in printed and "\n  new 2  " in printed
-    points = rows(out / "points.csv")
+    points = rows_of(out / "points.csv")
     assert all(float(row["sigma_with_more"]) < float(row["sigma"]) for row in points)

@@ -5,16 +5,25 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from sfm.cli import main
+from adapters.formats.registry import ENDINGS, FORMATS
+from sfm.cli.app import app
 from sfm.cli.commands import surveying as drafting
 from sfm.cli.commands.starting import stopped_once
+from sfm.conventions import METRES
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.survey.drafting.draft import Draft, draft_survey
+from sfm.survey.inputs.settings import Head
+from sfm.survey.inputs.survey_file import read_survey_file
+from tests.commands import kolinear, refused
+from tests.first_tries import TRIES, Try, answer
+from tests.surveys import write_observed_survey
 
 FOUR_LINES = """
 import sys
@@ -26,21 +35,10 @@ for k in range(2):
 """
 
 
-def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    """Return the line with which a command is refused."""
-    monkeypatch.setattr(sys, "argv", ["kolinear", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    return capsys.readouterr().err
-
-
 @pytest.mark.parametrize("given", [("--pitch", "12,5"), ("--pitch=12,5",)])
-def test_a_decimal_comma_is_explained(
-    given: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert "12.5" in refused(capsys, monkeypatch, "init", "here", *given)
-    assert "comma" not in refused(capsys, monkeypatch, "init", "here", "--pitch", "wide")
+def test_a_decimal_comma_is_explained(given: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "12.5" in refused(capsys, "init", "here", *given)
+    assert "comma" not in refused(capsys, "init", "here", "--pitch", "wide")
 
 
 def test_lines_of_both_streams_keep_their_order() -> None:
@@ -91,12 +89,11 @@ def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
         drafting.drafted_beside(moved / 'b "1"' / "plate", moved / "out" / "plate", None)
 
 
-def test_a_pitch_for_a_survey_file_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pitch_for_a_survey_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "survey.toml").write_text("", encoding="utf-8")
     for given in (tmp_path, tmp_path / "survey.toml"):
-        assert "targets.pitch" in refused(capsys, monkeypatch, "run", str(given), "--pitch", "12.5")
+        assert kolinear("run", given, "--pitch", "12.5") == 2
+        assert "targets.pitch" in capsys.readouterr().err
 
 
 def test_the_folder_that_has_photographs_is_named(tmp_path: Path) -> None:
@@ -107,3 +104,40 @@ def test_the_folder_that_has_photographs_is_named(tmp_path: Path) -> None:
         draft_survey(tmp_path)
     assert str(tmp_path / "images") in str(refusal.value)
     assert str(tmp_path / "notes") not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "one",
+    [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * one.photographs) for one in TRIES],
+)
+def test_a_first_try_is_reported_what_is_wrong(one: Try, tmp_path: Path) -> None:
+    found = answer(one, tmp_path)
+    assert found.code == one.code, found.text
+    for words in one.told:
+        assert words in found.text
+    assert "nan" not in found.text and "Warning:" not in found.text.replace("! Warning:", "")
+    assert [path.name for path in tmp_path.iterdir() if path.name not in ("s", "out")] == []
+
+
+def test_the_help_of_convert_lists_every_format() -> None:
+    text = CliRunner().invoke(app, ["convert", "--help"]).output
+    assert all(one.name in text for one in FORMATS) and all(ending in text for ending in ENDINGS)
+
+
+def test_units_are_known_ones(tmp_path: Path) -> None:
+    assert set(get_args(Head.model_fields["unit"].annotation)) == set(METRES)
+    path = write_observed_survey(tmp_path / "s", "s")
+    path.write_text(path.read_text().replace('unit = "m"', 'unit = "metres"'), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"unit: found 'metres', needed one of 'km', 'm'"):
+        read_survey_file(path)
+
+
+def test_everything_that_is_missing_is_said_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_text(
+        '[survey]\nname = "s"\n[[camera]]\nname = "c"\n[[scale_bar]]\nfrom = "1"\n', encoding="utf-8"
+    )
+    with pytest.raises(SurveyFileError) as error:
+        read_survey_file(path)
+    for key in ("survey.unit", "to", "length", "sigma", "are missing"):
+        assert key in str(error.value)

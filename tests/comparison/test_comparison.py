@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -28,6 +27,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
+from tests.tables import rows_of
 
 SHARED = SHARED / "data"
 CAMCAL, PANEL = SHARED / "camcal", SHARED / "retro-panel"
@@ -267,10 +267,8 @@ def panel(model: str) -> tuple[Network, Estimate]:
     """Reference image points and start values of retro-panel (see ../shared/data/README.md)."""
     with (PANEL / "panel-points-mm.txt").open() as file:
         xyz = {int(row[0]): [float(v) for v in row[1:4]] for row in map(str.split, file)}
-    with (PANEL / "reference-poses.csv").open() as file:
-        poses = sorted(csv.DictReader(file), key=lambda row: row["image"])
-    with (PANEL / "reference-image-points.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    poses = sorted(rows_of(PANEL / "reference-poses.csv"), key=lambda row: row["image"])
+    rows = rows_of(PANEL / "reference-image-points.csv")
     images = [pose["image"] for pose in poses]
     points = sorted({int(row["point"]) for row in rows})
     cameras = tuple(

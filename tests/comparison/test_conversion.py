@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
-from sfm.comparison.camera_conversion import convert_camera, corresponding_free, start_values
+from sfm.comparison.camera_conversion import convert_camera, corresponding_free, start_values, undistort
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
 from sfm.distortion.models import GENERAL_MODELS, MODELS, Role
-from sfm.errors import SurveyFileError
-from tests.synthetic import seed_of
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.remarks.remark import of_kind
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.result import SurveyResult
+from tests.other_adjuster import in_house_adjuster
+from tests.synthetic import make_network, seed_of
 
 SIZE_PX = (2272, 1704)
 HEIGHT_MM = 5.43764
@@ -161,3 +170,70 @@ def test_same_model_is_left_alone_and_unknown_ones_are_refused() -> None:
     assert convert_camera(camcal(), "brown").camera.parameters == pytest.approx(camcal().parameters, abs=0)
     with pytest.raises(SurveyFileError, match="model 'fisheye', expected one of brown"):
         convert_camera(camcal(), "fisheye")
+
+
+@pytest.mark.parametrize("model", ["brown", "full_opencv", "brown_forward"])
+@pytest.mark.parametrize("models", [("opencv",), ("brown",), GENERAL_MODELS])
+def test_rays_stay_and_covariances_follow(model: str, models: tuple[str, ...]) -> None:
+    network, truth = make_network(seed_of("undistort"), images=2, points=10, model=model)
+    camera = replace(truth.cameras[0], pixel_mm=truth.cameras[0].pixel_mm * [1.01, 1.0])
+    truth = replace(truth, cameras=(camera,))
+    straight, ideal = undistort(network, truth, models)
+    new = ideal.cameras[0]
+    assert new.model in models
+    assert new.model == ("brown" if camera.in_mm and "brown" in models else new.model)
+    distortion = [new.value(n) for n in new.names if n not in ("c", "x0", "y0", "fx", "fy", "cx", "cy")]
+    assert not any(distortion) and not new.free[-len(distortion) :].any()
+    assert new.pixel_mm[0] == new.pixel_mm[1]
+    before, after = network.image_points, straight.image_points
+    uv = tangents_from_pixel(camera, before.xy)
+    np.testing.assert_allclose(tangents_from_pixel(new, after.xy), uv, atol=1e-13)
+    assert np.abs(after.xy - before.xy).max() > 1  # px: there was something to correct
+    # one sigma to the right by the covariance against where that point really goes
+    step = 1e-3
+    moved = replace(network, image_points=replace(before, xy=before.xy + np.array([step, 0])))
+    G = (undistort(moved, truth, models)[0].image_points.xy - after.xy) / step
+    along = replace(before, covariance=np.tile(np.diag([1.0, 0.0]), (len(before), 1, 1)))
+    found = undistort(replace(network, image_points=along), truth, models)[0].image_points.covariance
+    np.testing.assert_allclose(found, G[:, :, None] * G[:, None, :], atol=1e-5)
+
+
+def test_what_cannot_be_inverted_is_refused() -> None:
+    network, truth = make_network(seed_of("undistort"), images=2, points=10, model="opencv")
+    camera = truth.cameras[0]
+    folded = camera.with_parameters(camera.parameters + np.array([0, 0, 0, 0, -50.0, 0, 0, 0]))
+    with pytest.raises(
+        GeometryError, match=r"cannot be inverted at \d+ image points?, the first is point \d"
+    ):
+        undistort(network, replace(truth, cameras=(folded,)), ("opencv",))
+
+
+def compared(stretch: float, free: tuple[str, ...]) -> tuple[AdjusterComparison, SurveyResult]:
+    """Adjust and compare photographs whose pixels are wider than the survey says, by a factor."""
+    network, truth = make_network(seed_of("better"), images=10, points=50, model="brown_forward", free=free)
+    camera = truth.cameras[0]
+    start = replace(truth, cameras=(replace(camera, pixel_mm=camera.pixel_mm * np.array([stretch, 1.0])),))
+    a = adjust(network, start, datum=Datum("free"), reject="none")
+    both = compare_adjusters(a, in_house_adjuster, name="other", model="opencv")
+    codes = np.full(len(network.points), -1)
+    return both, SurveyResult("s", "m", len(network.images), (), a, codes, both)
+
+
+USUAL = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
+
+
+def test_a_camera_that_fits_many_times_better_is_no_agreement() -> None:
+    both, result = compared(1.007, USUAL)
+    assert both.agree and both.better is not None
+    assert both.better.free == ("b1",)
+    assert both.better.rms_px == pytest.approx(0.1, rel=0.1) and both.better.times > 5
+    (found,) = of_kind(findings_of(result).verdict.remarks, "adjuster_fits_better")
+    assert found.names("parameters") == ("b1",) and found.severity == "warning"
+    assert found.number("times") == both.better.times
+
+
+@pytest.mark.parametrize(("stretch", "free"), [(1.0, USUAL), (1.007, (*USUAL, "b1"))])
+def test_a_camera_that_fits_as_well_is_not_reported(stretch: float, free: tuple[str, ...]) -> None:
+    both, result = compared(stretch, free)
+    assert both.agree and both.better is None
+    assert not of_kind(findings_of(result).verdict.remarks, "adjuster_fits_better")

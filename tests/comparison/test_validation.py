@@ -63,13 +63,6 @@ def test_truth_fits_with_the_noise_and_the_start_does_not(drawn: list) -> None:
         assert np.bincount(made.network.image_points.image, minlength=made.plan.images).min() >= 4
 
 
-def test_networks_repeat() -> None:
-    a, b = (random_network(np.random.default_rng([5, 3])) for _ in range(2))
-    assert a.plan == b.plan
-    np.testing.assert_array_equal(a.network.image_points.xy, b.network.image_points.xy)
-    np.testing.assert_array_equal(a.start.points, b.start.points)
-
-
 def test_control_is_exact_at_truth_and_start(drawn: list) -> None:
     for made in drawn:
         control = made.network.control

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import subprocess
@@ -26,6 +25,7 @@ from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity
 from tests.places import DATASETS, ROOT
 from tests.synthetic import stored_of
+from tests.tables import rows_of
 
 NOISE_PX = 0.01  # what the measured targets of the rendered photographs show
 LEVEL = 0.95
@@ -130,11 +130,11 @@ def test_from_photographs_to_the_page_in_one_command(tmp_path: Path) -> None:
     print(ended.stdout)
     out = tmp_path / "out"
     assert (out / "epochs/epochs.html").stat().st_size > 50_000
-    with (out / "epochs/displacements.csv").open(encoding="utf-8") as file:
-        table = list(csv.DictReader(file))
+    table = rows_of(out / "epochs/displacements.csv")
     for first, second in (("first", "second"), ("first", "third"), ("second", "third")):
-        with (out / first / "points.csv").open(encoding="utf-8") as file:
-            placed = {row["id"]: [float(row[axis]) for axis in "XYZ"] for row in csv.DictReader(file)}
+        placed = {
+            row["id"]: [float(row[axis]) for axis in "XYZ"] for row in rows_of(out / first / "points.csv")
+        }
         truth = sag_between(first, second, list(placed), np.array(list(placed.values())))
         rows = []
         for row in table:

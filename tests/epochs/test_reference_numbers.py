@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -18,6 +16,7 @@ from sfm.comparison.stable_points import (
 )
 from sfm.conventions import FloatArray
 from tests.places import ROOT
+from tests.tables import rows_of
 
 FOLDER = ROOT / "datasets/deformation"
 NAMES = ("A2", "A3", "O1", "O2", "O3", "O4")
@@ -26,8 +25,7 @@ FREEDOM = 8
 
 def levelling() -> tuple[FloatArray, FloatArray, float, list[float]]:
     """Return d (6, 1) mm, its cofactors, the pooled variance and sigma0 of both free adjustments."""
-    with (FOLDER / "levelling.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(FOLDER / "levelling.csv")
     A = np.zeros((len(rows), 6))
     for k, row in enumerate(rows):
         A[k, NAMES.index(row["from"])], A[k, NAMES.index(row["to"])] = -1.0, 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from sfm.remarks.remark import Remark, kinds_of
 from sfm.report.epochs import describe_stable
 from sfm.report.pages import write_page
 from tests.epochs.scenes import POINTS, epoch
+from tests.tables import rows_of
 
 
 def shift(size: float) -> FloatArray:
@@ -55,8 +55,7 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
     text = page.read_text(encoding="utf-8")
     said = verdict_of_epochs(found).remarks[0].text
     assert said in text.replace("\xa0", " ") and "span" in text and "Series" in text
-    with (tmp_path / "out/displacements.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "out/displacements.csv")
     assert len(rows) == 3 * POINTS and sum(int(row["moved"]) for row in rows) == 8
     summary = json.loads((tmp_path / "out/epochs.json").read_text(encoding="utf-8"))
     assert summary["changed"] and summary["pairs"][1]["moved"] == ["5", "17", "22", "41"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
+import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from adapters.formats.mesh import read_mesh
 from adapters.formats.result_tables import write_tables
 from sfm.cli.app import app
 from sfm.errors import KolinearError
-from sfm.inspection.features_file import read_features_file
+from sfm.inspection.features_file import FeaturesFile, HeldSettings, read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.remarks.remark import kinds_of
 from sfm.report.measurement import describe_measured
@@ -29,6 +30,8 @@ from tests.inspection.benches import (
     one_bench,
     without_covariance,
 )
+from tests.places import ROOT
+from tests.tables import rows_of
 
 SHAPES = """
 [[group]]
@@ -216,8 +219,7 @@ def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
         ),
         *("measurement.html", "measurement.dxf", "points.ply", "point_covariance.npy", "manifest.json"),
     }
-    with (out / "deviations.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out / "deviations.csv")
     assert len(rows) == 135 and {row["decision"] for row in rows} == {"in"}
     summary = json.loads((out / "measurement.json").read_text(encoding="utf-8"))
     assert summary["tolerances"][0]["in"] == 25 and len(summary["shapes"]) == 4
@@ -260,3 +262,31 @@ def test_bad_input_is_one_line(text: str, tmp_path: Path) -> None:
     with pytest.raises(KolinearError, match=BAD[text]) as error:
         measured(tmp_path, text)
     assert "\n" not in str(error.value)
+
+
+TEXT = (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
+
+
+def test_features_files_of_the_page_are_read_and_show_every_key(tmp_path: Path) -> None:
+    shown: dict[str, set[str]] = {}
+    for block in re.findall(r"```toml\n(.*?)```", TEXT, re.S):
+        path = tmp_path / "features.toml"
+        path.write_text(block, encoding="utf-8")
+        features, paths = read_features_file(path)
+        assert paths.keys() == {*features.tables(), *features.meshes()}
+        for key, given in tomllib.loads(block).items():
+            for one in given if isinstance(given, list) else [given]:
+                shown.setdefault(key, set()).update(one)
+    fields = {field.alias or name: (name, field) for name, field in FeaturesFile.model_fields.items()}
+    assert shown.keys() == fields.keys()
+    for key, (name, _) in fields.items():
+        section = getattr(read_features_file(path)[0] if key == "alignment" else EVERY, name)
+        kind = type(section[0] if isinstance(section, tuple) else section)
+        assert shown[key] == {field.alias or name for name, field in kind.model_fields.items()}, key
+    for name in HeldSettings.model_fields:
+        assert re.search(rf"\b{name}\b", TEXT), name
+    assert "measurement.html" in TEXT
+
+
+BLOCK = re.findall(r"```toml\n(.*?)```", TEXT, re.S)[0]
+EVERY = FeaturesFile.model_validate(tomllib.loads(BLOCK))

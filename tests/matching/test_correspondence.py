@@ -1,17 +1,25 @@
 """Correspondence: synthetic truth with missing and false targets, planar grids and spatial clouds."""
 
+from __future__ import annotations
+
 import zlib
 from dataclasses import replace
+from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
 from sfm.camera import camera_from_values, project, tangents_from_pixel
-from sfm.conventions import rotation_from_angles, rotation_from_vector
+from sfm.conventions import BoolArray, FloatArray, rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
+from sfm.matching.conjugate import difference_of_blur, match_points
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
+from sfm.matching.lsm.surface_planes import on_surface
 from sfm.matching.tracks.correspondence import match_targets
-from sfm.network import Estimate
+from sfm.network import Estimate, ImagePoints
+from tests.synthetic import seed_of
+from tests.textures import natural_texture, with_noise
 
 SIZE = (2000, 1500)
 CAMERA = camera_from_values(
@@ -270,3 +278,114 @@ def test_camcal_dots_from_the_reference_orientation(shared_data, tolerance):
     assert len(found.points) == 96
     assert (precision, double) == (1.0, 0)
     assert recall > 0.998  # the reference orientation itself is off by up to 1.6 px
+
+
+SIZE_PX = (800, 600)
+WRONG = [117, 118, 130, 255]  # two of them neighbours
+
+
+def pair_over_hills(*, along_px: float) -> tuple[ImagePoints, Estimate, BoolArray]:
+    """Return a pair over hills, points 0.02 px off along the epipolar line, and which are WRONG."""
+    rng = seed_of("hills")
+    lens = camera_from_values("lens", "brown", SIZE_PX, (0.01, 0.01), c_mm=8.0, values=())
+    position = np.array([[-0.5, 0.0, 5.0], [0.5, 0.1, 5.0]])
+    x, y = (one.ravel() for one in np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-1.5, 1.5, 15)))
+    x, y = x + rng.normal(0, 0.04, 300), y + rng.normal(0, 0.04, 300)
+    truth = np.column_stack([x, y, 0.05 * np.sin(1.5 * x) + 0.03 * np.cos(2 * y)])
+    error_px = rng.normal(0, 0.02, 300)
+    error_px[WRONG] = along_px * np.array([1.0, 1.0, -1.0, 1.0])
+    depth = 5.0 - truth[:, 2:]
+    moved = depth / (1 + depth * error_px[:, None] / lens.c_px)  # parallax is c times base over depth
+    points = position[0] + (truth - position[0]) * moved / depth
+    xy = [project(lens, one, np.eye(3), points) for one in position]
+    image, point = np.repeat([0, 1], 300), np.tile(np.arange(300), 2)
+    seen = ImagePoints(image, point, np.concatenate(xy), np.tile(4e-4 * np.eye(2), (600, 1, 1)))
+    wrong = np.isin(np.arange(300), WRONG)
+    return seen, Estimate((lens,), position, np.tile(np.eye(3), (2, 1, 1)), points), wrong
+
+
+ONE_CAMERA = np.zeros(2, dtype=np.int64)
+
+
+@pytest.mark.parametrize("along_px", [2.0, 20.0])
+def test_points_off_the_surface_leave_and_their_neighbours_stay(along_px: float) -> None:
+    seen, estimate, wrong = pair_over_hills(along_px=along_px)
+    good = on_surface(seen, ONE_CAMERA, estimate, np.ones(300, dtype=bool))
+    assert not good[wrong].any()
+    assert good[~wrong].sum() >= 290
+
+
+def test_points_that_a_third_ray_checks_stay() -> None:
+    seen, estimate, wrong = pair_over_hills(along_px=20.0)
+    assert on_surface(seen, ONE_CAMERA, estimate, np.zeros(300, dtype=bool)).all()
+    assert on_surface(seen, ONE_CAMERA, estimate, ~wrong)[wrong].all()
+
+
+def test_points_without_neighbours_are_on_no_surface() -> None:
+    seen, estimate, _ = pair_over_hills(along_px=0.0)
+    few = seen.select(seen.point < 6)
+    alone = Estimate(estimate.cameras, estimate.position, estimate.rotation, estimate.points[:6])
+    assert not on_surface(few, ONE_CAMERA, alone, np.ones(6, dtype=bool)).any()
+    behind: FloatArray = estimate.points.copy()
+    behind[40] = [0.0, 0.0, 9.0]
+    turned = Estimate(estimate.cameras, estimate.position, estimate.rotation, behind)
+    assert not on_surface(seen, ONE_CAMERA, turned, np.ones(300, dtype=bool))[40]
+
+
+PICTURE_PX = (420, 380)
+NOISE = 2.0
+A, SHIFT = np.array([[1.03, -0.05], [0.04, 0.98]]), np.array([6.4, -9.7])
+MIDDLE = np.array(PICTURE_PX) / 2
+
+
+@cache
+def _pair(blur_left: float, blur_right: float) -> tuple[FloatArray, FloatArray]:
+    scene = natural_texture(np.random.default_rng(3), PICTURE_PX)
+    back = np.linalg.inv(A)
+    M = np.column_stack([back, MIDDLE - back @ (MIDDLE + SHIFT)])
+    warped = cv2.warpAffine(
+        scene,
+        M,
+        PICTURE_PX,
+        flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+    both = (
+        cv2.GaussianBlur(one, (0, 0), blur) if blur else one
+        for one, blur in ((scene, blur_left), (warped, blur_right))
+    )
+    left, right = (with_noise(one, NOISE, k) for k, one in enumerate(both))
+    return left, right
+
+
+def _points() -> FloatArray:
+    y, x = np.mgrid[100:281:30, 100:321:30].astype(float)
+    return np.column_stack([x.ravel(), y.ravel()]) + 0.3
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.5, 3.0, 5.0])
+def test_difference_of_blur_is_that_put_in(sigma: float) -> None:
+    assert difference_of_blur(*_pair(0.0, sigma)) == pytest.approx(sigma**2, rel=0.15)
+    assert difference_of_blur(*_pair(sigma, 0.0)) == pytest.approx(-(sigma**2), rel=0.15)
+
+
+def test_photographs_alike_have_no_difference_of_blur() -> None:
+    assert abs(difference_of_blur(*_pair(0.0, 0.0))) < 0.1
+    noise = [with_noise(np.full(PICTURE_PX, 128.0), NOISE, k) for k in (5, 6)]
+    assert difference_of_blur(*noise) == 0.0
+    assert difference_of_blur(np.zeros((9, 9), np.uint8), np.zeros((9, 9), np.uint8)) == 0.0
+
+
+@pytest.mark.parametrize(("blur_left", "blur_right"), [(0.0, 3.0), (3.0, 0.0), (0.0, 1.5)])
+def test_one_photograph_out_of_focus_is_matched(blur_left: float, blur_right: float) -> None:
+    points = _points()
+    truth = (points - MIDDLE) @ A.T + MIDDLE + SHIFT
+    found = match_points(*_pair(blur_left, blur_right), points, search_px=81)
+    e = (found.right - truth)[found.good]
+    assert found.good.mean() > 0.6
+    assert np.abs(e).max() < 1.5 and np.sqrt((e**2).mean()) < 0.3
+    assert np.sqrt((e**2 / found.sigma[found.good] ** 2).mean()) == pytest.approx(1.0, abs=0.5)
+    k = int(np.flatnonzero(found.good)[0])
+    mapped = found.warp[k] @ [0.0, 0.0, 1.0]
+    assert mapped[:2] / mapped[2] == pytest.approx(found.right[k], abs=1e-9)
+    assert found.warp[k, :2, :2] == pytest.approx(A, abs=0.3)

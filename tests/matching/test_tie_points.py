@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import tracemalloc
 import weakref
 from collections.abc import Sequence
@@ -67,6 +66,7 @@ from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
 from sfm.textbook.matching import match_along_line
 from tests.engines import ALONE, HERE, Notes
+from tests.tables import rows_of
 from tests.textures import random_texture, with_noise
 
 
@@ -585,8 +585,7 @@ def test_batch_of_a_survey_without_targets_is_that_survey(
             assert entry["failed"] if name == "broken.png" else found
     assert row.status == "done" and row.photographs == 3 and row.photographs_total == 4
     alone = run_survey(read_survey(survey)).adjustment
-    with (out / "small" / "points.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out / "small" / "points.csv")
     assert [one["id"] for one in rows] == list(alone.network.points)
     xyz = np.array([[float(one[axis]) for axis in "XYZ"] for one in rows])
     assert xyz == pytest.approx(alone.estimate.points, abs=1e-9)

@@ -28,10 +28,11 @@ from sfm.planning.stations import arrangement
 from sfm.planning.visibility import Seeing, TargetImage, Why
 from sfm.planning.weakness import contributions, open_counts, reason_of
 from sfm.report.pages import write_page
-from tests.cli.test_planning_commands import plan, rows
+from tests.cli.test_planning_commands import plan
 from tests.rigs import make_rig
 from tests.survey.test_survey_observations import network_of_all, observed
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 
 STATIONS = ("--unit", "m", "--sigma-px", "0.1", "--stations", "hemisphere:6")
 
@@ -86,7 +87,7 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
     kinds = {of.name for name, of in TABLES.items() if name != "distance"} | {"mounts", "scale bars", "rig"}
     assert set(gain) == kinds
     assert all(one["gain"] >= 1 - 1e-9 for one in gain.values()) and gain["rig"]["gain"] > 1.0001
-    assert {row[""] if "" in row else row["kind"] for row in rows(out / "gain.csv")} == kinds
+    assert {row[""] if "" in row else row["kind"] for row in rows_of(out / "gain.csv")} == kinds
     assert "gain by plumb lines: points 1." in printed and "rig stereo: camera 2 0.4" in printed
     (mount,) = found["rigs"][0]["mounts"]
     assert 0 < mount["base"]["sigma"] < 1e-4 and found["photographs"] == 12

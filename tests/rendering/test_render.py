@@ -1,6 +1,5 @@
 """Rendered photographs against analytic areas, centres of area and the collinearity equations."""
 
-import csv
 import subprocess
 import sys
 from dataclasses import replace
@@ -24,6 +23,7 @@ from sfm.rendering.scene_file import read_scene
 from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import read_codes
 from tests.places import ROOT
+from tests.tables import rows_of
 
 DEMO = ROOT / "datasets/demo/scene.toml"
 SIZE = (320, 240)
@@ -323,14 +323,12 @@ def test_a_scene_file_gives_photographs_and_their_truth(tmp_path):
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "manifest.json", "p1.png", "p2.png", "truth_image_points.csv", "truth_images.csv", "truth_points.csv",
     ]  # fmt: skip
-    with (tmp_path / "out/truth_points.csv").open() as file:
-        points = list(csv.DictReader(file))
+    points = rows_of(tmp_path / "out/truth_points.csv")
     assert [(p["target"], p["code"], float(p["X"])) for p in points] == [
         ("7", "7", -20.0),
         ("t002", "-1", 0.0),
     ]
-    with (tmp_path / "out/truth_image_points.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 4
+    assert len(rows_of(tmp_path / "out/truth_image_points.csv")) == 4
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from sfm.result import SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_points
 from tests.places import SHARED
 from tests.synthetic import SIZE_PX, make_network, seed_of
+from tests.tables import rows_of
 
 CAMCAL = SHARED / "data" / "camcal"
 
@@ -165,11 +165,9 @@ def test_weak_points_are_named_and_all_reports_agree(tmp_path: Path) -> None:
     assert told["points_by_rays"] == {"6": 20}
     assert told["point_rms_px"]["max"] == pytest.approx(float(found.point_rms_px.max()))
     write_tables(findings_of(result), tmp_path)
-    with (tmp_path / "points.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "points.csv")
     assert [float(row["angle_deg"]) for row in rows] == found.angle_deg.tolist()
     assert [float(row["rms_px"]) for row in rows] == found.point_rms_px.tolist()
-    with (tmp_path / "images.csv").open(encoding="utf-8") as file:
-        assert [float(row["coverage"]) for row in csv.DictReader(file)] == found.hull.tolist()
+    assert [float(row["coverage"]) for row in rows_of(tmp_path / "images.csv")] == found.hull.tolist()
     assert len(read_points(tmp_path / "points.csv").names) == 20  # welcome as [approximate]
     assert len(read_exterior(tmp_path / "images.csv").names) == 6

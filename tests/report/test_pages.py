@@ -1,31 +1,53 @@
-"""Pages of a validation and of a comparison: complete, self-contained, escaped, whole or not at all."""
+"""Pages: folded on the screen, printed whole, in words without a script; overlays."""
 
 from __future__ import annotations
 
-import csv
 import json
+import re
 import shutil
+import subprocess
+from collections.abc import Iterator
 from dataclasses import replace
+from html.parser import HTMLParser
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
+from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.display import bound
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
+from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import TRIALS, largest_difference, verdict_of_validation
-from sfm.report.pages import write_page
+from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.report.output import write_result
+from sfm.report.page import FoldedParts, Heading, Paragraph, Part, Statement, Table
+from sfm.report.pages import html_of, page_of, write_page
+from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
+from sfm.report.survey_report import text_report
+from sfm.result import BaselineComparison, SurveyResult
 from sfm.solution import Solution
+from sfm.survey.inputs.survey import read_survey
+from sfm.targets.outlines import Flag
+from tests.other_adjuster import in_house_adjuster
+from tests.places import ROOT
+from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
 
@@ -57,8 +79,7 @@ def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
     )
     lost = trial(1, cost=np.nan, ended=failed)
     path = write_page(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
-    with (tmp_path / "out" / "validation.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "out" / "validation.csv")
     assert list(rows[0]) == [one.name for one in TRIALS if one.name]
     assert rows[0]["ended"] == "same_optimum" and rows[1]["cost_other_px2"] == ""
     assert rows[1]["message"] == "<out of order>"
@@ -154,8 +175,7 @@ def test_comparison_is_written_with_every_point(
     moved: tuple[ResultComparison, np.ndarray], tmp_path: Path
 ) -> None:
     path = write_page(moved[0], tmp_path / "out", xyz=moved[1])
-    with (tmp_path / "out" / "differences.csv").open() as file:
-        rows = {row["id"]: row for row in csv.DictReader(file)}
+    rows = {row["id"]: row for row in rows_of(tmp_path / "out" / "differences.csv")}
     assert len(rows) == 20
     assert [name for name, row in rows.items() if row["significant"] == "1"] == ["5"]
     assert float(rows["5"]["dX"]) == pytest.approx(0.003)
@@ -226,3 +246,180 @@ def test_sigmas_of_one_result_are_enough() -> None:
     assert found.has_sigma == (True, False)
     assert np.isnan(found.statistic).tolist() == [j == 3 for j in range(20)]
     assert found.changed is False
+
+
+CHROMIUM = shutil.which("chromium")
+ROWS = 300
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_folded_tables_are_printed_whole(tmp_path: Path) -> None:
+    style = (files("sfm.report") / "templates" / "report.css").read_text(encoding="utf-8")
+    assert "counter(page)" in style
+    rows = "".join(f"<tr><th>{k}</th><td>{k}</td></tr>" for k in range(ROWS))
+    table = f"<div class=scroll><table><tbody>{rows}</tbody></table></div>"
+    page = f"<style>{style}</style><details><summary>s</summary>{table}</details>"
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    printed = tmp_path / "page.pdf"
+    subprocess.run(
+        [
+            str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu",
+            f"--user-data-dir={tmp_path}/profile", f"--print-to-pdf={printed}",
+            (tmp_path / "page.html").as_uri(),
+        ],
+        check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    assert len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes())) > 3
+
+
+def test_crosses_are_those_drawn_one_by_one() -> None:
+    """Two lines through each candidate, short ones where it is too small; the first reason has the colour."""
+    rng = np.random.default_rng(3)
+    flags = [reason.value for reason, _ in REASON_COLOURS] + [0, (Flag.LOBED | Flag.TOO_SMALL).value]
+    flag = np.repeat(flags, 3)
+    xy = rng.permutation(np.stack(np.meshgrid(np.arange(8), np.arange(8)), axis=2).reshape(-1, 2))[
+        : len(flag)
+    ] * 30 + rng.uniform(5, 20, (len(flag), 2))
+    picture, expected = np.full((250, 250, 3), 90, np.uint8), np.full((250, 250, 3), 90, np.uint8)
+    _crosses(picture, xy, flag, 0.9)
+    for at, value in zip(xy, flag.tolist(), strict=True):
+        colour = next((colour for reason, colour in REASON_COLOURS if value & reason.value), INK)
+        arm = (2 if value & Flag.TOO_SMALL.value else 4) << SHIFT
+        x, y = (round(float(c)) for c in ((at + 0.5) * 0.9 - 0.5) * (1 << SHIFT))
+        for sign in (1, -1):
+            ends = (x - arm, y - sign * arm), (x + arm, y + sign * arm)
+            cv2.line(expected, *ends, colour, 1, cv2.LINE_AA, SHIFT)
+    assert (picture != 90).any()
+    assert np.array_equal(picture, expected)
+
+
+def test_no_candidates_draw_nothing() -> None:
+    """A photograph without rejected candidates, and one outside of the picture."""
+    picture = np.full((20, 20, 3), 90, np.uint8)
+    _crosses(picture, np.zeros((0, 2)), np.zeros(0, np.int64), 1.0)
+    _crosses(picture, np.array([[-500.0, 9e9]]), np.array([Flag.LOBED.value]), 1.0)
+    assert (picture == 90).all()
+
+
+def test_photographs_that_vanish_during_a_run_are_named(tmp_path: Path) -> None:
+    folder = write_photograph_survey(tmp_path / "s", "vanished").parent
+    result = run_survey(read_survey(folder / "survey.toml"))
+    (folder / "photo 2.png").unlink()
+    write_result(findings_of(result), tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    (said,) = [one for one in summary["verdict"]["remarks"] if one["kind"] == "photographs_not_drawn"]
+    assert said["severity"] == "note" and "photo 2.png" in said["text"] and "photo 1.png" not in said["text"]
+    assert said["text"] in " ".join((tmp_path / "out" / "report.txt").read_text(encoding="utf-8").split())
+    assert len(list((tmp_path / "out" / "overlays").iterdir())) == len(result.photographs) - 1
+
+
+NUMBER = re.compile(r"(?<![\w.^-])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
+
+
+class Words(HTMLParser):
+    """The text of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.text = ""
+        self.hidden = False
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.hidden = tag in ("style", "script")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.hidden = False
+
+    def handle_data(self, data: str) -> None:
+        self.text += "" if self.hidden else f" {data}"
+
+
+def said(text: str) -> set[float]:
+    return {float(number) for number in NUMBER.findall(text)}
+
+
+@pytest.mark.parametrize("write", [write_photograph_survey, write_observed_survey])
+def test_the_page_says_what_the_text_says(write: object, tmp_path: Path) -> None:
+    findings = findings_of(run_survey(read_survey(write(tmp_path / "survey", "text in page"))))  # type: ignore[operator]
+    words = Words()
+    words.feed(html_of(findings))
+    text = text_report(findings)
+    missing = sorted(said(text) - said(words.text))
+    lines = [line for line in text.splitlines() if said(line) & set(missing)]
+    assert missing == [], "\n".join(lines)
+    assert len(said(text)) > 60
+
+
+@pytest.fixture(scope="module")
+def result() -> SurveyResult:
+    network, truth = make_network(seed_of("compared"), images=5, points=20, noise_px=0.1)
+    a = adjust(network, truth, datum=Datum("free"))
+    both = compare_adjusters(a, in_house_adjuster)
+    return SurveyResult("compared", "m", 5, (), a, np.full(20, -1), both)
+
+
+@pytest.mark.parametrize(
+    ("changed", "level", "reasons"),
+    [
+        ({}, "good", 0),
+        ({"stopped_early": True}, "good", 0),
+        ({"backend_converged": False}, "good", 0),  # fits alike
+        ({"backend_converged": False, "cost": (1.0, 2.0)}, "bad", 1),
+    ],
+)
+def test_the_outcome_comes_first_with_its_reasons(
+    result: SurveyResult, changed: dict[str, Any], level: str, reasons: int
+) -> None:
+    both = result.comparison
+    assert both is not None
+    cost = changed.pop("cost", both.comparison.cost)
+    both = replace(both, comparison=replace(both.comparison, cost=cost), **changed)
+    first, second, *_ = adjuster_parts(findings_of(replace(result, comparison=both)))
+    assert isinstance(first, Statement) and first.level == level and first.text
+    assert (isinstance(second, Table) and len(second.rows)) == (reasons or False)
+    (none,) = adjuster_parts(findings_of(replace(result, comparison=None)))
+    assert type(none) is Paragraph
+
+
+def test_the_other_pipeline_is_compared_in_a_unit_that_reads_well(result: SurveyResult) -> None:
+    found = BaselineComparison(
+        "mapper", (5, 4), 5, (0.1, 0.5), 18, 0.25,
+        np.full((18, 3), 1e-3), np.full((4, 3), 2e-3), np.full(4, 0.01), (2.0, 30.0),
+    )  # fmt: skip
+    _, both, apart, _ = pipeline_parts(findings_of(replace(result, baseline=found)))
+    assert isinstance(both, Table) and isinstance(apart, Table)
+    assert both.rows[0] == ("photographs oriented", "5 of 5", "4 of 5", "")
+    assert both.rows[2][1:] == ("0.100", "0.250", "px")
+    (_, point, _, unit), (_, centre, _, same), rotation = apart.rows
+    assert float(centre) == 2 * float(point) and unit == same and rotation[-1] == "deg"
+    assert list(pipeline_parts(findings_of(result))) == []
+
+
+PAGE = re.sub(r"\s+", " ", (ROOT / "docs" / "reading-the-report.md").read_text(encoding="utf-8")).lower()
+OF_FIGURES = ("", "observations", "standard deviation", "reliability")  # first columns that name figures
+
+
+def labels(parts: tuple[Part, ...]) -> Iterator[str]:
+    for part in parts:
+        if isinstance(part, FoldedParts):
+            yield from labels(part.parts)
+        elif isinstance(part, Heading):
+            yield re.sub(r"^The \d+ ", "", part.text)
+        elif isinstance(part, Table) and (part.facts or part.header[0] in OF_FIGURES):
+            yield from (str(row[0]).removesuffix(" small") for row in part.rows)  # the name of the camera
+        elif isinstance(part, Table):
+            reasons = (
+                part.header[1:] if "accepted in the result" not in str(part.header) else part.header[1:3]
+            )
+            yield from (one.removeprefix(">").partition(" [")[0] for one in reasons)
+
+
+def test_every_figure_of_the_report_is_explained(tmp_path: Path) -> None:
+    found = findings_of(run_survey(read_survey(write_photograph_survey(tmp_path / "survey", "page"))))
+    sections = {one.key: one for one in page_of(found).sections}
+    names = {
+        one for key in ("worked", "quality", "rejected", "comparison") for one in labels(sections[key].parts)
+    }
+    assert len(names) > 60
+    missing = sorted(one for one in names if one.lower() not in PAGE)
+    assert not missing, missing

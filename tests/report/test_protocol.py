@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -113,18 +113,15 @@ def test_the_files_hold_all_covariances(found: Findings, tmp_path: Path) -> None
     with np.load(tmp_path / "covariances.npz") as stored:
         np.testing.assert_array_equal(stored["points"], a.covariance.points)
         np.testing.assert_array_equal(stored["interior_0"], a.covariance.interior[0])
-    with (tmp_path / "point_covariances.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "point_covariances.csv")
     assert float(rows[2]["X_Z"]) == a.covariance.points[2, 0, 2]
-    with (tmp_path / "interior_correlations.csv").open(encoding="utf-8") as file:
-        pairs = list(csv.DictReader(file))
+    pairs = rows_of(tmp_path / "interior_correlations.csv")
     assert len(pairs) == 10 and all(-1 <= float(pair["correlation"]) <= 1 for pair in pairs)
 
 
 def test_correlations_with_every_photograph_are_a_table(found: Findings, tmp_path: Path) -> None:
     write_tables(found, tmp_path)
-    with (tmp_path / "exterior_correlations.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "exterior_correlations.csv")
     a = found.result.adjustment
     assert len(rows) == 5 * 8 and {row["camera"] for row in rows} == {"synthetic"}
     assert [row["image"] for row in rows[:8]] == list(a.network.images)

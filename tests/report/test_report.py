@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Iterator
@@ -57,6 +56,7 @@ from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
+from tests.tables import rows_of
 from tests.written import WRITTEN
 
 EVIL = "<script>alert('x')</script>&\"é€"
@@ -106,11 +106,6 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
         remarks=(remark("scale_bars_missing", bars=["1 - 2"]),),
         seconds=(StageTime("targets", 1.25),),
     )
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_small_probabilities_are_written_as_such() -> None:
@@ -464,6 +459,7 @@ def test_fixed_coordinates_have_neither_unknown_precision_nor_residuals() -> Non
     found = findings_of(SurveyResult("fixed", "mm", 4, (), a, np.arange(12), None))
     page = html_of(found)
     assert np.isnan(found.precision.rms).all() and "standard deviation [" not in page
+    assert "held fixed" in text_report(found) and "not known" not in page
     assert ">rX</th>" not in page and page.count(">sX [") == 2  # of points and photographs
     assert "None of the" in page and " 0 of " not in page
 

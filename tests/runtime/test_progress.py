@@ -1,14 +1,19 @@
-"""Progress: stages with what they do, how much of it is done, and what is left where that is known."""
+"""Progress: stages, how much is done and left; memory that threads freed; a second thread."""
 
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 import time
 from pathlib import Path
+from threading import get_ident
 
 import pytest
 from rich.console import Console
+from threadpoolctl import threadpool_info
 
+from sfm.kernels.threads import at_once, own_threads
 from sfm.pipeline import run_survey
 from sfm.runtime.progress import Silent, StageClock, report_step, reported
 from sfm.runtime.progress_bar import drawn_progress
@@ -87,3 +92,59 @@ def test_every_stage_of_a_survey_reports_what_it_does(tmp_path: Path) -> None:
     assert oriented[-1] == (PHOTOGRAPHS, PHOTOGRAPHS)
     for _, name, done, total in watching.steps:
         assert name and (total is None or 0 <= (done or 0) <= total)
+
+
+THREADS, ARRAYS, MB = 6, 8, 8
+IN_TURN = f"""
+from pathlib import Path
+from threading import Event, Thread
+import numpy as np
+from sfm.runtime.progress import keep_freed_memory
+from sfm.runtime.progress import SILENT, StageClock
+StageClock(SILENT)
+keep_freed_memory()
+def taken_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) / 256
+done, taken = Event(), [taken_mb()]
+def work(ready):
+    arrays = [np.ones({MB} << 17) for _ in range({ARRAYS})]
+    taken.append(taken_mb())
+    del arrays
+    ready.set()
+    done.wait()
+for _ in range({THREADS}):
+    ready = Event()
+    Thread(target=work, args=[ready]).start()
+    ready.wait()
+done.set()
+print(max(taken) - taken[0])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_threads_take_what_others_have_freed() -> None:
+    """One after another they need no more than one; each in memory of its own they take 400 MB."""
+    done = subprocess.run([sys.executable, "-c", IN_TURN], capture_output=True, text=True, check=True)
+    assert ARRAYS * MB / 2 < float(done.stdout) < 2 * ARRAYS * MB
+
+
+def _blas() -> list[int]:
+    return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+
+def test_a_second_thread_is_at_hand_where_there_are_two() -> None:
+    before = _blas()
+    with own_threads(2):
+        outer = at_once(get_ident, get_ident)
+        with own_threads():  # of an adjustment, whose pools have one thread here
+            assert set(_blas()) == {1}
+            inner = at_once(get_ident, get_ident)
+        after = at_once(get_ident, get_ident)
+    assert outer == inner == after and outer[0] == get_ident() != outer[1]
+    assert _blas() == before
+
+
+def test_one_thread_alone() -> None:
+    with own_threads(1), own_threads():
+        assert at_once(get_ident, get_ident) == (get_ident(), get_ident())
+    assert at_once(get_ident, get_ident) == (get_ident(), get_ident())

@@ -234,6 +234,11 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
         assert (
             f"{found.w[e, k]:+.2f}" in shown and "Observed exterior orientation: projection centres" in shown
         )
+    (component,) = (row for row in text.splitlines() if row.split()[:2] == ["exterior", "orientation"])
+    assert float(component.split()[3]) == pytest.approx(float(np.nansum(found.r)), abs=0.06)
+    again = read_observed_exterior(tmp_path / "out" / "images.csv")
+    np.testing.assert_array_equal(again.value[:, :3], result.adjustment.estimate.position)
+    assert np.isfinite(again.sigma).all()
 
 
 def said_of_right_points(path: Path, truth: Estimate) -> Remark:
@@ -266,20 +271,6 @@ def test_exchanged_projection_centres_are_exchanged_again(tmp_path: Path) -> Non
     said = said_of_right_points(path, truth)
     assert (said.kind, said.names("of")) == ("given_renamed", ("centres",))
     assert sorted(said.names("given")) == sorted([cells[1][0], cells[4][0]])
-
-
-def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> None:
-    path, _ = written(tmp_path, "redundancy")
-    result = solved(path)
-    given = given_of(result.adjustment, result.length_unit)
-    both = given.of("projection centre"), given.of("rotation")
-    assert both[0] is not None
-    path_of = (
-        row
-        for row in text_report(findings_of(result)).splitlines()
-        if row.split()[:2] == ["exterior", "orientation"]
-    )
-    assert float(next(path_of).split()[3]) == pytest.approx(float(np.nansum(both[0].r)), abs=0.06)
 
 
 @pytest.mark.parametrize(
@@ -342,12 +333,3 @@ def test_photographs_are_placed_by_their_observed_stations(tmp_path: Path) -> No
     )
     with pytest.raises(SurveyFileError, match=r"line 4: column image: .photo 9.png. is no photograph"):
         run_survey(read_survey(path))
-
-
-def test_images_of_a_result_are_welcome(tmp_path: Path) -> None:
-    path, _ = written(tmp_path / "survey", "welcome")
-    result = solved(path)
-    write_result(findings_of(result), tmp_path / "out")
-    table = read_observed_exterior(tmp_path / "out" / "images.csv")
-    np.testing.assert_array_equal(table.value[:, :3], result.adjustment.estimate.position)
-    assert np.isfinite(table.sigma).all()

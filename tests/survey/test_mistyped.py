@@ -54,6 +54,16 @@ OF_STUDY = {  # each beside a quick one of the same kind
     "two names of a box",
     "four of eight control, X and Y",
     "fixed control turned by a row",
+    "two names of a pyramid",
+    "left and right names of a box",
+    "y upwards, eight control",
+    "control, X and Y exchanged",
+    "centres, X and Y exchanged",
+    "three names of eight turned",
+    "control shifted by a row",
+    "control turned by a row",
+    "four of ten control",
+    "twenty points too precise, bars",
 }
 
 

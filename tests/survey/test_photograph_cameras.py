@@ -1,25 +1,36 @@
-"""Photographs that do not fit: zoomed ones get per-photograph cameras, strange ones are left out."""
+"""Photographs that do not fit: zoomed and strange ones; central perspective or fisheye."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import project, tangents_from_pixel
+from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.survey_remarks import findings_of
+from sfm.similarity import fit_similarity
 from sfm.survey.correspondences import restore_strayed
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
+from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import AdjustSettings
+from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.orientation import FISHEYE, orient_with_models
 from tests.survey.faults import planted
+from tests.survey.texture_scenes import Plane, upright, wall
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
@@ -41,7 +52,7 @@ def with_zoom(name: str, factors: dict[int, float], *, images: int = 10) -> tupl
     return replace(network, image_points=replace(seen, xy=xy)), truth
 
 
-@pytest.mark.parametrize("factor", [pytest.param(0.95, marks=pytest.mark.slow), 0.98, 1.1])
+@pytest.mark.parametrize("factor", [0.98, *(pytest.param(k, marks=pytest.mark.slow) for k in (0.95, 1.1))])
 def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     network, truth = with_zoom(f"zoomed {factor}", {7: factor})
     result = run_survey(survey_of(network, truth, adjust=TAU))
@@ -141,3 +152,134 @@ def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:
         assert np.array_equal(kept.position[2], truth.position[2])
         assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
         assert kept.oriented.all()
+
+
+SIZE_PX = (640, 480)
+SURVEY = """
+[survey]
+name = "room"
+unit = "m"
+[[camera]]
+name = "lens"
+images = "*.png"
+size_px = [640, 480]
+pixel_mm = [0.01, 0.01]
+c_mm = 7.68
+{model}
+[tie_points]
+[compare]
+backend = "none"
+"""
+
+
+def lens(model: str, f: float, k1: float, k2: float) -> Camera:
+    """Return a camera whose principal point is 3 px beside the middle."""
+    more = (0.0, 0.0)
+    p = np.array([f, f, 322.5, 237.5, k1, k2, *more])
+    return Camera("lens", model, SIZE_PX, np.full(2, 0.01), p)
+
+
+def stations(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return where photographs of the end of a room are taken, every third turned by 90 degrees."""
+    position = np.column_stack(
+        [np.linspace(-1.2, 1.2, count), rng.uniform(-0.5, 0.8, count), rng.uniform(0.2, 1.2, count)]
+    )
+    directions = np.column_stack(
+        [rng.uniform(-0.3, 0.3, count) - 0.3 * position[:, 0], rng.uniform(-0.2, 0.2, count), -np.ones(count)]
+    )
+    rolls = [np.pi / 2 * (i % 3 == 2) for i in range(count)]
+    return position, np.array([upright(d, roll) for d, roll in zip(directions, rolls, strict=True)])
+
+
+def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Measurements, Orientation]:
+    """Return the orientation of six photographs of points on the walls of a room, 0.1 px of noise."""
+    (folder / "survey.toml").write_text(SURVEY.format(model=model), encoding="utf-8")
+    survey, rng = read_survey(folder / "survey.toml"), seed_of("room")
+    on = rng.integers(0, 3, 150)
+    xyz = rng.uniform([-4.0, -1.5, -3.0], [4.0, 3.5, 1.0], (150, 3))
+    xyz[on == 0, 2] = -3.0
+    xyz[on == 1, 0] = np.where(rng.random(150) < 0.5, -4.0, 4.0)[on == 1]
+    xyz[on == 2, 1] = np.where(rng.random(150) < 0.5, -1.5, 3.5)[on == 2]
+    position, rotation = stations(rng, 6)
+    xy = np.stack([project(camera, *one, xyz) for one in zip(position, rotation, strict=True)])
+    xy += rng.normal(0, 0.1, xy.shape)
+    image, point = np.nonzero((np.isfinite(xy) & (xy > 0) & (xy < np.array(SIZE_PX) - 1)).all(axis=2))
+    seen = ImagePoints(image, point, xy[image, point], np.tile(0.01 * np.eye(2), (len(image), 1, 1)))
+    names = tuple(f"{i}.png" for i in range(6))
+    network = Network(names, np.zeros(6, dtype=np.int64), tuple(map(str, range(150))), seen)
+    cameras = start_cameras(survey.cameras, "room")
+    return orient_with_models(survey, Measurements(network, cameras, names, np.full(150, 3)))
+
+
+@pytest.mark.parametrize(
+    ("model", "f", "k1", "k2"),
+    [
+        (FISHEYE, 200.0, -0.03, 0.01),  # the corner is beyond 90 degrees
+        pytest.param(FISHEYE, 230.0, 0.02, -0.005, marks=pytest.mark.slow),
+        pytest.param(FISHEYE, 360.0, 0.02, -0.005, marks=pytest.mark.slow),  # 62 degrees
+        ("opencv", 240.0, -0.05, 0.01),  # a central perspective of 59 degrees
+        pytest.param("opencv", 336.0, -0.1, 0.03, marks=pytest.mark.slow),
+    ],
+)
+def test_the_image_points_tell_a_fisheye_from_a_wide_lens(
+    tmp_path: Path, model: str, f: float, k1: float, k2: float
+) -> None:
+    survey, measured, found = oriented(tmp_path, lens(model, f, k1, k2))
+    taken = FISHEYE if model == FISHEYE else "brown"
+    assert survey.cameras[0].model == measured.cameras[0].model == found.estimate.cameras[0].model == taken
+    assert found.estimate.oriented.all() and found.estimate.cameras[0].c_px == pytest.approx(f, rel=0.01)
+    assert len(of_kind(found.remarks, "fisheye_taken")) == (model == FISHEYE)
+
+
+@pytest.mark.parametrize("model", ['model = "brown"', pytest.param('free = ["c"]', marks=pytest.mark.slow)])
+def test_a_model_that_the_survey_states_stays(tmp_path: Path, model: str) -> None:
+    survey, _, found = oriented(tmp_path, lens(FISHEYE, 230.0, 0.02, -0.005), model)
+    assert survey.cameras[0].model == found.estimate.cameras[0].model == "brown"
+
+
+def photograph(planes: list[Plane], camera: Camera, X0: FloatArray, R: FloatArray) -> FloatArray:
+    """Return what a camera of any model sees of textured planes, the nearest first."""
+    w, h = SIZE_PX
+    y, x = np.mgrid[0 : 2 * h, 0 : 2 * w] / 2 - 0.25
+    uv = tangents_from_pixel(camera, np.column_stack([x.ravel(), y.ravel()]))
+    d = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
+    nearest, grey = np.full(len(d), np.inf), np.full(len(d), 30.0)
+    for one in planes:
+        normal = np.cross(one.right, one.up)
+        with np.errstate(all="ignore"):
+            t = ((one.corner - X0) @ normal) / (d @ normal)
+            X = X0 + t[:, None] * d - one.corner
+            right, up = (X @ side / (side @ side) for side in (one.right, one.up))
+            on = (t > 0) & (t < nearest) & (right > 0) & (right < 1) & (up > 0) & (up < 1)
+        tall, wide = one.texture.shape
+        column, row = (
+            np.where(on, part, 0.0).astype(np.float32).reshape(2 * h, 2 * w)
+            for part in (right * wide - 0.5, (1 - up) * tall - 0.5)
+        )
+        smooth = cv2.GaussianBlur(np.asarray(one.texture, dtype=np.float32), (0, 0), 0.8)
+        value = cv2.remap(smooth, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        grey[on], nearest[on] = value.ravel()[on], t[on]
+    return np.asarray(cv2.resize(grey.reshape(2 * h, 2 * w), SIZE_PX, interpolation=cv2.INTER_AREA))
+
+
+@pytest.mark.slow
+def test_a_folder_of_fisheye_photographs_without_exif_data_needs_nothing_more(tmp_path: Path) -> None:
+    """With Brown's model the centres of such photographs in a room of 8 m were 6 cm wrong (RMS)."""
+    rng, camera = seed_of("fisheye"), lens(FISHEYE, 230.0, 0.02, -0.005)
+    across, up, along = np.array([8.0, 0, 0]), np.array([0, 5.0, 0]), np.array([0, 0, 8.0])
+    planes = [
+        wall(rng, np.array([0.0, 1.0, -3.0]), across, up),
+        *(wall(rng, np.array([x, 1.0, 1.0]), along, up) for x in (-4.0, 4.0)),
+        *(wall(rng, np.array([0.0, y, 1.0]), across, along) for y in (-1.5, 3.5)),
+    ]
+    position, rotation = stations(rng, 6)
+    for i in range(6):
+        grey = photograph(planes, camera, position[i], rotation[i]) + rng.normal(0, 1.5, SIZE_PX[::-1])
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+    (tmp_path / "survey.toml").write_text(draft_survey(tmp_path).text, encoding="utf-8")
+    a = run_survey(read_survey(tmp_path / "survey.toml")).adjustment
+    (found,) = a.estimate.cameras
+    assert found.model == FISHEYE and len(a.network.images) == 6 and len(a.network.points) > 1000
+    assert found.parameters[:4] == pytest.approx(camera.parameters[:4], abs=0.2)
+    placed = fit_similarity(a.estimate.position, position)
+    assert np.linalg.norm(placed.apply(a.estimate.position) - position, axis=1).max() < 1e-3

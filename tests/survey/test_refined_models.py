@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -31,6 +30,7 @@ from sfm.survey.refining import windows as model_photographs
 from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
 from sfm.survey.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family
+from tests.tables import rows_of
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -227,12 +227,10 @@ def test_what_is_not_measured_stays_as_it_is(
         assert after.point3D(AWAY + 2 * j).track.length() == 2
         assert (_key_points(after, AWAY)[j + 1] == _key_points(before, AWAY)[j + 1]).all()
         assert 0 < np.linalg.norm(after.point3D(AWAY + 2 * j).xyz - truth.points[j]) < 0.05
-    with (out / "sigma_points.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out / "sigma_points.csv")
     assert {int(row["point3D_id"]) for row in rows} <= set(after.point3D_ids()) and len(rows) > 40
     assert all(0 < float(row["sZ"]) < 0.01 for row in rows)
-    with (out / "sigma_cameras.csv").open(encoding="utf-8") as file:
-        interior = list(csv.DictReader(file))
+    interior = rows_of(out / "sigma_cameras.csv")
     assert interior[0]["model"] == camera and float(interior[0]["sigma"]) > 0
     assert float(interior[0]["after"]) == pytest.approx(params[0], rel=1e-9)
     page = (out / "refinement.html").read_text(encoding="utf-8")
@@ -269,8 +267,7 @@ def test_a_rig_comes_out_with_its_rig(tmp_path: Path, capfd: pytest.CaptureFixtu
     refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx")
     assert "adjustment.cc" not in capfd.readouterr().err  # COLMAP's log
     after = pycolmap.Reconstruction(str(tmp_path / "out"))
-    with (tmp_path / "out" / "sigma_cameras.csv").open(encoding="utf-8") as file:
-        told = {(int(r["camera_id"]), r["parameter"]): r for r in csv.DictReader(file)}
+    told = {(int(r["camera_id"]), r["parameter"]): r for r in rows_of(tmp_path / "out" / "sigma_cameras.csv")}
     for number in (7, 9):  # of two photographs: cy is held anyway
         params, was = after.camera(number).params, before.camera(number).params
         assert (params == was).all() and told[number, "fx"]["sigma"] == ""
@@ -500,8 +497,7 @@ def _survey(folder: Path, text: str) -> Path:
 
 def _targets_of(out: Path) -> tuple[FloatArray, FloatArray]:
     """Return the coordinates of the targets and their standard deviations, in order of their codes."""
-    with (out / "targets.csv").open(encoding="utf-8") as file:
-        rows = {int(r["target"]): r for r in csv.DictReader(file)}
+    rows = {int(r["target"]): r for r in rows_of(out / "targets.csv")}
     found = [[float(rows[k][c]) for c in ("X", "Y", "Z", "sX", "sY", "sZ")] for k in TARGETS]
     return np.array(found)[:, :3], np.array(found)[:, 3:]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from sfm.cli.commands.solvers import refine
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.network import Estimate, ImagePoints, Network
 from tests.synthetic import seed_of
+from tests.tables import rows_of
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -128,8 +128,7 @@ def _room(folder: Path, lens: Camera) -> None:
 
 
 def _of_cameras(out: Path, column: str) -> FloatArray:
-    with (out / "sigma_cameras.csv").open(encoding="utf-8") as file:
-        return np.array([float(row[column] or "nan") for row in csv.DictReader(file)])
+    return np.array([float(row[column] or "nan") for row in rows_of(out / "sigma_cameras.csv")])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Codes that contradict one another: photographs of a second object are left out, single codes are told."""
+"""Codes and tie points of a second object: photographs of it are left out, its motion is reported."""
 
 from __future__ import annotations
 
@@ -11,27 +11,55 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values
-from sfm.network import ImagePoints, empty_estimate
-from sfm.orientation.incremental.sequence import orient
+from sfm.camera import camera_from_values, project
+from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.orientation.incremental.sequence import Orientation, orient
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import Optics
+from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
-from sfm.survey.diagnosis.lost_photographs import find_second_objects
+from sfm.survey.diagnosis.lost_photographs import MOTION_POINTS, find_second_motion, find_second_objects
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import refine
+from sfm.targets.codes.plates import code_family
+from sfm.targets.codes.rings import CodeFamily
 from tests.survey.test_photograph_cameras import with_zoom
-from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations, survey_of
 from tests.synthetic import SIZE_PX as OF_NETWORK
 from tests.synthetic import make_network, seed_of
+
+# Places on a plate and on one above it, mm: (face, x, y).
+PLACES = [(0, x, y) for x in (-165.0, -110.0, 110.0, 165.0) for y in (-115.0, -40.0, 40.0, 115.0)]
+PLACES += [(0, x, y) for x in (-40.0, 40.0) for y in (-120.0, 120.0)]
+PLACES += [(1, x, y) for x in (-35.0, 35.0) for y in (-25.0, 25.0)]
+FIRST_CODE = 10
+
+
+def two_plates(place: dict[int, int]) -> Scene:
+    """Return a plate and a smaller one above it, with codes at places of these numbers."""
+    family = code_family("ring14")
+    assert isinstance(family, CodeFamily)
+    faces = Faces(
+        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]]),
+        np.tile(np.eye(3)[:2], (2, 1, 1)),
+        np.array([[210.0, 160.0], [60.0, 50.0]]),
+        np.array([0.8, 0.85]),
+        np.zeros(2),
+        np.ones(2),
+    )
+    marks = []
+    for code, k in place.items():
+        face, x, y = PLACES[k]
+        marks.append(coded_ring(face, np.array([x, y]), 7.0, code, family, 0.08, turn=0.3 * code))
+    none = CircularTargets(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+    return Scene(faces, join_marks(marks), none)
+
 
 SHEET = 16
 LEFT_FREE = FIRST_CODE + 3  # its place is free for a code that moves
@@ -196,3 +224,70 @@ def test_control_names_photographs_that_are_all_mirrored(datum: str) -> None:
     result = run_survey(survey)
     assert "given_mirrored" in kinds_of(result.remarks)
     assert findings_of(result).verdict.level == "bad"
+
+
+IMAGES, POINTS, NOISE_PX = 8, 200, 0.1
+
+
+def walked(count: int, *, by_chance: bool = False) -> tuple[Network, Estimate]:
+    """Return a network of which the last points walk on together from photograph to photograph, and the rest.
+
+    Args:
+        count: of these points.
+        by_chance: whether each has errors of its own instead.
+    """
+    rng = seed_of("second motion")
+    network, truth = make_network(rng, images=IMAGES, points=POINTS, free=(), noise_px=NOISE_PX)
+    seen, xy = network.image_points, network.image_points.xy.copy()
+    for i in range(IMAGES):
+        rows = np.flatnonzero((seen.image == i) & (seen.point >= POINTS - count))
+        moved = truth.points + 0.03 * i * np.array([1.0, 0.5, 0.2])
+        at = project(truth.cameras[0], truth.position[i], truth.rotation[i], moved[seen.point[rows]])
+        xy[rows] = at + NOISE_PX * rng.standard_normal(at.shape)
+        if by_chance:
+            xy[rows] = seen.xy[rows] + rng.uniform(-60, 60, at.shape)
+    return replace(network, image_points=replace(seen, xy=xy)), truth
+
+
+def oriented(network: Network, truth: Estimate) -> Orientation:
+    return orient(network, empty_estimate(network, truth.cameras), refine=refine)
+
+
+def orient_again(network: Network, start: Estimate) -> Orientation:
+    return orient(network, start, refine=refine)
+
+
+@pytest.mark.parametrize("count", [60, MOTION_POINTS + 5])
+def test_points_that_walk_on_together_are_reported_with_their_share(count: int) -> None:
+    network, truth = walked(count)
+    (found,) = find_second_motion(network, oriented(network, truth), orient_again)
+    assert found.kind == "second_motion" and found.severity == "error"
+    assert found.number("share") == pytest.approx(count / POINTS, abs=0.02)
+    assert found.number("points") == pytest.approx(count, abs=4) and len(found.names("photographs")) == IMAGES
+
+
+def test_errors_by_chance_are_no_motion() -> None:
+    network, truth = walked(60, by_chance=True)
+    found = oriented(network, truth)
+    assert found.estimate.oriented.all()
+    assert find_second_motion(network, found, orient_again) == ()
+
+
+@pytest.mark.parametrize("count", [0, MOTION_POINTS - 2])
+def test_few_points_are_not_even_tried(count: int) -> None:
+    network, truth = walked(count)
+
+    def refuse(_: Network, __: Estimate) -> Orientation:
+        raise AssertionError("tried")
+
+    assert find_second_motion(network, oriented(network, truth), refuse) == ()
+
+
+def test_photographs_without_orientation_have_their_own_reason() -> None:
+    """Their points are not those of another motion, as where they show another object."""
+    network, truth = walked(60)
+    found = oriented(network, truth)
+    position = found.estimate.position.copy()
+    position[2:] = np.nan
+    found = replace(found, estimate=replace(found.estimate, position=position))
+    assert find_second_motion(network, found, orient_again) == ()

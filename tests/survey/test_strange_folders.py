@@ -38,6 +38,7 @@ from sfm.report.output import SurveyLog, folder_name, read_log
 from sfm.solution import Solution
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore
 from sfm.targets.detect import Targets, find_targets
+from tests import commands
 from tests.engines import ALONE, HERE, Notes
 from tests.places import ROOT
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
@@ -67,16 +68,12 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr("sys.argv", ["kolinear", *map(str, arguments)])
+def kolinear(*arguments: object) -> int:
     if arguments[0] == "render":
-        monkeypatch.setattr("sys.argv", ["render", *map(str, arguments[1:])])
-        return sfm.rendering.render.main()
-    try:
-        sfm.cli.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sys.argv", list(map(str, arguments)))
+            return sfm.rendering.render.main()
+    return commands.kolinear(*arguments)
 
 
 def observed(folder: Path) -> Path:
@@ -222,7 +219,7 @@ def test_settings_of_libraries_in_the_current_folder_are_refused(
     arguments = COMMANDS[command][0](tmp_path)
     (tmp_path / name).symlink_to("nowhere")
     before = sorted(tmp_path.rglob("*"))
-    assert kolinear(monkeypatch, *arguments) == 2
+    assert kolinear(*arguments) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and f"contains '{name}', by which it would decide" in told
     assert sorted(tmp_path.rglob("*")) == before
@@ -252,7 +249,7 @@ def test_no_drafted_survey_is_read_or_written_through_a_link(
     (tmp_path / place).parent.mkdir(parents=True)
     (tmp_path / place).symlink_to(home if place == "new/out" else write_observed_survey(home / "x", "x"))
     before = content(home)
-    assert kolinear(monkeypatch, *arguments) == 2
+    assert kolinear(*arguments) == 2
     assert "is a link to" in capsys.readouterr().err and content(home) == before
 
 
@@ -266,13 +263,13 @@ def test_a_link_to_a_result_or_its_pictures_leads_no_page_out_of_the_folder(
     given = tmp_path / "given"
     given.mkdir()
     (given / "model").symlink_to(result)
-    assert kolinear(monkeypatch, "view", given / "model", "--no-open") == 0
+    assert kolinear("view", given / "model", "--no-open") == 0
     assert content(home) == before and (given / "model.html").is_file()
     seen: list[Path] = []
     monkeypatch.setattr("sfm.report.view_page.photographs_in", lambda folder, _: seen.append(folder) or {})
     shutil.copytree(result, given / "other")
     (given / "other" / "pictures").symlink_to(home)
-    assert kolinear(monkeypatch, "view", given / "other", "--no-open") == 0
+    assert kolinear("view", given / "other", "--no-open") == 0
     assert seen == []
     capsys.readouterr()
 
@@ -291,7 +288,7 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
 
     monkeypatch.setattr("sfm.survey.drafting.draft.read_metadata", metadata)
     monkeypatch.setattr("sfm.api.sensor_widths", lambda *_: lambda *_: 36.0)
-    assert kolinear(monkeypatch, "init", given) == 0
+    assert kolinear("init", given) == 0
     told = capsys.readouterr()
     assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err
     text = (given / "survey.toml").read_text(encoding="utf-8")
@@ -300,9 +297,7 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has another path of libraries")
 @pytest.mark.parametrize("given", [None, "", "/a::/b:"])
-def test_no_process_looks_for_libraries_in_the_current_folder(
-    given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_process_looks_for_libraries_in_the_current_folder(given: str | None, tmp_path: Path) -> None:
     """What cv2 does to the path when it is imported would add it."""
     script = (
         "import os, sfm.cli.app; from sfm.cli import main\n"
@@ -370,7 +365,7 @@ def test_no_command_writes_through_a_link(
     link.symlink_to(home / "absent" if dangling else home / ".profile" if is_file else home / "below")
     before, names = content(home), sorted(home.rglob("*"))
     of_one_survey = place == "out/batch/s"  # which fails, the batch goes on
-    assert kolinear(monkeypatch, *arguments) == (1 if of_one_survey else 2)
+    assert kolinear(*arguments) == (1 if of_one_survey else 2)
     told = capsys.readouterr()
     said = told.out if of_one_survey else told.err
     refused = ("is a link to", "is there already", "already is a file", "exists a")
@@ -420,7 +415,7 @@ def test_no_command_writes_over_files_of_the_user(
     mine = folder / place / "mine.txt" if kind == "folder" else folder / place
     mine.parent.mkdir(parents=True, exist_ok=True)
     mine.write_text(OWN)
-    number = kolinear(monkeypatch, *arguments)
+    number = kolinear(*arguments)
     assert mine.read_text() == OWN
     told = capsys.readouterr()
     of_one_survey = place == "out/batch/s"  # which fails, the batch goes on
@@ -435,27 +430,27 @@ def test_no_command_writes_over_files_of_the_user(
 
 @pytest.mark.parametrize("form", [form.name for form in FORMATS])
 def test_no_format_is_written_over_a_file_of_the_user(
-    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given, mine = model(tmp_path), tmp_path / "mine.txt"
     mine.write_text(OWN)
     for target in (mine, given):
-        assert kolinear(monkeypatch, "convert", given, target, "--to", form) == 2
+        assert kolinear("convert", given, target, "--to", form) == 2
         assert f"{target}: already exists and is left alone" in capsys.readouterr().err
     assert mine.read_text() == OWN
 
 
 def test_photographs_that_were_rendered_are_replaced_and_no_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "survey.toml").write_text(OWN)
     for _ in range(2):
-        assert kolinear(monkeypatch, "render", scene(tmp_path), out) == 0
+        assert kolinear("render", scene(tmp_path), out) == 0
     before = content(out)
     (out / "p1.jpg").write_text(OWN)
-    assert kolinear(monkeypatch, "render", scene(tmp_path), out) == 2
+    assert kolinear("render", scene(tmp_path), out) == 2
     assert "contains 'p1.jpg', changed since Kolinear wrote it; " in capsys.readouterr().err
     assert content(out) == {**before, "p1.jpg": OWN.encode()}
     assert (out / "survey.toml").read_text() == OWN
@@ -527,7 +522,7 @@ def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
         patch.setattr("sfm.report.output.draw_plots", lambda _: [])
-        assert kolinear(patch, "adjust", survey, "--out", folder / "out") == 0
+        assert kolinear("adjust", survey, "--out", folder / "out") == 0
     return folder
 
 
@@ -551,12 +546,7 @@ def result(adjusted: Path, tmp_path: Path) -> tuple[Path, Path]:
     ],
 )
 def test_files_of_the_user_in_a_result_are_kept_and_named(
-    name: str,
-    told: str,
-    result: tuple[Path, Path],
-    home: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, told: str, result: tuple[Path, Path], home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     survey, out = result
     capsys.readouterr()
@@ -567,26 +557,26 @@ def test_files_of_the_user_in_a_result_are_kept_and_named(
     else:
         path.write_text(OWN)
     before = content(out)
-    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 2
+    assert kolinear("adjust", survey, "--out", out) == 2
     err = capsys.readouterr().err
     assert told in err and err.count("\n") == 1, err
     assert content(out) == before
 
 
 def test_an_unchanged_result_is_replaced_though_a_system_has_left_its_files(
-    result: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    result: tuple[Path, Path],
 ) -> None:
     survey, out = result
     manifest = json.loads((out / "manifest.json").read_text())["files"]
     assert manifest.keys() == content(out).keys() - {"manifest.json"}
     (out / "plots" / ".DS_Store").touch()
     (out / "points.ply").unlink()
-    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 0
+    assert kolinear("adjust", survey, "--out", out) == 0
     assert (out / "points.ply").is_file()
 
 
 def test_a_result_folder_of_a_stranger_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It has all names of a result, and a user's file has one of them."""
     survey, out = observed(tmp_path), tmp_path / "out"
@@ -594,7 +584,7 @@ def test_a_result_folder_of_a_stranger_is_left_alone(
     summary = {"survey": "s", "images": {}, "points": {}, "observations": {}}
     (out / "summary.json").write_text(json.dumps(summary))
     (out / "plots" / "holiday.png").write_text(OWN)
-    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 2
+    assert kolinear("adjust", survey, "--out", out) == 2
     assert "contains 'plots/holiday.png'; 'summary.json'; " in capsys.readouterr().err
     assert (out / "plots" / "holiday.png").read_text() == OWN
 
@@ -622,7 +612,7 @@ def test_targets_that_came_with_the_folder_are_not_believed(
     survey = write_photograph_survey(tmp_path / "given" / "s", "s")
     monkeypatch.chdir(tmp_path / "given")
     out = tmp_path / "given" / "out" / "s"
-    assert kolinear(monkeypatch, "run", survey) == 0
+    assert kolinear("run", survey) == 0
     true = (out / "points.csv").read_bytes()
     assert read_log(out / "log.jsonl")[-1]["stored_photographs"] == []
     kept = tmp_path / "given" / "out" / ".kolinear" / "targets"
@@ -634,9 +624,9 @@ def test_targets_that_came_with_the_folder_are_not_believed(
             arrays = {f.name: found[f.name] for f in fields(Targets)}
         arrays["xy"] = (arrays["xy"] - 300) * 1.02 + 300
         np.savez(entry, **arrays)
-    assert kolinear(monkeypatch, "run", survey) == 0
+    assert kolinear("run", survey) == 0
     assert (out / "points.csv").read_bytes() == true
-    assert kolinear(monkeypatch, "run", survey) == 0  # now from the user's own
+    assert kolinear("run", survey) == 0  # now from the user's own
     stored = read_log(out / "log.jsonl")[-1]["stored_photographs"]
     assert stored == [f"photo {k}.png" for k in range(1, 7)]
     assert (cache / "kolinear" / "measured").stat().st_mode & 0o777 == 0o700

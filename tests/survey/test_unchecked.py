@@ -47,12 +47,11 @@ def test_the_scale_of_one_bar_is_unchecked() -> None:
     assert _kinds(network, truth, scale_bars=(_bar(truth, 0, 9), _bar(truth, 1, 8))) == ("good", ())
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_only_given_points_in_space_check_the_handedness(mirrored: bool) -> None:
+def test_only_given_points_in_space_check_the_handedness() -> None:
     network, truth = _scene("handedness")
     seen, last = network.image_points, np.array(truth.cameras[0].size_px) - 1
-    xy = seen.xy * (1, -1) + (0, last[1]) if mirrored else seen.xy
-    network = replace(network, image_points=replace(seen, xy=xy))
+    turned_over = replace(seen, xy=seen.xy * (1, -1) + (0, last[1]))
+    mirrored = replace(network, image_points=turned_over)
     bars = (_bar(truth, 0, 9), _bar(truth, 1, 8))
     chosen = [0, 5, 9, 14, 20, 25]
     names = [network.points[j] for j in chosen]
@@ -62,13 +61,14 @@ def test_only_given_points_in_space_check_the_handedness(mirrored: bool) -> None
     centres = ObservedExterior.from_arrays(network.images, truth.position, 1e-4)
     # approximate values, and centres that are not used, place nothing
     for given in ({}, {"start": truth}, {"exterior": centres}, {"control": three}):
-        found = run_survey(survey_of(network, truth, scale_bars=bars, **given))
+        found = run_survey(survey_of(mirrored, truth, scale_bars=bars, **given))
         assert "handedness_unchecked" in kinds_of(found.remarks)
         assert findings_of(found).verdict.level == "good"
     for given in ({"control": space}, {"exterior": centres, "datum": {"kind": "control"}}):
-        judged = kinds_of(run_survey(survey_of(network, truth, **given)).remarks)
-        assert "handedness_unchecked" not in judged and ("given_mirrored" in judged) is mirrored
-    flat = run_survey(survey_of(network, truth, control=plane))
+        for one in (network, mirrored):
+            judged = kinds_of(run_survey(survey_of(one, truth, **given)).remarks)
+            assert "handedness_unchecked" not in judged and ("given_mirrored" in judged) is (one is mirrored)
+    flat = run_survey(survey_of(mirrored, truth, control=plane))
     assert "handedness_unchecked" in kinds_of(flat.remarks)
 
 
@@ -80,15 +80,6 @@ def test_control_of_which_one_point_is_doubtful_checks_the_handedness() -> None:
     control = KnownPoints.from_arrays(network.points[:8], xyz, 0.0)
     found = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})).remarks
     assert "given_contradicted" in kinds_of(found) and "handedness_unchecked" not in kinds_of(found)
-
-
-def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> None:
-    network, truth = _scene("worse bar")
-    worse = replace(_bar(truth, 1, 8), sigma=5e-4)
-    result = run_survey(survey_of(network, truth, scale_bars=(_bar(truth, 0, 9), worse)))
-    (said,) = remarks_on_given(result)
-    assert said.kind == "given_weakly_checked" and said.names("given") == ("1 - 10",)
-    assert said.number("sigmas") > 5
 
 
 @pytest.mark.parametrize(("ratio", "weak"), [(1.1, False), (1.6, True)])
@@ -266,7 +257,7 @@ def test_another_exposure_from_the_same_place_is_no_copy() -> None:
     assert same_photographs(image, point, xy, np.array([0, 0, 1])) == {}  # of another camera
 
 
-@pytest.mark.parametrize("reject", ["tau", "none"])
+@pytest.mark.parametrize("reject", ["tau", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_third_of_the_control_half_a_metre_off_is_named(reject: str) -> None:
     """10 of 30 control points stated to 1 mm: sigma0 was 500 times too large, and no line said which."""
     rng = seed_of("third of control")
@@ -283,11 +274,3 @@ def test_a_third_of_the_control_half_a_metre_off_is_named(reject: str) -> None:
     index = [network.point_index(name) for name in result.network.points]
     assert np.abs(result.estimate.points - truth.points[index]).max() < 5e-3
     assert findings_of(result).verdict.level == "fair"
-
-
-def test_good_control_fits_the_free_network() -> None:
-    network, truth = _scene("good control")
-    noisy = truth.points[:8] + 1e-3 * seed_of("good control noise").standard_normal((8, 3))
-    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], noisy, 1e-3)
-    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
-    assert kinds_of(remarks_on_given(result)) == ("scale_unchecked",)

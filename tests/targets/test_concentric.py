@@ -60,10 +60,10 @@ def drawn(name: str, count: int, radius: float, **options: float) -> list[Tag]:
         ("cctag3", 15.0, {"tilt_deg": 30.0}),
         ("cctag3", 40.0, {"tilt_deg": 60.0, "blur": 1.5, "noise": 5.0}),
         ("cctag4", 30.0, {"tilt_deg": 60.0}),
-        ("cctag3", 30.0, {"spread": 0.008}),
+        pytest.param("cctag3", 30.0, {"spread": 0.008}, marks=pytest.mark.slow),
         ("cctag4", 30.0, {"spread": -0.006, "slope": 0.5}),
         ("cctag3", 30.0, {"paper": 45.0, "ink": 200.0}),
-        ("cctag3", 30.0, {"paper": 275.0}),
+        pytest.param("cctag3", 30.0, {"paper": 275.0}, marks=pytest.mark.slow),
     ],
 )
 def test_ids_and_centres(name: str, radius: float, options: dict[str, float]) -> None:

@@ -59,7 +59,9 @@ def photographed(name: str, seed: int, longest: float = 23.0) -> tuple[AnyArray,
     return np.rint(picture).clip(0, 255).astype(np.uint8), number, corners
 
 
-@pytest.mark.parametrize("name", ["apriltag36h11", "aruco4x4_50", "aruco5x5_250"])
+@pytest.mark.parametrize(
+    "name", ["apriltag36h11", "aruco4x4_50", pytest.param("aruco5x5_250", marks=pytest.mark.slow)]
+)
 def test_as_many_as_opencv_are_found_and_measured_better(name: str) -> None:
     picture, number, corners = photographed(name, 3)
     detector = cv2.aruco.ArucoDetector(
@@ -177,8 +179,14 @@ LIGHTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("side", [15, 20, 30, 60])
-@pytest.mark.parametrize("name", ["apriltag36h11", "aruco4x4_1000"])
+@pytest.mark.parametrize(
+    ("name", "side"),
+    [
+        *(("apriltag36h11", 15), ("aruco4x4_1000", 20), ("apriltag36h11", 30), ("aruco4x4_1000", 60)),
+        *(pytest.param("aruco4x4_1000", side, marks=pytest.mark.slow) for side in (15, 30)),
+        *(pytest.param("apriltag36h11", side, marks=pytest.mark.slow) for side in (20, 60)),
+    ],
+)
 def test_tags_are_read_as_by_opencv_under_shadows_and_highlights(name: str, side: int) -> None:
     """Errors over stated standard deviations: 6 to 8 where small tags are fitted as if light were even.
 
@@ -242,7 +250,7 @@ def test_a_dark_plate_with_a_coded_ring_is_no_tag(side: int) -> None:
     assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) == 4
 
 
-@pytest.mark.parametrize("seed", [100, 103, 211, 229])
+@pytest.mark.parametrize("seed", [100, 211, *(pytest.param(k, marks=pytest.mark.slow) for k in (103, 229))])
 def test_letters_are_no_small_tags(seed: int) -> None:
     """Uneven light explains letters of 5 x 8 px (211, 229) as a tag whose modules are hardly resolved."""
     rng = np.random.default_rng(seed)

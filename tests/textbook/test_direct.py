@@ -1,12 +1,19 @@
-"""Direct orientation of photographs to control."""
+"""Direct orientation to control, and separate adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
 from sfm.errors import GeometryError
-from sfm.textbook.direct import orient_direct
-from tests.synthetic import make_network, seed_of
+from sfm.network import ObjectPoints, ScaleBars
+from sfm.textbook.direct import adjust_separately, orient_direct
+from tests.synthetic import make_network, perturb, seed_of
 
 
 def _two(noise_px=0.1):
@@ -69,3 +76,28 @@ def test_direct_orientation_refusals():
     with pytest.raises(GeometryError, match=f"point {ids[10]} is not control and not seen by two"):
         keep = np.isin(seen.point, ids) & only
         orient_direct(uv[keep], seen.image[keep], seen.point[keep], control)
+
+
+@pytest.mark.parametrize("free", [(), ("c", "x0", "y0", "K1")])
+@pytest.mark.parametrize("control", [False, True])
+def test_rounds_end_at_the_simultaneous_optimum(free: tuple[str, ...], control: bool) -> None:
+    rng = seed_of(f"separate {free} {control}")
+    network, truth = make_network(rng, images=6, points=20, free=free)
+    if control:
+        network = replace(network, control=ObjectPoints(np.arange(8), truth.points[:8], np.zeros((8, 3, 3))))
+    start = perturb(truth, rng, position=1e-3, angle_deg=0.1, points=1e-3)
+    both = adjust(network, start, datum=Datum("control" if control else "free"), reject="none")
+    turn = adjust_separately(network, start)
+    assert turn.rounds > 5 * both.iterations
+    assert turn.vPv == pytest.approx(both.vPv, rel=1e-6)
+    if control:
+        sigma = np.sqrt(np.diagonal(both.covariance.points, axis1=1, axis2=2))
+        error = np.abs(turn.estimate.points - both.estimate.points)
+        assert (error <= 0.1 * sigma + 1e-12).all()
+
+
+def test_scale_bars_are_refused() -> None:
+    network, truth = make_network(seed_of("bars"), images=4, points=10)
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-3]))
+    with pytest.raises(GeometryError, match="expected image points and fixed control only"):
+        adjust_separately(replace(network, scale_bars=bars), truth)

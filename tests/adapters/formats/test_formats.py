@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -42,6 +41,7 @@ from sfm.files.csv_tables import write_ply
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.places import SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of
+from tests.tables import rows_of
 
 
 def network_in(
@@ -567,8 +567,7 @@ def test_published_start_values_of_the_bridge_pier_in_its_own_format(tmp_path: P
         pytest.skip("figures of the source documents are not beside the repository")
 
     def rows(name: str) -> list[dict[str, str]]:
-        with (folder / name).open() as file:
-            return list(csv.DictReader(file))
+        return rows_of(folder / name)
 
     exterior = rows("flyover_exterior_orientation.csv")
     points = rows("flyover_object_points_m.csv")

@@ -1,4 +1,4 @@
-"""What a survey was given, read back from its result."""
+"""A converted network is a survey: its control, standard deviations and given values are read back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 from adapters.formats.content import Content
 from adapters.formats.given_table import read_given
-from adapters.formats.registry import read_content, write_content
+from adapters.formats.photomodeler import write_photomodeler
+from adapters.formats.registry import read_any, read_content, write_any, write_content
 from sfm.errors import SurveyFileError
 from sfm.files.result_tables import GIVEN
 from sfm.network import ImagePoints, Network
@@ -18,6 +19,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
@@ -101,3 +103,21 @@ def test_a_result_and_a_converted_one_have_the_same_given_values(tmp_path: Path)
     first, second = (GIVEN.read(folder) for folder in (tmp_path, tmp_path / "converted"))
     assert len(first.texts[0]) == 12 and first.texts == second.texts
     np.testing.assert_array_equal(first.values, second.values)
+
+
+def test_control_of_photomodeler_is_kept_and_the_survey_runs(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("kept control"), images=6, points=20, free=("c",))
+    camera = replace(truth.cameras[0], parameters=truth.cameras[0].parameters * 1.0)
+    names = camera.names
+    camera.parameters[[names.index("b1"), names.index("b2")]] = 0.0
+    truth = replace(truth, cameras=(camera,))
+    sigma = np.array([1e-3, 1e-3, 2e-3])
+    network = network.with_control(["1", "2", "3", "4"], truth.points[:4], sigma)
+    write_photomodeler(tmp_path / "project.txt", network, truth)
+    write_any(tmp_path / "tables", "tables", *read_any(tmp_path / "project.txt", "photomodeler"))
+    survey = read_survey(tmp_path / "tables" / "survey.toml")
+    assert survey.control is not None and survey.datum.kind == "control"
+    np.testing.assert_allclose(survey.control.sigma, np.tile(sigma, (4, 1)), rtol=1e-6)
+    np.testing.assert_allclose(survey.control.xyz, truth.points[:4], atol=1e-9)
+    a = run_survey(survey).adjustment
+    assert a.converged and len(a.network.control) == 4 and len(a.network.points) == 20

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
-import sys
 import tomllib
 from pathlib import Path
 
@@ -16,15 +14,16 @@ from PIL import ExifTags, Image, ImageFilter
 from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.mapper import sensor_width_mm
-from sfm import cli
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import manifest_text, sha256_of
 from sfm.report.output import Origin, read_origin, refuse_other_origin
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
 from sfm.targets.codes.plates import FAMILIES, PLATES
+from tests.commands import kolinear
 from tests.satellite import at, state_position
 from tests.surveys import write_photograph_survey
+from tests.tables import rows_of
 
 PHOTOS = """
 [survey]
@@ -40,19 +39,9 @@ kind = "free"
 """
 
 
-def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
-
-
 def sizes(result: Path) -> np.ndarray:
     """Distances between all coded points, in units of their mean: what a free network without scale has."""
-    with (result / "points.csv").open(newline="") as file:
-        rows = sorted((row["id"], *(float(row[a]) for a in "XYZ")) for row in csv.DictReader(file))
+    rows = sorted((row["id"], *(float(row[a]) for a in "XYZ")) for row in rows_of(result / "points.csv"))
     xyz = np.array([row[1:] for row in rows if row[0].isdigit()])
     distance = np.linalg.norm(xyz[:, None] - xyz, axis=-1)
     return distance / distance.mean()
@@ -90,7 +79,7 @@ def test_a_folder_becomes_a_result(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
+    assert kolinear("run", folder, "--out", "mine/first") == 0
     told = capsys.readouterr()
     assert (
         "broken.jpg: not a photograph" in told.err and "screenshot.png: the only one of 200 x 300" in told.err
@@ -107,7 +96,7 @@ def test_a_folder_becomes_a_result(
     assert all(name in listed or name.startswith(heads) for name in FAMILIES)
     survey.write_text(survey.read_text().replace('kind = "free"', 'kind = "minimal"'))
     capsys.readouterr()
-    assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
+    assert kolinear("run", folder, "--out", "mine/first") == 0
     told = capsys.readouterr()
     assert f"Running {Path('mine/first.toml')}, which is there already" in told.err
     assert "minimal" in told.out, "the file that a person changed is run as it is"
@@ -136,10 +125,10 @@ def test_a_result_of_another_survey_is_replaced_only_when_asked_for(
     file.write_text(PHOTOS, encoding="utf-8")
     monkeypatch.chdir(tmp_path / "all")
     for given in (("--images", tmp_path / "photos"), ("--images", images)):
-        assert kolinear(monkeypatch, "run", file, *given) == 2
+        assert kolinear("run", file, *given) == 2
         said = capsys.readouterr().err
         assert ("--overwrite" in said) == (given[1] != images), said
-        assert kolinear(monkeypatch, "run", file, *given, "--overwrite") == 2
+        assert kolinear("run", file, *given, "--overwrite") == 2
         assert "--overwrite" not in capsys.readouterr().err, "no photographs are there"
     (tmp_path / "all").rename(tmp_path / "moved")
     moved = tmp_path / "moved"
@@ -171,14 +160,14 @@ def test_init_writes_only_the_file_and_replaces_none(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert kolinear(monkeypatch, "init", folder, "--out", "draft.toml") == 0
+    assert kolinear("init", folder, "--out", "draft.toml") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["draft.toml"]
     described = read_survey_file(tmp_path / "draft.toml")
     assert described.name == 'plate "A"' and described.targets.codes == "ring14"
     assert described.cameras[0].images == ("photo *.png",)
     assert tomllib.loads((tmp_path / "draft.toml").read_text())["datum"] == {"kind": "free"}
     capsys.readouterr()
-    assert kolinear(monkeypatch, "init", folder, "--out", "draft.toml") == 2
+    assert kolinear("init", folder, "--out", "draft.toml") == 2
     assert "draft.toml" in capsys.readouterr().err
 
 
@@ -202,7 +191,7 @@ def test_folders_that_are_no_survey(
     for name in names:
         (photographs / name).write_bytes(b"nothing")
     monkeypatch.chdir(tmp_path)
-    assert kolinear(monkeypatch, "run", photographs) == 2
+    assert kolinear("run", photographs) == 2
     error = capsys.readouterr().err
     assert line in error and error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["photographs"], "nothing is left behind"

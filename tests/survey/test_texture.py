@@ -1,0 +1,199 @@
+"""Points of natural texture: windows that show another place, wrong ones, few, scenes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.hypotheses.hypotheses import JudgedAssumptions
+from sfm.camera import project
+from sfm.network import Estimate, Network
+from sfm.remarks.remark import of_kind, remark
+from sfm.similarity import fit_similarity
+from sfm.survey.adjusting import solution
+from sfm.survey.adjusting.solution import OF_CAMERAS, SolvedSurvey, solve_survey
+from sfm.survey.correspondences import Correspondences
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.survey import CameraSetup, Survey
+from tests.survey.texture_scenes import KINDS, NUMBERS, SHARE, WRONG, outcome_of, study, water, write_scene
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+SPOILED = (5, 40, 90)  # points
+NOISE_PX = 0.1
+POINTS = 60
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[Network, Estimate]:
+    """Return a network of which some points have errors of 2.5 sigma, too small for tests of single ones."""
+    rng = seed_of("wrong windows")
+    network, truth = make_network(rng, images=8, points=150, free=("c",), noise_px=NOISE_PX)
+    seen, xy = network.image_points, network.image_points.xy.copy()
+    wrong = np.isin(seen.point, SPOILED)
+    turn = rng.uniform(0.0, 2 * np.pi, wrong.sum())
+    xy[wrong] += 2.5 * NOISE_PX * np.column_stack([np.cos(turn), np.sin(turn)])
+    return replace(network, image_points=replace(seen, xy=xy)), truth
+
+
+def texture(network: Network, truth: Estimate, reject: str) -> Survey:
+    """Return a survey of texture that rejects gross errors, or does not."""
+    survey = survey_of(network, truth)
+    settings = survey.adjust.model_copy(update={"reject": reject})
+    return replace(survey, tie_points=TiePointSettings(), adjust=settings)
+
+
+def test_texture_loses_them_and_targets_are_named(noisy: tuple[Network, Estimate]) -> None:
+    network, truth = noisy
+    names = {network.points[j] for j in SPOILED}
+    survey, matched = texture(network, truth, "tau"), Correspondences(network, truth, np.full(150, 3))
+    of_targets = solve_survey(replace(survey, tie_points=None), matched)
+    assert set(of_targets.adjustment.network.points) == set(network.points)
+    textured = solve_survey(survey, matched)
+    assert set(network.points) - set(textured.adjustment.network.points) == names
+    assert {one.point for one in textured.left_out} == names
+
+
+def test_what_control_names_stays(noisy: tuple[Network, Estimate]) -> None:
+    network, truth = noisy
+    given = [*SPOILED[:1], 10, 60, 120]
+    network = network.with_control([network.points[j] for j in given], truth.points[given], 1.0)
+    found = solve_survey(texture(network, truth, "tau"), Correspondences(network, truth, np.full(150, 3)))
+    left = set(network.points) - set(found.adjustment.network.points)
+    assert left == {network.points[j] for j in SPOILED[1:]}
+
+
+def test_a_survey_that_rejects_nothing_loses_nothing(noisy: tuple[Network, Estimate]) -> None:
+    network, truth = noisy
+    found = solve_survey(texture(network, truth, "none"), Correspondences(network, truth, np.full(150, 3)))
+    assert set(found.adjustment.network.points) == set(network.points)
+
+
+def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a test of alternatives found it, or rejected image points that agree."""
+    network, truth = make_network(seed_of("elsewhere"), images=8, points=POINTS, free=("c",))
+    moved = [
+        remark("points_moved", points=[name], distance=0.1, shift=9.0, wrong=1.0, **{"from": "image 5"})
+        for name in ("7", "17")
+    ]
+    monkeypatch.setattr(
+        solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
+    )
+    monkeypatch.setattr(solution, "explain_rejections", lambda *_, **__: (moved[1],))
+    survey = survey_of(network, truth)
+    matched = Correspondences(network, truth, np.full(POINTS, 2))
+    assert of_kind(solve_survey(survey, matched).remarks, "points_moved") == tuple(moved)
+    textured = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).remarks
+    found = of_kind(textured, "windows_elsewhere")
+    assert [one.names("points") for one in found] == [("7",), ("17",)]
+    assert [one.severity for one in found] == ["warning", "warning"] and not of_kind(textured, "points_moved")
+
+
+@pytest.mark.parametrize(("left", "stays"), [(9, False), (30, True)])
+def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int, stays: bool) -> None:
+    network, truth = make_network(seed_of("few tie points"), images=10, points=60, free=("c",))
+    seen = network.image_points
+    last = np.flatnonzero(seen.image == 9)
+    keep = np.ones(len(seen), dtype=bool)
+    keep[last[left:]] = False
+    network = replace(network, image_points=seen.select(keep))
+    survey = survey_of(network, truth)
+    matched = Correspondences(network, truth, np.full(len(network.points), 3))
+    of_targets = solve_survey(survey, matched)
+    assert len(of_targets.adjustment.network.images) == 10
+    textured = replace(survey, tie_points=TiePointSettings())
+    found = solve_survey(textured, matched)
+    assert len(found.adjustment.network.images) == (10 if stays else 9)
+    told = [("image 10", remark("photograph_with_few_accepted", needed=15))]
+    assert list(found.dropped_images) == ([] if stays else told)
+
+
+def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
+    """All their rays are accepted, and one is of a photograph that is not in the result."""
+    network, truth = make_network(seed_of("leave with it"), images=10, points=60, free=("c",))
+    seen = network.image_points
+    few = seen.point < 9
+    keep = np.where(seen.image == 9, few, ~few | (seen.image < 2))
+    network = replace(network, image_points=seen.select(keep))
+    survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
+    found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
+    reasons = {(one.reason.kind, one.reason.number("needed")) for one in found.left_out}
+    assert reasons == {("point_of_lost_photographs", 3)}
+
+
+IMAGES, ZOOMED = 9, (3, 4, 7)
+
+
+def zoomed(change: float) -> tuple[Network, Estimate]:
+    """Return photographs of which some have another c, by so much, and start values."""
+    rng = seed_of("zoomed")
+    network, truth = make_network(rng, images=IMAGES, points=POINTS, planar=True, free=("c",))
+    seen, camera = network.image_points, truth.cameras[0]
+    other = camera.with_parameters(np.where(camera.parts[0], 1 + change, 1.0) * camera.parameters)
+    xy = seen.xy.copy()
+    for i in ZOOMED:
+        rows = np.flatnonzero(seen.image == i)
+        at = project(other, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+        xy[rows] = at + 0.1 * rng.standard_normal(at.shape)
+    kept = np.flatnonzero(((xy > 0) & (xy < camera.size_px)).all(axis=1))
+    return replace(network, image_points=replace(seen, xy=xy).select(kept)), truth
+
+
+def solved(change: float, *, textured: bool = True, **settings: object) -> tuple[SolvedSurvey, float]:
+    """Return the solution, and the error of its projection centres over their extent."""
+    network, truth = zoomed(change)
+    camera = truth.cameras[0]
+    setup = CameraSetup(
+        name="zoom", images="*", size_px=camera.size_px, pixel_mm=tuple(camera.pixel_mm.tolist()),
+        c_mm=camera.value("c"), **settings,
+    )  # fmt: skip
+    survey = Survey(name="s", cameras=(setup,), tie_points=TiePointSettings() if textured else None)
+    start = replace(truth, cameras=(replace(camera, name="zoom"),))
+    found = solve_survey(survey, Correspondences(network, start, np.full(POINTS, 3)))
+    centres = found.adjustment.estimate.position
+    away = fit_similarity(centres, truth.position).apply(centres) - truth.position
+    return found, float(np.sqrt((away**2).sum() / ((truth.position - truth.position.mean(0)) ** 2).sum()))
+
+
+def test_every_photograph_has_its_own_c_where_texture_shows_that_it_differs() -> None:
+    found, error = solved(0.04)
+    (one,) = of_kind(found.remarks, "c_per_photograph")
+    assert one.names("camera") == ("zoom",) and one.severity == "warning"
+    assert one.number("most") / one.number("least") == pytest.approx(1.04, abs=0.01)
+    assert len(found.adjustment.estimate.cameras) > IMAGES - 1
+    assert error < 0.005 and not of_kind(found.remarks, "other_camera", "camera_varies")
+
+
+@pytest.mark.parametrize(
+    ("change", "textured", "settings"),
+    [(0.0, True, {}), (0.04, False, {}), (0.04, True, {"free": ("c",)}), (0.04, True, {"free": ()})],
+)
+def test_c_is_one_where_it_is_or_where_the_survey_says_so(
+    change: float, textured: bool, settings: dict[str, object]
+) -> None:
+    found, _ = solved(change, textured=textured, **settings)
+    assert not of_kind(found.remarks, "c_per_photograph")
+
+
+def test_a_difference_of_c_that_focusing_makes_is_reported_alone() -> None:
+    found, _ = solved(0.015)
+    assert of_kind(found.remarks, *OF_CAMERAS) and not of_kind(found.remarks, "c_per_photograph")
+
+
+@pytest.mark.slow
+def test_moving_water_is_left_out_of_a_shore(tmp_path: Path) -> None:
+    rng = seed_of("water 0")
+    scene = water(rng)
+    write_scene(tmp_path, scene, rng)
+    found = outcome_of(tmp_path, scene)
+    assert found.oriented == len(scene.position) and found.level in ("good", "fair")
+    assert found.over_sigma < WRONG and found.share < SHARE
+    assert replace(found, over_sigma=2 * WRONG, share=2 * SHARE).is_wrong_and_believed
+
+
+@pytest.mark.slow
+def test_no_scene_is_wrong_and_believed() -> None:
+    assert not [one for one in study(0, NUMBERS, list(KINDS)) if one[2].is_wrong_and_believed]
