@@ -1,4 +1,4 @@
-"""Units of length by the factors between them."""
+"""Units of length by the factors between them, and the one in which a length reads well."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 from pydantic import TypeAdapter
 
-from sfm.conventions import METRES, SWELLING, UNITS, find_unit
+from sfm.conventions import METRES, SWELLING, UNITS, find_unit, finer_unit
 from sfm.survey.inputs.settings import Unit
 
 MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
@@ -50,3 +50,13 @@ def test_nanometres_are_a_unit_of_surveys_and_plans() -> None:
     assert METRES["nm"] == 1e-9
     assert TypeAdapter(Unit).validate_python("nm") == "nm"
     assert set(METRES) == set(get_args(get_args(Unit)[0]))
+
+
+def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
+    assert finer_unit("m", 3.2e-5) == (pytest.approx(1e6), "µm")
+    assert finer_unit("mm", 0.5) == (pytest.approx(1e3), "µm")
+    assert finer_unit("m", 0.012) == (pytest.approx(1e3), "mm")
+    assert finer_unit("ft", 1e-5) == (1.0, "ft") and finer_unit("", 1e-5) == (1.0, "")
+    assert finer_unit("network units", 2.12e-5) == (1e6, "× 10⁻⁶ network units")
+    assert finer_unit("network units", 0.5) == (1e3, "× 10⁻³ network units")
+    assert finer_unit("network units", 5.0) == (1.0, "network units")

@@ -95,7 +95,7 @@ class Lines(Group):
         """Return the offsets from the best line; H by its place and, where it is free, its direction."""
         w = self.weights.reshape(-1, 2)[:, 0]
         along, axes = self.axes(X, w)
-        length = (X - (X * w[:, None]).sum(axis=0) / w.sum()) @ along
+        length = (X - X.mean(axis=0)) @ along  # from anywhere, as the place is free
         at = X @ axes.T
         at = at - (at * w[:, None]).sum(axis=0) / w.sum()
         H = np.zeros((len(X), 2, 4 if self.turns else 2))

@@ -440,13 +440,34 @@ def test_a_zoomed_photograph_of_two_is_reported_from_a_camera_that_varies(which:
 
 
 def test_alternatives_are_counted_by_cameras() -> None:
-    """Before, 30 were assumed of any network; eight cameras of five photographs have 202."""
+    """Before, 30 were assumed of any network of eight cameras of five photographs; 12 have no gain."""
     rng = seed_of("many")
     network, truth = make_network(rng, images=40, points=40, cameras=8, free=("c",))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     columns = columns_of(a)
     every = alternatives.alternatives_of(a, reduce_adjustment(a, columns), columns)
-    assert len(every) > 190 and abs(len(every) / alternatives.count_alternatives(a) - 1) < 0.1
+    count = alternatives.count_alternatives(a)
+    held = sum(one.family.name == "held" for one in every)
+    assert held == 8 * (9 + 1)  # each parameter of a camera, and all of them
+    assert count == 215 and 0 <= count - len(every) <= 12
+    assert alternatives.count_alternatives(a, bodies=3) == count + 3
+
+
+def test_gains_that_might_be_named_are_divided_by_the_effect_of_correlation() -> None:
+    def of_gain(gain: float) -> Any:
+        return SimpleNamespace(
+            gain=SimpleNamespace(value=gain),
+            price=0.0,
+            evidence=gain,
+            columns=lambda *_: None,
+            with_design_effect=lambda effect, redundancy: SimpleNamespace(evidence=gain / effect),
+        )
+
+    reduced: Any = SimpleNamespace(redundancy=100, design_effect=lambda _: 2.0, whiten=lambda by: by)
+    for correlation, evidence in ((0.1, [45.0, 1.0]), (None, [90.0, 1.0])):
+        reduced.correlation = correlation
+        found = alternatives._by_evidence(reduced, reduced, reduced, [of_gain(1.0), of_gain(90.0)])
+        assert [one.evidence for one in found] == evidence
 
 
 def test_runs_are_of_one_camera_and_in_the_order_of_the_sequence() -> None:

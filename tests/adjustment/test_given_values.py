@@ -398,15 +398,18 @@ def test_a_wrong_point_without_stated_standard_deviations_is_identified() -> Non
     assert wrong is not None and wrong.judgement.wrong == (4,)
 
 
-def test_single_heights_are_judged_too() -> None:
+@pytest.mark.parametrize(("complete", "start"), [(4, None), (2, FRAME.inverse())])
+def test_single_heights_are_judged_too(complete: int, start: Similarity | None) -> None:
+    """The distance of two complete points is not checked, and nothing places their mirror image."""
     one = points(7, "heights")
     given = one.given.copy()
-    given[4:, :2] = np.nan
-    right = judge_points(replace(one, given=given), LEVEL)
+    given[complete:, :2] = np.nan
+    right = judge_points(replace(one, given=given), LEVEL, start=start)
     given[5, 2] += 0.05
-    wrong = judge_points(replace(one, given=given), LEVEL)
-    assert right is not None and right.judgement.fits and right.judgement.dof == 8
-    assert wrong is not None and wrong.judgement.wrong == (5,)
+    wrong = judge_points(replace(one, given=given), LEVEL, start=start)
+    assert right is not None and right.judgement.fits and right.judgement.dof == 2 * complete
+    assert wrong is not None and not wrong.mirrored
+    assert (wrong.judgement.wrong == (5,)) if complete > 2 else 5 in wrong.judgement.doubtful
 
 
 def test_the_scale_of_points_and_of_a_bar_agree_within_their_covariance() -> None:

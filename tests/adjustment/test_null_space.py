@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
-from sfm.adjustment.datum import Datum
+from sfm.adjustment.datum import Datum, Motions
 from sfm.adjustment.engine import iterate
 from sfm.adjustment.engine.cofactors import cofactors, hat_complement, marginal_covariance
 from sfm.adjustment.engine.iterate import optimum_at, problem_of
@@ -20,6 +20,7 @@ from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import rank_defect
 from sfm.network import Estimate, ImagePoints, Network
+from tests.synthetic import seed_of
 from tests.synthetic_blocks import aerial, in_sigmas, lens, run
 
 MOTIONS = 7
@@ -147,3 +148,14 @@ def test_a_block_of_calibrated_cameras_is_adjusted_in_fronts(monkeypatch: pytest
     fronts = run(network, truth)
     assert fronts.defect == MOTIONS
     assert in_sigmas(fronts.covariance.points, full.covariance.points) < 1e-8
+
+
+@pytest.mark.parametrize("steps", [(), (3,)])
+def test_steps_in_the_datum_meet_its_constraints(steps: tuple[int, ...]) -> None:
+    """Those of points, and of photographs where points do not carry it."""
+    rng = seed_of("in the datum")
+    (H, on_reduced), (P, B) = rng.standard_normal((2, 6, 2)), rng.standard_normal((2, 4, 3, 2))
+    inverse = np.linalg.inv(np.tensordot(B, P, ((0, 1), (0, 1))) + on_reduced.T @ H)
+    motions = Motions(H, P, B, on_reduced, inverse)
+    x, X = motions.transform(rng.standard_normal((6, *steps)), rng.standard_normal((4, 3, *steps)))
+    np.testing.assert_allclose(on_reduced.T @ x + np.tensordot(B, X, ((0, 1), (0, 1))), 0.0, atol=1e-12)

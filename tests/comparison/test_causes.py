@@ -54,6 +54,14 @@ def test_names_are_those_that_were_exchanged() -> None:
     assert found.cause.renamed == ((names[3], names[8]), (names[8], names[3]))
 
 
+@pytest.mark.parametrize(("same", "named"), [(16, True), (14, False)])
+def test_names_are_exchanged_where_half_of_the_points_are_the_same(same: int, named: bool) -> None:
+    a, rng = pairs_of(1.0), seed_of("half the same")
+    b = np.concatenate([np.roll(a.b[:same], 1, axis=0), rng.uniform(-1, 1, (30 - same, 3))])
+    found = find_cause(replace(a, b=b))
+    assert found is not None and found.row.names is named
+
+
 def pairs_of(scale: float, size: float = 1.0, sigma: float = 1e-5, n: int = 30) -> PointPairs:
     """Return made-up points with independent coordinates of equal precision."""
     rng = seed_of("pairs of points")

@@ -660,16 +660,6 @@ def test_numbers_end_where_their_sigma_does() -> None:
     assert with_exponent(0.5, float("nan")) == ("0.5", "held fixed")
 
 
-def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
-    assert finer_unit("m", 3.2e-5) == (pytest.approx(1e6), "µm")
-    assert finer_unit("mm", 0.5) == (pytest.approx(1e3), "µm")
-    assert finer_unit("m", 0.012) == (pytest.approx(1e3), "mm")
-    assert finer_unit("ft", 1e-5) == (1.0, "ft") and finer_unit("", 1e-5) == (1.0, "")
-    assert finer_unit("network units", 2.12e-5) == (1e6, "× 10⁻⁶ network units")
-    assert finer_unit("network units", 0.5) == (1e3, "× 10⁻³ network units")
-    assert finer_unit("network units", 5.0) == (1.0, "network units")
-
-
 def test_the_comparison_says_what_of_the_survey_it_leaves_out(
     result: SurveyResult, capsys: pytest.CaptureFixture[str]
 ) -> None:

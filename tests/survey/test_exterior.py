@@ -22,6 +22,7 @@ from sfm.report.output import write_result
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
+from sfm.survey import placing
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import OBSERVED, remarks_on_given, stations, write_photograph_survey
@@ -185,6 +186,11 @@ def test_projection_centres_on_a_line_do_not_place_a_network(tmp_path: Path, off
         GeometryError, match="places of projection centres and control points with X, Y and Z, on a line, and"
     ):
         solved(path)
+
+
+@pytest.mark.parametrize(("breadth", "on_a_line"), [(0.8e-6, True), (1.5e-6, False)])
+def test_places_are_on_a_line_within_a_millionth_of_their_extent(breadth: float, on_a_line: bool) -> None:
+    assert (placing._arrangement(1.0, breadth, 1e-9) == "on a line") is on_a_line
 
 
 def test_a_control_datum_needs_control_or_exterior(tmp_path: Path) -> None:

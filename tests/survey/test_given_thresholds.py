@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.given_points import GivenPoints
 from sfm.adjustment.quality.given_values import GivenModel, Judgement
+from sfm.conventions import SWELLING
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
@@ -28,6 +32,15 @@ def test_a_print_may_be_half_a_percent_larger_than_stated(off: float, contradict
     bar = ScaleBar("9", "20", float(np.linalg.norm(truth.points[8] - truth.points[19])), 1e-4)
     result = run_survey(survey_of(network, truth, control=control, scale_bars=(bar,), datum={"kind": "free"}))
     assert ("scale_contradicted" in kinds_of(remarks_on_given(result))) == contradicted
+
+
+def test_the_scale_of_unstated_coordinates_is_known_to_a_part_of_itself() -> None:
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    points = GivenPoints(3.0 * X, np.zeros((2, 3, 3)), X, np.eye(6), 100)
+    task: Any = SimpleNamespace(places=SimpleNamespace(xyz=X), datum=SimpleNamespace(kind="free"))
+    group: Any = SimpleNamespace(points=points, places=np.arange(2))
+    found = given_scales._scale_of(task, group)
+    assert found is not None and found.scale == 3.0 and found.sigma == pytest.approx(3.0 * SWELLING)
 
 
 @pytest.mark.parametrize("weaker", [5.0, 11.0, 100.0])
@@ -196,9 +209,12 @@ def test_contradicting_control_is_an_error_but_for_one_of_some_that_the_others_c
     network, truth = scene("far pair", figure)
     xyz = figure + 0.2 * SIGMA * seed_of("far pair").standard_normal(figure.shape)
     xyz[5, 0] += 9 * SIGMA
+    bars = (ScaleBar("1", "5", 1.0, 1e-4),)  # which is not compared with what contradicts itself
     for names, kinds in (([0, 1, 2, 3, 4, 5], "warning"), ([0, 1, 4, 5], "error")):
         control = KnownPoints.from_arrays([str(k + 1) for k in names], xyz[names], SIGMA)
-        result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+        survey = survey_of(network, truth, control=control, scale_bars=bars, datum={"kind": "control"})
+        result = run_survey(survey)
+        assert [one.dof for one in result.given_tests if one.what == "scale"] == [0]
         said = remarks_on_given(result)[0]
         assert said.kind == "given_contradicted" and said.severity == kinds
         assert (said.number("shift") < 5) == (kinds == "warning")

@@ -192,6 +192,19 @@ def test_without_errors_every_kind_has_the_values_of_the_truth() -> None:
     assert a.vPv == pytest.approx(0.0, abs=1e-10)
 
 
+def test_every_observation_has_a_name_and_a_unit_of_each_component() -> None:
+    network, truth = network_of_all()
+    for kind in network.kinds:
+        assert len(kind.names(network, truth)) == len(kind)
+        units = np.array(kind.units(truth, "mm"))
+        assert units.shape == np.diagonal(kind.covariances(), axis1=1, axis2=2).shape
+        assert kind is not network.control or (units == "mm").all()
+        if isinstance(kind, Group):
+            several = len(kind.components) > 1
+            parts = [label.split()[-1] in kind.components for label in kind.labels(network)]
+            assert parts == [several] * units.shape[1]
+
+
 def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
     """From a free network in any attitude; an unknown point is named, and a gross error shows."""
     network, truth = network_of("levelled", ("height difference", "distance"))
@@ -376,6 +389,19 @@ def test_a_mistake_in_a_whole_table_is_named(
     both = {("kind_wrong", ("height differences",), ("exchanged",))} if open_with_heights else set()
     assert found == {("kind_wrong", (TABLES[kind].name,), (mistake,))} | both
     assert all("agree if" in one.text for one in said)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "lengths", "angles"),
+    [("thousandfold", 1e-3, 1.0), ("thousandth", 1e3, 1.0), ("feet", 0.3048, 1.0), ("gon", 1.0, 0.9)],
+)
+def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, angles: float) -> None:
+    (right,) = network_of("units", ("relative orientation",))[0].observations
+    assert isinstance(right, TableKind)
+    found = right.mistakes()[mistake]
+    factors = np.array([lengths] * 3 + [angles] * 3)
+    np.testing.assert_allclose(found.values, factors * right.values)
+    np.testing.assert_allclose(found.sigma, factors * right.sigma)
 
 
 def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from scipy.linalg import cho_factor, cho_solve
 from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.distributions import f_sf
 from sfm.network import rows_of
 
@@ -298,10 +298,7 @@ def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
     centre = X0.mean(axis=0)
     G = np.zeros((m, 6, 7))
     G[:, :3, :3] = np.eye(3)
-    for axis in range(3):
-        turn = np.eye(3)[axis]
-        G[:, :3, 3 + axis] = np.cross(turn, X0 - centre)
-        G[:, 3:, 3 + axis] = np.einsum("mji,j->mi", R, turn)
+    G[:, :3, 3:6], G[:, 3:, 3:6] = -skew(X0 - centre), np.swapaxes(R, 1, 2)
     G[:, :3, 6] = X0 - centre
     scale = np.sqrt(np.diagonal(S)[: 6 * m])
     heavy = np.zeros_like(S)

@@ -149,10 +149,10 @@ def solve_triple(
         y_plus, y_minus = 1.0 - gac + root, 1.0 - gac - root
         misfit_plus = abs(((x - y_plus) ** 2 + 2.0 * x * y_plus * gbc) * a2 - Rbc2)
         misfit_minus = abs(((x - y_minus) ** 2 + 2.0 * x * y_minus * gbc) * a2 - Rbc2)
-        for side in range(2):
-            y, misfit, other = y_plus, misfit_plus, misfit_minus
-            if side == 1:
-                y, misfit, other = y_minus, misfit_minus, misfit_plus
+        for y, misfit, other in (
+            (y_plus, misfit_plus, misfit_minus),
+            (y_minus, misfit_minus, misfit_plus),
+        ):
             if y <= 0.0 or (misfit > other and misfit > MAX_DOUBLE_ROOT_MISFIT * Rbc2):
                 continue
             a = np.sqrt(a2)

@@ -6,7 +6,7 @@ import pytest
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
-from sfm.orientation.resection.least_squares import choose_by_line, solution_of
+from sfm.orientation.resection.least_squares import checked_points, choose_by_line, solution_of
 from sfm.textbook.resection.by_method import cylinder_distance, cylinder_warning
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import resect_dlt
@@ -283,3 +283,8 @@ def test_degenerate_points_are_refused(method):
         method(uv[:2], same[2:])
     with pytest.raises(GeometryError, match="not a finite number"):
         method(np.full((4, 2), np.nan), POINTS)
+
+
+def test_points_far_from_the_origin_do_not_coincide():
+    far = 1e10 + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    assert (checked_points("p4p", TANGENTS[:4], far, needed=4)[1] == far).all()
