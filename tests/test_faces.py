@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -35,6 +39,7 @@ PLACE = np.array([[40.0, 40.0]])
 STACK = np.zeros((2, 2, 2, 2))
 NETWORK, TRUTH = make_network(seed_of("faces"), images=4, points=12, noise_px=0.1)
 ADJUSTMENT = sfm.adjust(NETWORK, TRUTH)
+PACKAGES = sorted(path for room in ("sfm", "adapters") for path in (ROOT / room).rglob("__init__.py"))
 RAYS = {"positions": np.zeros((1, 3)), "rotations": np.eye(3)[None]}
 
 
@@ -65,6 +70,43 @@ def test_a_room_explains_its_functions_and_its_example_runs(room: str) -> None:
     (example,) = finder.find(module, room, extraglobs=given)
     assert len(example.examples) > 2
     assert doctest.DocTestRunner().run(example).failed == 0
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.parent.relative_to(ROOT).as_posix())
+def test_a_room_describes_what_is_in_it(package: Path) -> None:
+    """Names in its docstring are modules, folders or functions of the room, or full paths from the root."""
+    text = ast.get_docstring(ast.parse(package.read_text())) or ""
+    for name in re.findall(r"`([a-z_]\w*(?:\.\w+)*)/?`", text):
+        folder = ROOT if name.startswith(("sfm.", "adapters.")) else package.parent
+        assert _is_found(name, folder), f"{package}: {name}"
+
+
+def _is_found(name: str, folder: Path) -> bool:
+    """Return whether a dotted name is below a folder, or one alone is defined in any of its files."""
+    if (folder / name).is_file():
+        return True
+    first, *rest = name.split(".")
+    if (folder / first).is_dir():
+        return not rest or _is_found(".".join(rest), folder / first)
+    if (folder / f"{first}.py").is_file():
+        return not rest or rest[0] in _defined(folder / f"{first}.py")
+    return not rest and any(first in _defined(file) for file in folder.rglob("*.py*"))
+
+
+@cache
+def _defined(path: Path) -> frozenset[str]:
+    """Return the names that a file defines at its top or, if it is a stub, imports."""
+    if path.suffix not in (".py", ".pyi"):
+        return frozenset()
+    names = set()
+    for one in ast.parse(path.read_text()).body:
+        if isinstance(one, ast.FunctionDef | ast.ClassDef):
+            names.add(one.name)
+        elif isinstance(one, ast.AnnAssign | ast.Assign):
+            names.update(name.id for name in ast.walk(one) if isinstance(name, ast.Name))
+        elif isinstance(one, ast.ImportFrom) and path.suffix == ".pyi":
+            names.update(alias.name for alias in one.names)
+    return frozenset(names)
 
 
 def test_importing_the_rooms_imports_no_library() -> None:

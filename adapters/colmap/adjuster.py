@@ -7,9 +7,7 @@ The only module that imports pycolmap. Limits of its adjuster against Kolinear's
 
 Pixel origin and axes are turned in adapters.colmap.reconstruction.
 
-Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
-
-Source: COLMAP 4.2, estimate_ba_covariance.
+Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models"; COLMAP 4.2, estimate_ba_covariance.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
 """COLMAP's models, binary and text, and kolinear.json beside them, written and read.
 
-COLMAP cannot hold names of cameras and points or the size of a pixel; they lie beside a model in
-kolinear.json.
+COLMAP cannot hold names of cameras and points, the size of a pixel, and which parameters are free; they lie
+beside a model in kolinear.json.
 
 Source: COLMAP 4.2 documentation, "Output Format".
-
-kolinear.json beside a COLMAP model: what COLMAP cannot hold.
-
-Names of cameras, photographs and points, the size of a pixel, and which parameters are free.
 """
 
 from __future__ import annotations

@@ -3,12 +3,10 @@
 The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
 are compared with the survey's by sfm.comparison.solutions.
 
+Widths of camera sensors from COLMAP's list of cameras. pycolmap gives them only through the focal length that
+it infers for a photograph, so it is given a small one with the make, the model and a known focal length.
+
 Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
-
-Widths of camera sensors from COLMAP's list of cameras.
-
-pycolmap gives them only through the focal length that it infers for a photograph, so it is given a small one
-with the make, the model and a known focal length.
 """
 
 from __future__ import annotations

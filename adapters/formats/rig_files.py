@@ -12,17 +12,15 @@
 Camera axes are x right, y down, z forward, pixels count from the centre of the top-left one (COLMAP: from its
 corner). Lengths are in the unit of the result; in metres, where it is known, for Kalibr, ROS and mrcal.
 
+Rectification of a pair of cameras as OpenCV does it: a common image plane, rows as epipolar lines. Each
+camera is turned by half of their relative rotation and then so that the base is along rows (or columns);
+focal length and principal point, the same in both, show in both as much as is without empty borders.
+
 Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
 documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; pyvale 2026.10, its
 example calib.caldat, whose cameras converge by x_right = R x_left + T in these axes; Kalibr wiki, "YAML
-formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal 2.5, "The .cameramodel file format".
-
-Rectification of a pair of cameras as OpenCV does it: a common image plane, rows as epipolar lines.
-
-Each camera is turned by half of their relative rotation and then so that the base is along rows (or columns);
-focal length and principal point, the same in both, show in both as much as is without empty borders.
-
-Source: cv::stereoRectify of OpenCV 4 (after Bouguet), with CALIB_ZERO_DISPARITY and alpha = 0.
+formats"; ROS REP 104 and sensor_msgs/CameraInfo; mrcal 2.5, "The .cameramodel file format"; cv::stereoRectify
+of OpenCV 4 (after Bouguet), with CALIB_ZERO_DISPARITY and alpha = 0.
 """
 
 from __future__ import annotations

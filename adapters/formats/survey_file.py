@@ -1,7 +1,7 @@
 """The survey file of a converted network: its tables adjusted again as they are, with its control.
 
     survey.toml     unit, cameras, rigs, image points, approximate values, scale bars, datum
-    control.csv     control and check points, see `known_points`
+    control.csv     control and check points, see `given_table`
     exterior.csv    image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg
 
 Source: the README, "The survey file".

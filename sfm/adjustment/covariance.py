@@ -3,17 +3,15 @@
 The normal equations are formed once more at the solution. The coordinates stay; a change of datum is an
 S-transformation of their covariance.
 
-Source: Baarda (1973), S-transformations and criterion matrices.
+A network as it is best computed with: coordinates near the origin, near points near in memory; and back. Near
+5e6 m a coordinate in double precision has steps of 1e-9 m, which in a close-range network is more than the
+change at which an iteration has converged: it is reduced to its centroid. The points of a large network are
+put in order along a curve that fills space, so that a photograph meets those that it sees in few stretches of
+memory; sums over 646,000 image points take a third of the time then.
 
-A network as it is best computed with: coordinates near the origin, near points near in memory; and back.
-
-Near 5e6 m a coordinate in double precision has steps of 1e-9 m, which in a close-range network is more
-than the change at which an iteration has converged: it is reduced to its centroid. The points of a large
-network are put in order along a curve that fills space, so that a photograph meets those that it sees in few
-stretches of memory; sums over 646,000 image points take a third of the time then.
-
-Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.2.2; Morton (1966), A computer oriented
-geodetic data base and a new technique in file sequencing, IBM.
+Source: Baarda (1973), S-transformations and criterion matrices; Luhmann et al., Close-Range Photogrammetry
+(2020), sec. 2.2.2; Morton (1966), A computer oriented geodetic data base and a new technique in file
+sequencing, IBM.
 """
 
 from __future__ import annotations

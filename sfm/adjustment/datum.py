@@ -1,29 +1,22 @@
 """Datum: which points define position, attitude and scale; free motions and their constraints.
 
-Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3.
+The normal equations of image points alone do not change when the whole network is shifted, turned or scaled.
+`free_motions` gives these null vectors H; what is fixed or observed takes some away. A datum is a matrix B
+with B' dx = 0 and B'H regular, and any solution is carried into it by S = I - H (B'H)^-1 B' without a new
+adjustment.
 
-Free similarity motions of a network, inner and minimal constraints on them, S-transformations.
-
-The normal equations of image points alone do not change when the whole network is shifted, turned or
-scaled. `free_motions` gives these null vectors H; what is fixed or observed takes some away. A datum
-is a matrix B with B' dx = 0 and B'H regular, and any solution is carried into it by
-S = I - H (B'H)^-1 B' without a new adjustment.
-
-Source: Baarda (1973), S-transformations and criterion matrices; Papo and Perelmuter (1980); Luhmann et
-al., Close-Range Photogrammetry (2020), sec. 4.4.3.
-
-Null vectors that no motion of the whole network explains, brought into its datum.
-
-Two networks without a common point, a photograph with a single point, a principal distance that looks like
-another height: the normal equations leave more open than the datum knows of. Where such a null vector moves
-object points that carry the datum, the datum fixes it as it fixes the motions, by an inner constraint on
-these points, so that two networks have a free datum each. Where it moves none, it is fixed by an inner
-constraint on the scaled reduced unknowns. So the result does not depend on how a solver has held them.
+Other null vectors are brought into the datum too. Two networks without a
+common point, a photograph with a single point, a principal distance that looks like another height: the
+normal equations leave more open than the datum knows of. Where such a null vector moves object points that
+carry the datum, the datum fixes it as it fixes the motions, by an inner constraint on these points, so that
+two networks have a free datum each. Where it moves none, it is fixed by an inner constraint on the scaled
+reduced unknowns. So the result does not depend on how a solver has held them.
 
 A point without an accepted ray, or with parallel ones, carries no datum; the directions that are open stay
 where they are, whatever the rest does.
 
-Source: Baarda (1973), S-transformations and criterion matrices; Foerstner and Wrobel (2016), sec. 4.5.
+Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3; Baarda (1973), S-transformations and
+criterion matrices; Papo and Perelmuter (1980); Foerstner and Wrobel (2016), sec. 4.5.
 """
 
 from __future__ import annotations

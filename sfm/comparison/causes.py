@@ -13,18 +13,16 @@ Simple rows come first, and a later row must exceed them as much: a bending of t
 imitates a strain, and a strain a scale and a mirror. Where no row explains the differences, a permutation
 test asks whether the points have anything to do with one another.
 
+Two sets of points brought onto one another by their geometry alone, whatever their names. Triangles of
+neighbouring points are compared by their sides, or by the ratios of these where the scale is not known. Each
+pair of triangles of one shape proposes a similarity, and the one that brings most points of one set onto
+points of the other wins.
+
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Schwarz (1978),
 Estimating the dimension of a model, for q/2 ln n; Jackson (1995), PROTEST: a Procrustean randomization test,
-Ecoscience 2, 297-303, for the last.
-
-Two sets of points brought onto one another by their geometry alone, whatever their names.
-
-Triangles of neighbouring points are compared by their sides, or by the ratios of these where the scale is not
-known. Each pair of triangles of one shape proposes a similarity, and the one that brings most points of one
-set onto points of the other wins.
-
-Source: Groth (1986), A pattern-matching algorithm for two-dimensional coordinate lists, Astronomical Journal
-91, 1244-1248, with triangles in space; Fischler, Bolles (1981), Random sample consensus.
+Ecoscience 2, 297-303, for the last; Groth (1986), A pattern-matching algorithm for two-dimensional coordinate
+lists, Astronomical Journal 91, 1244-1248, with triangles in space; Fischler, Bolles (1981), Random sample
+consensus.
 """
 
 from __future__ import annotations

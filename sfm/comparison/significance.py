@@ -9,10 +9,8 @@ T = d' (Qa + Qb)^-1 d / 3, an approximation that is made for free networks only.
 from the same image points are not independent and are not tested. Reasons other than points that moved
 are in `sfm.comparison.causes`.
 
-Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
-Concepts of network and deformation analysis, sec. 7.
-
-Source: Caspary (2000), Concepts of network and deformation analysis, sec. 7.
+Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000), Concepts
+of network and deformation analysis, sec. 7.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Distortion models: functions in `brown`, `forward` and `opencv`, a row each in `models`: begin there."""
+"""Distortion models: functions in `brown`, `radial` and `opencv`, a row each in `models`: begin there."""

@@ -10,15 +10,12 @@ epoch moves by Q g / s^2 for a unit of l, so that
 with the sigma0 of both that their covariances hold, summed over the bars, and over the coordinates of
 control, that both share.
 
+Change of the mounts of a rig between two epochs: T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom. Values
+given alike to both epochs, as a scale bar, make the true variance of d smaller than Q_1 + Q_2: the test then
+finds less, and does not find what is not there.
+
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2; Koch (1999), Parameter Estimation and Hypothesis
 Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
-
-Change of the mounts of a rig between two epochs: T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom.
-
-Values given alike to both epochs, as a scale bar, make the true variance of d smaller than Q_1 + Q_2: the
-test then finds less, and does not find what is not there.
-
-Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.
 """
 
 from __future__ import annotations

@@ -1,17 +1,14 @@
 """Epochs of one object: each against the first and the one before, motion of blocks, verdict.
 
+Motion and strain of groups of points: a block that tilted is separated from one that changed its shape. The
+displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c, small
+rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the full
+covariance of the displacements, in the datum of the stable points outside of the group; what is left shows
+whether the group moved as the model assumes.
+
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12; Caspary (2000), Concepts of network and deformation
-analysis, sec. 7.
-
-Motion and strain of groups of points: a block that tilted is separated from one that changed its shape.
-
-The displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c,
-small rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the
-full covariance of the displacements, in the datum of the stable points outside of the group; what is left
-shows whether the group moved as the model assumes.
-
-Source: Chen (1983), Analysis of deformation surveys; Caspary (2000), Concepts of network and deformation
-analysis, sec. 9; Welsch, Heunecke, Kuhlmann (2000), Auswertung geodaetischer Ueberwachungsmessungen, sec. 6.
+analysis, secs. 7 and 9; Chen (1983), Analysis of deformation surveys; Welsch, Heunecke,
+Kuhlmann (2000), Auswertung geodaetischer Ueberwachungsmessungen, sec. 6.
 """
 
 from __future__ import annotations

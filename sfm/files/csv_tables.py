@@ -2,9 +2,7 @@
 
 Their size is bounded before memory is allocated, and every refusal names the line and the column.
 
-Source: RFC 4180.
-
-Source: Turk, The PLY polygon file format (1994).
+Source: RFC 4180; Turk, The PLY polygon file format (1994).
 """
 
 from __future__ import annotations

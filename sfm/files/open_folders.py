@@ -5,18 +5,17 @@ may be a link but those of the system in its root folder (as /tmp of macOS). A f
 something is made, opened or moved in it, so that nothing can be put in its place meanwhile; Windows cannot
 open files by such a handle, there its path is checked only.
 
-Source: POSIX.1-2008, openat() and O_NOFOLLOW.
-
-The lock of a folder: one run at a time writes into it, and everybody can read who.
-
-The operating system keeps the lock and releases it when the process ends, however it ends. So a lock file
-that is free is stale by that alone, and no process number has to be trusted. It lies beside what it
-locks, where the runs of other computers on the same disk see it.
+The lock of a folder: one run at a time writes into it, and everybody can read who. The operating system keeps
+the lock and releases it when the process ends, however it ends. So a lock file that is free is stale by that
+alone, and no process number has to be trusted. It lies beside what it locks, where the runs of other
+computers on the same disk see it.
 
 The list of the files that Kolinear wrote into a folder, with their hashes: by it they are known again.
 
 A folder or file that may be replaced has such a list, manifest.json. It is replaced only while it is as it
 was written: files that were added, edited or linked by a person are named, and left alone.
+
+Source: POSIX.1-2008, openat() and O_NOFOLLOW.
 """
 
 from __future__ import annotations

@@ -3,9 +3,7 @@
 Degrees in files, lengths in the object unit of the survey, sigmas are standard deviations a posteriori (those
 of image points: as measured). Numbers are written with enough digits to give the same number back.
 
-Source: RFC 4180 for CSV; docs/reference/results.md describes each column.
-
-Rigs of a result as tables: where their cameras are mounted, and which photographs are of one moment.
+Rigs have two tables: where their cameras are mounted, and which photographs are of one moment.
 
     mounts.csv     camera,rig,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg
     moments.csv    image,moment
@@ -13,7 +11,7 @@ Rigs of a result as tables: where their cameras are mounted, and which photograp
 Mounts are in the image axes of the reference camera of the rig, whose row is 0. A standard deviation of 0
 means held fixed, an empty cell adjusted and not known. Photographs that moments.csv does not name are alone.
 
-Source: RFC 4180 for CSV.
+Source: RFC 4180 for CSV; docs/reference/results.md describes each column.
 """
 
 from __future__ import annotations

@@ -5,18 +5,13 @@ functions together, is J Q J'. In a free network only what does not change with 
 leaves open has a covariance that means something: J G = 0, with G the shifts, rotations and, without a scale,
 the scale of the whole.
 
+Functions of coordinates: distances, angles, heights above a plane, in any mixture of points and shapes. Each
+takes functions of coordinates and returns one, so that the covariance of the network goes along: of points as
+well as of centres, axes and planes that were fitted to points.
+
 Source: Baarda (1973), S-transformations and criterion matrices; Caspary (2000), Concepts of network and
-deformation analysis, sec. 6 (estimable functions).
-
-Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.6 (hidden-point devices).
-
-Functions of coordinates: distances, angles, heights above a plane, in any mixture of points and shapes.
-
-Each takes functions of coordinates and returns one, so that the covariance of the network goes along: of
-points as well as of centres, axes and planes that were fitted to points.
-
-Source: law of propagation of covariances; Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging,
-sec. 2.4.
+deformation analysis, sec. 6 (estimable functions); Luhmann et al. (2020), Close-Range Photogrammetry and 3D
+Imaging, sec. 2.4 (propagation of covariances) and 6.6 (hidden-point devices).
 """
 
 from __future__ import annotations

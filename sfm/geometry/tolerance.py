@@ -3,10 +3,9 @@
 A value conforms if it is inside the limits by its expanded uncertainty U = k sigma, does not if it is outside
 by that, and nothing is decided in between.
 
-Source: ISO 14253-1:2017, Decision rules for verifying conformity or nonconformity with specifications.
-
-Source: Ericson (2005), Real-Time Collision Detection, sec. 5.1.5 (nearest point of a triangle); Baerentzen
-and Aanaes (2005), IEEE TVCG 11(3) (the side of an edge or corner, by the mean of the normals about it).
+Source: ISO 14253-1:2017, Decision rules for verifying conformity or nonconformity with specifications;
+Ericson (2005), Real-Time Collision Detection, sec. 5.1.5 (nearest point of a triangle); Baerentzen and Aanaes
+(2005), IEEE TVCG 11(3) (the side of an edge or corner, by the mean of the normals about it).
 """
 
 from __future__ import annotations

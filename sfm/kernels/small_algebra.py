@@ -5,20 +5,17 @@ Two products of 6 x 6 and 3 x 6 numbers for compiled loops, written in vectors o
 Both are the inner work of sums over pairs of rays. The compiler makes vectors of loops over long arrays, but
 not of six numbers at a time: as loops they take 21 ns, as vectors 5 ns.
 
-Source: vector types and `contract` (fused multiply-add): LLVM Language Reference.
+Small symmetric systems of equations by Cholesky's factorisation, for use inside compiled loops. Only the
+lower triangle of a matrix is read. All work is done in arrays of the caller.
 
-Small symmetric systems of equations by Cholesky's factorisation, for use inside compiled loops.
+Real positive roots of a quartic, none of which is missed. Ferrari's two quadratic factors give the roots
+where they multiply back to the quartic and no two roots are near each other. Closed formulas lose the
+near-double roots that occur when the camera is near the danger cylinder of three points; there every interval
+between turning points is searched by bracketed Newton steps, and a turning point that touches zero within
+rounding counts as a double root.
 
-Only the lower triangle of a matrix is read. All work is done in arrays of the caller.
-
-Source: Golub and Van Loan (2013), Matrix Computations, sec. 4.2.
-
-Real positive roots of a quartic, none of which is missed.
-
-Ferrari's two quadratic factors give the roots where they multiply back to the quartic and no two roots
-are near each other. Closed formulas lose the near-double roots that occur when the camera is near the
-danger cylinder of three points; there every interval between turning points is searched by bracketed
-Newton steps, and a turning point that touches zero within rounding counts as a double root.
+Source: vector types and `contract` (fused multiply-add): LLVM Language Reference; Golub and Van Loan (2013),
+Matrix Computations, sec. 4.2.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Kinds of observations beside image points, one in each module; `kind` has what they share.
+"""Kinds of observations beside image points, one class each; `kind` has what they share.
 
-A kind that a survey gives as a table is one module and one row of TABLES. The adjustment, its tests and
+A kind that a survey gives as a table is one class and one row of TABLES. The adjustment, its tests and
 variance components, the survey file, the tables and the reports take everything they need from there.
 """
 

@@ -3,15 +3,13 @@
 A kind is one class in one file of this package. The adjustment takes from it what its normal equations,
 redundancy numbers, tests and variance components need; the report takes its names and units.
 
-Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least squares).
+Observations of a group of points with parameters of the group: planes, lines, frames, directions. The
+parameters of a group are found anew from its points whenever the observations are linearised, and do not
+appear among the unknowns: with their derivatives H and the weight W, the derivatives by the points are (I - H
+(H'W H)^-1 H'W) Jx, which leaves minimum and covariance as they are with the parameters among them.
 
-Observations of a group of points with parameters of the group: planes, lines, frames, directions.
-
-The parameters of a group are found anew from its points whenever the observations are linearised, and do not
-appear among the unknowns: with their derivatives H and the weight W, the derivatives by the points are
-(I - H (H'W H)^-1 H'W) Jx, which leaves minimum and covariance as they are with the parameters among them.
-
-Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.6 (elimination of groups of
+Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least squares);
+Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.6 (elimination of groups of
 parameters); Golub and Pereyra (1973), SIAM J. Numer. Anal. 10(2) (variable projection).
 """
 

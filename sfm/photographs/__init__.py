@@ -1,1 +1,1 @@
-"""Photographs as files: `reading` (pixels), `exif`, `satellite_positions`, `file_checks` (untrusted)."""
+"""Photographs as untrusted files: `reading` (pixels), `exif` (camera, time, satellite position)."""

@@ -1,23 +1,19 @@
 """A network designed for what is wanted: candidates for stations, their gain, and the choice.
 
-The choice goes by the limiting covariance of points, in which the orientations are held (`gain`); each
+The choice goes by the limiting covariance of points, in which the orientations are held (`gains`); each
 point's share of what that ignores - orientation, self-calibration, datum - is taken from the full covariance
 of the network so far. Figures of the design always are of the full covariance.
 
-Source: Fraser (1984) (zero- to first-order design); Fedorov (1972), Theory of Optimal Experiments (greedy
-choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing cameras).
-
-Source: van der Corput, Halton (1960), Numer. Math. 2 (evenly spread positions).
-
-Gain of one more photograph for the points that it shows, the orientations of all photographs held.
-
-Each image point adds A'PA to the 3 x 3 normal matrix of its point, so that the gain of every candidate
-follows from updates of rank 2, without any system of equations: limiting error propagation.
+Gain of one more photograph for the points that it shows, the orientations of all photographs held. Each image
+point adds A'PA to the 3 x 3 normal matrix of its point, so that the gain of every candidate follows from
+updates of rank 2, without any system of equations: limiting error propagation.
 
     Q' = Q - Q A' (P^-1 + A Q A')^-1 A Q
 
-Source: Fraser (1987), Photogramm. Eng. Remote Sens. 53(5) (limiting error propagation); Foerstner and Wrobel
-(2016), sec. 4.2.7 (recursive estimation).
+Source: Fraser (1984) (zero- to first-order design); Fedorov (1972), Theory of Optimal Experiments (greedy
+choice and exchange); Olague and Mohr (2002), Pattern Recognition 35(4) (placing cameras); van der Corput,
+Halton (1960), Numer. Math. 2 (evenly spread positions); Fraser (1987), Photogramm. Eng. Remote Sens. 53(5)
+(limiting error propagation); Foerstner and Wrobel (2016), sec. 4.2.7 (recursive estimation).
 """
 
 from __future__ import annotations

@@ -3,14 +3,11 @@
 A surface is sampled evenly: many random points of equal density, of which each next one is farthest from
 those taken before.
 
-Source: Gonzalez (1985), Theoretical Computer Science 38 (farthest point sampling).
+Points hidden by a mesh: is a triangle between a point and a projection centre? The triangles are sorted into
+a tree of boxes, halved along their longest side, so that a ray meets few.
 
-Points hidden by a mesh: is a triangle between a point and a projection centre?
-
-The triangles are sorted into a tree of boxes, halved along their longest side, so that a ray meets few.
-
-Source: Moeller and Trumbore (1997), J. Graphics Tools 2(1) (ray and triangle); Kay and Kajiya (1986),
-SIGGRAPH (ray and box).
+Source: Gonzalez (1985), Theoretical Computer Science 38 (farthest point sampling); Moeller and Trumbore
+(1997), J. Graphics Tools 2(1) (ray and triangle); Kay and Kajiya (1986), SIGGRAPH (ray and box).
 """
 
 from __future__ import annotations

@@ -4,15 +4,13 @@
 
 with the mean scale number S, k photographs from each station, and q that states how strong the network is.
 
+Requirements on a network: a standard deviation of points or lengths, or a displacement that is found. A
+displacement between two such surveys is found, in its worst direction, if it is as long as the noncentrality
+of the test of three coordinates over the standard deviation of the difference.
+
 Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
-Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.
-
-Requirements on a network: a standard deviation of points or lengths, or a displacement that is found.
-
-A displacement between two such surveys is found, in its worst direction, if it is as long as the
-noncentrality of the test of three coordinates over the standard deviation of the difference.
-
-Source: Baarda (1968), sec. 4 (power of a test); Niemeier (2008), Ausgleichungsrechnung, ch. 9.
+Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3; Baarda (1968), sec. 4 (power
+of a test); Niemeier (2008), Ausgleichungsrechnung, ch. 9.
 """
 
 from __future__ import annotations

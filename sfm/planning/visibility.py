@@ -1,21 +1,17 @@
 """Which point is seen from which station, and how well; depth of field and sizes of targets.
 
-Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
-Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution).
-
-Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 3.1.1.3; with the hyperfocal distance
-H = f^2 / (N c) + f, near s (H - f) / (H + s - 2 f) and far s (H - f) / (H - s).
-
-Precision of a target in a photograph from its size, contrast, blur and noise.
-
-An edge blurred by a Gaussian of standard deviation s contains, per length, the information
-A^2 / (2 s sqrt(pi)) / noise^2 on a shift across it. Summed round an ellipse that is the Cramer-Rao bound of
-its centre, which the measurement of targets reaches within some 5 % where the background is even.
+Precision of a target in a photograph from its size, contrast, blur and noise. An edge blurred by a Gaussian
+of standard deviation s contains, per length, the information A^2 / (2 s sqrt(pi)) / noise^2 on a shift across
+it. Summed round an ellipse that is the Cramer-Rao bound of its centre, which the measurement of targets
+reaches within some 5 % where the background is even.
 
     information = A^2 / (2 s sqrt(pi) noise^2) * integral of n n' dl
     circle of radius R: sigma^2 = 2 s noise^2 / (sqrt(pi) R A^2)
 
-Source: Cramer-Rao bound; Foerstner and Wrobel (2016), sec. 4.2.
+Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
+Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution); Luhmann et al.,
+Close-Range Photogrammetry (2020), sec. 3.1.1.3; with the hyperfocal distance H = f^2 / (N c) + f, near s (H -
+f) / (H + s - 2 f) and far s (H - f) / (H - s); Cramer-Rao bound; Foerstner and Wrobel (2016), sec. 4.2.
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
 """Where a planned network is weak, and what the rig and each kind of observation contribute.
 
+Contributions of the rig and of each kind of observation beside image points to a planned network. Precision
+without and with a kind is compared in the datum of the network without it: with inner constraints for the
+motions that it leaves open. It is the datum of the plan unless the kind alone gives a motion, as the only
+scale bars do.
+
 Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (what determines interior orientation:
-convergence, rolled photographs, depth of the object); Baarda (1968) for reliability.
-
-Contributions of the rig and of each kind of observation beside image points to a planned network.
-
-Precision without and with a kind is compared in the datum of the network without it: with inner constraints
-for the motions that it leaves open. It is the datum of the plan unless the kind alone gives a motion, as the
-only scale bars do.
-
-Source: Baarda (1973), S-transformations and criterion matrices.
+convergence, rolled photographs, depth of the object); Baarda (1968) for reliability; Baarda (1973),
+S-transformations and criterion matrices.
 """
 
 from __future__ import annotations

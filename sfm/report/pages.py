@@ -5,11 +5,10 @@ A declared page as HTML, with everything that it shows inside it, and its Conten
 Names, reasons and remarks in a page come from files of strangers. The template escapes them; should that ever
 fail somewhere, a browser still refuses any script, style or address that is not in the policy.
 
-Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
-
 A declared page as plain text: tables in columns, facts and sentences in lines, the first rows of each.
-
 Figures, notes, and what a click unfolds on the page are left out, unless it is declared to be in texts.
+
+Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
 """
 
 from __future__ import annotations

@@ -5,13 +5,9 @@ Public names are imported when they are first asked for, and listed once, in the
 `__init__.pyi` is what type checkers and editors read. Every row of it is one public name, `from module import
 name as name`, or one room, `from . import room as room`; a new name is a new row and nothing else.
 
-Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
-
-Kolinear's two packages found by their place, and whether files of other projects lie among them.
-
-Two projects on the registry have packages of the same names, and a user may have a folder of such a name.
-Python packages of one name are merged into one folder without a word, and the `__init__.py` of whichever came
-last is left.
+Kolinear's two packages found by their place, and whether files of other projects lie among them. Two projects
+on the registry have packages of the same names, and a user may have a folder of such a name. Python packages
+of one name are merged into one folder without a word, and the `__init__.py` of whichever came last is left.
 
 Settings of libraries and libraries themselves in the current folder, which may have come with a survey.
 
@@ -20,6 +16,8 @@ so programs. matplotlib reads `matplotlibrc` there, which can have every text se
 libraries and a colon before LD_LIBRARY_PATH; where that is empty, nothing follows the colon, by which the
 linker of every process that is started afterwards understands the current folder. Python looks there first
 for modules in the processes of multiprocessing and Dask, which are started with `python -c`.
+
+Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
-from sfm.errors import KolinearError
+from sfm.errors import InstallationError, KolinearError
 
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
 LIBRARIES = "LD_LIBRARY_PATH"
@@ -86,8 +84,6 @@ def refuse_mixed_installation() -> None:
     for file in FOREIGN:
         path = os.path.join(ROOT, file)
         if os.path.exists(path):
-            from sfm.errors import InstallationError
-
             name = os.path.dirname(file)
             line = (
                 f"{path}: a file of another project, whose package is called {name} too; install Kolinear "
@@ -111,8 +107,6 @@ def load_adapters() -> None:
         folders = list(getattr(loaded, "__path__", ()))
         if [os.path.realpath(folder) for folder in folders] == [os.path.realpath(installed)]:
             return
-        from sfm.errors import InstallationError
-
         where = folders[0] if folders else getattr(loaded, "__file__", None)
         raise InstallationError(
             f"{where}: a package called adapters is imported, and Kolinear has one of that name; rename yours"

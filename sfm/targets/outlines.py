@@ -357,7 +357,7 @@ class Flag(IntFlag):
 
 
 # Reasons for a rejection, those first of which a candidate is most like a target: it has passed the tests of
-# those below, which `candidates` asks first. The last two are no targets lost.
+# those below, which `sfm.targets.measure` asks first. The last two are no targets lost.
 LIKEST_FIRST = (
     *(Flag.NOT_ON_PLATE, Flag.POOR_FIT, Flag.THIN_BACKGROUND, Flag.LOBED, Flag.UNEVEN_EDGE, Flag.BLURRED),
     *(Flag.LOW_CONTRAST, Flag.TOO_OBLIQUE, Flag.TOO_LARGE, Flag.NO_CONVERGENCE, Flag.CUT_BY_BORDER),

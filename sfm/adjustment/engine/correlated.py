@@ -6,16 +6,14 @@ dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; wit
 R has what each image point has alone, in units of its standard deviation, and what a photograph does to
 neighbours alike, in px: whitened, it is the larger the more precise an image point is.
 
+The adjustment as a linear function of the errors of its image points, at the optimum. With the whitened
+derivatives A (reduced unknowns) and B (eliminated object points), errors e of the image points, in units of
+their standard deviations, move the unknowns by dx = Q M e with M = A' - W V^-1 B', W = A'B and V = B'B with
+what is observed of points, and each point by V^-1 (B'e - W'dx).
+
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.6 and 3.2;
-covariance function: Moritz (1980), Advanced Physical Geodesy, sec. 22; Foerstner and Wrobel (2016), sec. 4.2.
-
-The adjustment as a linear function of the errors of its image points, at the optimum.
-
-With the whitened derivatives A (reduced unknowns) and B (eliminated object points), errors e of the image
-points, in units of their standard deviations, move the unknowns by dx = Q M e with M = A' - W V^-1 B',
-W = A'B and V = B'B with what is observed of points, and each point by V^-1 (B'e - W'dx).
-
-Source: Foerstner and Wrobel (2016), sec. 4.2.1 and 15.2.
+covariance function: Moritz (1980), Advanced Physical Geodesy, sec. 22; Foerstner and Wrobel (2016), sec. 4.2
+and 15.2.
 """
 
 from __future__ import annotations

@@ -1,16 +1,15 @@
 """Normal equations of all image points, reduced to orientations and kept points by the Schur complement.
 
 With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
-normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Y is stored by image points. Unknowns are
+normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Unknowns are
 scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into
 fronts, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
 
-Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016),
-sec. 15.2.
+Products of Y with steps and right sides take it as `sfm.adjustment.engine.accumulate` stores it: by image
+points and, for interior unknowns, by object points.
 
-Products of Y, the reduced rows of the object points, with steps and right sides.
-
-Y is stored by image points and, for interior unknowns, by object points (`sfm.adjustment.engine.accumulate`).
+Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016), sec.
+15.2.
 """
 
 from __future__ import annotations

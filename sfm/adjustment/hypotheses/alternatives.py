@@ -1,18 +1,15 @@
 """Alternative hypotheses, each with its gain, and common causes of rejected image points.
 
-A family is a set of columns; a pattern gives each photograph a factor on them, see `patterns`. The level of
+A family is a set of columns; a pattern gives each photograph a factor on them, see `moved`. The level of
 the test is shared out among all alternatives, and lowered by what was searched inside each: the number of
 patterns, or of sets of points, from which the best one was taken.
 
-Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level.
+Common causes of rejected image points: names that were exchanged, points at a second place. The test of the
+adjustment has separated them from the good ones; here they are explained among themselves, with photographs
+as adjusted. They take no part in the tests of `alternatives`, which a few of them would decide.
 
-Common causes of rejected image points: names that were exchanged, points at a second place.
-
-The test of the adjustment has separated them from the good ones; here they are explained among themselves,
-with photographs as adjusted. They take no part in the tests of `alternatives`, which a few of them would
-decide.
-
-Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
+Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level;
+Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
 """
 
 from __future__ import annotations

@@ -9,12 +9,11 @@ With the derivatives E of the image points of one photograph by a separate pose,
 and R = I - A Q A', its shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square
 of six. The photographs of a rig are tested together, the largest shift first, each beside those found before.
 
+The patterns: photographs in which a family is freed, with its gain and the test of the alternative. A pattern
+gives each photograph, or run of photographs, a factor on the columns of a family.
+
 Source: Baarda (1968), A testing procedure for use in geodetic networks; Foerstner and Wrobel (2016), sec.
 4.6.4 (groups of parameters).
-
-The patterns: photographs in which a family is freed, with its gain and the test of the alternative.
-
-A pattern gives each photograph, or run of photographs, a factor on the columns of a family.
 """
 
 from __future__ import annotations

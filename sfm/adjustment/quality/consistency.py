@@ -4,21 +4,17 @@ A bent target or a blurred photograph leaves residuals small enough for the test
 and yet larger than chance makes them together. All tests are against sigma0 a posteriori, with cameras and
 orientations as adjusted, which makes them a little too cautious.
 
-Source: Bartlett (1937), Proc. R. Soc. A 160; Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.2.
+Rejected rays for which another ray of the same point could have been rejected just as well. Of three rays two
+always nearly meet: which one is wrong is decided by what remains along the epipolar line, and data snooping
+blames the wrong one in a quarter of such points with an error of ten standard deviations. Both explanations
+are compared by what they leave; where they differ by less than chance, the point is doubtful.
 
-Rejected rays for which another ray of the same point could have been rejected just as well.
+Rays of single object points: what each adds to the normal equations of its point, cameras as adjusted. By
+these the tests of single points try other explanations of a point's residuals, without adjusting again.
 
-Of three rays two always nearly meet: which one is wrong is decided by what remains along the epipolar line,
-and data snooping blames the wrong one in a quarter of such points with an error of ten standard deviations.
-Both explanations are compared by what they leave; where they differ by less than chance, the point is
-doubtful.
-
-Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (separability of alternative
+Source: Bartlett (1937), Proc. R. Soc. A 160; Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.2;
+Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (separability of alternative
 hypotheses).
-
-Rays of single object points: what each adds to the normal equations of its point, cameras as adjusted.
-
-By these the tests of single points try other explanations of a point's residuals, without adjusting again.
 """
 
 from __future__ import annotations

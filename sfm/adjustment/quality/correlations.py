@@ -3,30 +3,25 @@
 In a flat network with parallel views c is strongly correlated with Z0, x0 and y0 with X0, Y0 or with the
 angles: the standard deviations of both are then large together, while distances between points may be good.
 
+How far the errors of neighbouring image points agree, from the residuals of an adjustment. A lens that
+breathes, a shutter that rolls and a surface that is curved inside of windows move neighbouring image points
+together. Sums of residuals over cells of a photograph, from single image points to half of it, show that: for
+independent errors their squares grow with the number of image points, for common ones with its square. Object
+points, orientations and cameras take a part of either, of long waves the most. How much is left is found by
+simulation: random fields of known length go through the linearised adjustment. A field moves precise image
+points by as many px as others.
+
+Projection uncertainty: how well a calibrated camera knows where a direction is seen in the photograph. The
+covariance of the interior orientation moves the picture of a distant point. The part that equals a rotation
+of the camera is no error of the camera, since every use of it finds the rotation anew: it is taken out by the
+small rotation that fits best to the image points of the calibration. Between these the camera is known,
+beyond them the uncertainty grows.
+
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlations in self-calibration);
-Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
-
-How far the errors of neighbouring image points agree, from the residuals of an adjustment.
-
-A lens that breathes, a shutter that rolls and a surface that is curved inside of windows move neighbouring
-image points together. Sums of residuals over cells of a photograph, from single image points to half of
-it, show that: for independent errors their squares grow with the number of image points, for common ones with
-its square. Object points, orientations and cameras take a part of either, of long waves the most. How much
-is left is found by simulation: random fields of known length go through the linearised adjustment. A field
-moves precise image points by as many px as others.
-
-Source: variance components by quadratic forms and their expectations, Koch (1999), sec. 3.6; nested cells,
-Webster and Oliver (2007), Geostatistics for Environmental Scientists, sec. 6.3; random fields of a given
-covariance, Rahimi and Recht (2007), Adv. Neural Inf. Process. Syst. 20.
-
-Projection uncertainty: how well a calibrated camera knows where a direction is seen in the photograph.
-
-The covariance of the interior orientation moves the picture of a distant point. The part that equals a
-rotation of the camera is no error of the camera, since every use of it finds the rotation anew: it is taken
-out by the small rotation that fits best to the image points of the calibration. Between these the camera is
-known, beyond them the uncertainty grows.
-
-Source: law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
+Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4); variance components by quadratic forms and their
+expectations, Koch (1999), sec. 3.6; nested cells, Webster and Oliver (2007), Geostatistics for Environmental
+Scientists, sec. 6.3; random fields of a given covariance, Rahimi and Recht (2007), Adv. Neural Inf. Process.
+Syst. 20; law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
 """
 
 from __future__ import annotations

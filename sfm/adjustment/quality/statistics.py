@@ -3,17 +3,14 @@
 Global test of the model, tests of the image coordinates, their minimal detectable bias and external
 reliability, significance of parameters, strong correlations.
 
-Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65
-NGS 1; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
-
 Redundancy numbers, standardised residuals and the tests of Baarda and Pope.
 
     R = Q_vv P (redundancy numbers on its diagonal; their sum is the redundancy),
     w = (P v)_i / sqrt(sigma0'^2 (P Q_vv P)_ii)     with sigma0' a priori: Baarda's w ~ N(0, 1),
     tau = the same with sigma0 a posteriori:         Pope's tau ~ tau(r).
 
-Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65
-NGS 1; Foerstner and Wrobel (2016), sec. 4.6.
+Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65 NGS 1;
+Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4; Foerstner and Wrobel (2016), sec. 4.6.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from sfm.cli.commands.planning_inputs import (
     survey_plan,
 )
 from sfm.cli.commands.starting import loading
-from sfm.errors import SurveyFileError
+from sfm.errors import GeometryError, SurveyFileError
 from sfm.planning import MIN_PIXELS
 from sfm.runtime.faults import working_on
 
@@ -401,7 +401,6 @@ def more_command(
         from adapters.formats.given_table import read_given
         from adapters.formats.result_tables import read_result
         from sfm.cli.console import print_verdict
-        from sfm.errors import GeometryError
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.planning.plan import further_photographs
         from sfm.report.pages import page_of, write_declared

@@ -1,10 +1,10 @@
 """Best-fit shapes by orthogonal distances: with the covariance of the network, or with equal weights.
 
+Parameters are given as people want them, with their derivatives by the motions and form of the shape.
+
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space; Foerstner and
 Wrobel (2016), Photogrammetric Computer Vision, secs. 4.8 and 10.6; Luhmann et al. (2020), Close-Range
 Photogrammetry and 3D Imaging, sec. 2.3.
-
-The parameters of shapes as people want them, and their derivatives by the motions and form of a shape.
 """
 
 from __future__ import annotations

@@ -10,10 +10,9 @@ Q_w, and so is the covariance F Q F' = (A' W^-1 A)^-1 - U of the parameters. In 
 the adjusted points and the shape are moved together: its form, v' Q^-1 v and the tests are the same.
 
 Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
-adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory).
-
-Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
-Marquardt (1963), SIAM J. 11(2); Nielsen (1999), Damping parameter in Marquardt's method.
+adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory); Ahn
+(2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3; Marquardt (1963),
+SIAM J. 11(2); Nielsen (1999), Damping parameter in Marquardt's method.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Each shape has its axes y = R' (x - c): its axis or normal is y3. A kind lists w
 motions of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form
 parameters it has, and one function: the signed distance d of points, its gradient g by the point, a unit
 vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and off
-it. The derivative by a motion follows for all kinds alike from g (`shape.design`).
+it. The derivative by a motion follows for all kinds alike from g (`Shape.design`).
 
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8.

@@ -5,10 +5,8 @@ become linear, or a circle, once their axis is known: directions all over the ha
 best are refined by orthogonal distances.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and
-Flusser (1998), Numerically stable direct least squares fitting of ellipses.
-
-Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, ch. 5; Beaton and Tukey (1974),
-Technometrics 16(2).
+Flusser (1998), Numerically stable direct least squares fitting of ellipses; Rousseeuw and Leroy (1987),
+Robust Regression and Outlier Detection, ch. 5; Beaton and Tukey (1974), Technometrics 16(2).
 """
 
 from __future__ import annotations

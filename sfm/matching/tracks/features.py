@@ -1,12 +1,11 @@
 """SIFT features of natural texture, and which photographs have enough in common to match.
 
+Which photographs have enough in common to be worth matching, from a few features of each. Matching every
+photograph with every other takes time with the square of their number. The coarsest features are the most
+likely to be found again from elsewhere; how many of a few hundred of them choose each other shows which
+photographs overlap, in a small part of the time of matching all.
+
 Source: Lowe (2004), IJCV 60(2); Hartley and Zisserman (2003), sec. 11.6 (epipolar geometry by RANSAC).
-
-Which photographs have enough in common to be worth matching, from a few features of each.
-
-Matching every photograph with every other takes time with the square of their number. The coarsest features
-are the most likely to be found again from elsewhere; how many of a few hundred of them choose each other
-shows which photographs overlap, in a small part of the time of matching all.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Pictures: `plots` of an adjustment, `overlays` on photographs, `patches` of matched points."""
+"""Pictures: `plots` of an adjustment, `overlays` on photographs, `comparisons` of results."""

@@ -8,11 +8,7 @@ parallax is what rotations leave between conjugate rays, with the principal dist
 distortion that make it least. A wall photographed from the front looks like a rotation with a lens without
 end; where the least parallax is at the end of what is tried, nothing is refused.
 
-Source: Hartley (1997), Self-calibration of stationary cameras, IJCV 22(1); Foerstner and Wrobel (2016),
-Photogrammetric Computer Vision, sec. 13.3.6 (critical configurations).
-
 Parts of a survey that do not fit the rest: a second object of the same codes, a mirror image, a motion.
-
 Photographs without orientation are oriented by themselves, both parts are adjusted, and the points that they
 have in common are compared as those of any two results (`sfm.comparison`): what a camera explains, that bends
 the whole, is no other object, nor is what agrees but for single points.
@@ -21,7 +17,9 @@ The orientation of tie points is that of the larger part of them. Where walkers 
 an object, it is theirs, and as precise as any other. Tie points that it does not explain are oriented by
 themselves; errors by chance have no orientation, another rigid body has one.
 
-Source: Torr (1998), Geometric motion segmentation, Phil. Trans. R. Soc. A 356.
+Source: Hartley (1997), Self-calibration of stationary cameras, IJCV 22(1); Foerstner and Wrobel (2016),
+Photogrammetric Computer Vision, sec. 13.3.6 (critical configurations); Torr (1998), Geometric motion
+segmentation, Phil. Trans. R. Soc. A 356.
 """
 
 from __future__ import annotations

@@ -21,13 +21,12 @@ from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import inside, is_home_file
+from sfm.survey.inputs.survey_file import SurveyFile, inside, is_home_file
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
 
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
-    from sfm.survey.inputs.survey_file import SurveyFile
 
 MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
 

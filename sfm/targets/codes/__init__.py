@@ -1,1 +1,1 @@
-"""Codes of targets: `families` lists them, `rings` and `tags` know their patterns and read them."""
+"""Codes of targets: `plates.code_family` finds one by its name, `rings` and `tags` read theirs."""

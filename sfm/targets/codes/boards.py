@@ -11,17 +11,15 @@ make a lattice. On each side of it the board ends where the next crossings would
 or the photograph cuts it. A board that ends on one side at least in both directions is named, with the
 colours of its squares; one whose naming stays uncertain is not.
 
-Source: the determinant of the Hessian as detector of saddles, Chen and Zhang (2005), ICMIT.
+AprilGrids: tags in rows, numbered along them from the lower left, and black squares at their corners. A tag
+and the squares at its corners touch as squares of a checkerboard do, so that its corners are crossings. That
+hides the tags from finders of outlines: regions darker than where they touch are opened first, which parts
+them, and the tags are read where their measured corners place them. Kalibr prints tags with a border of two
+modules, other programs with one, and turned in different ways: the turn in which the corners of all tags are
+those of one plane is taken.
 
-AprilGrids: tags in rows, numbered along them from the lower left, and black squares at their corners.
-
-A tag and the squares at its corners touch as squares of a checkerboard do, so that its corners are crossings.
-That hides the tags from finders of outlines: regions darker than where they touch are opened first, which
-parts them, and the tags are read where their measured corners place them. Kalibr prints tags with a border
-of two modules, other programs with one, and turned in different ways: the turn in which the corners of all
-tags are those of one plane is taken.
-
-Source: Kalibr (github.com/ethz-asl/kalibr), calibration targets; Olson (2011), ICRA, for the tags.
+Source: the determinant of the Hessian as detector of saddles, Chen and Zhang (2005), ICMIT; Kalibr
+(github.com/ethz-asl/kalibr), calibration targets; Olson (2011), ICRA, for the tags.
 """
 
 from __future__ import annotations

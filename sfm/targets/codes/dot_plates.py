@@ -1,6 +1,6 @@
 """Plates of dots: the lattice of dots in a photograph, and which dot of the plate each is.
 
-Dots make a lattice (see `lattice`). A placement puts it on the plate: turned by quarters, or for shifted
+Dots make a lattice (see `find_lattice`). A placement puts it on the plate: turned by quarters, or for shifted
 rows one of the bases of the lattice, and moved. With marks each placement that overlaps the plate has a
 likelihood: dots are as large as perspective makes them but for errors, marks larger by one common ratio, and
 some dots may be anything (damage, shadows). The placement that is certain is taken; what lies beyond the

@@ -1,10 +1,10 @@
-"""Space resection by other methods, one a file, and `by_method.resect`: any method by its name.
+"""Space resection by other methods, and `by_method.resect`: any method by its name.
 
-- `p4p` (points of a plane), `zeng_wang`, `rampal`: closed, without approximate values.
+- `p4p` (points of a plane), `zeng_wang` (and Rampal's method): closed, without approximate values.
 - `church`: three points and an approximate position.
 - `dlt`: with the interior orientation, from six points on.
 - `unknown_noise`: the tolerance of random sample consensus found from the points.
-- `critical_cylinder`: whether three points determine the position well.
+- `by_method.cylinder_distance`: whether three points determine the position well.
 """
 
 METHODS = (

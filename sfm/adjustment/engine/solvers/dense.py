@@ -5,14 +5,11 @@ solution is the one with Q'dx = 0: an inner constraint, not damping. Directions 
 cannot determine although the datum does not explain them are found as further null vectors and held in
 the same way, so that everything else is still estimated; they are reported.
 
-Y Y' is summed as a product of full rows (`full_rows`) or pair by pair of rays (`pairs`), and so are the
-elements of S^-1 that marginal covariances are made of.
+Y Y' is summed as a product of full rows Y' of the object points, where most photographs see most points, or
+pair by pair of rays (`fronts.Pairs`), and so are the elements of S^-1 that marginal covariances are made of.
 
-Source: Foerstner and Wrobel (2016), sec. 4.5 and 15.2.5; Luhmann et al. (2020), sec. 4.4.3.
-
-Products of full rows Y' of the object points, for networks in which most photographs see most points.
-
-Source: Foerstner and Wrobel (2016), sec. 15.2; Golub and Van Loan (2013), sec. 1.3 (products by blocks).
+Source: Foerstner and Wrobel (2016), sec. 4.5, 15.2 and 15.2.5; Luhmann et al. (2020), sec. 4.4.3; Golub and
+Van Loan (2013), sec. 1.3 (products by blocks).
 """
 
 from __future__ import annotations

@@ -5,10 +5,7 @@ that share object points with the group or with what was eliminated before it. A
 object point are in one front, that of the first of them to be eliminated, so an object point adds to one
 full matrix only, and takes all it needs of the inverse from one.
 
-Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1).
-
 In what order photographs are eliminated so that little is filled in: nested dissection of their graph.
-
 Photographs that share object points are neighbours. A few of them, the separator, split the others into two
 halves without a common point; the halves are eliminated first, each split again in the same way, and the
 separator last. For a block of m photographs the factor has of the order of m log m elements and takes m^1.5
@@ -17,15 +14,13 @@ operations, where a band takes m^1.5 and m^2.
 Where to split is found by distances in the graph from four photographs at its far ends: by the difference of
 two of them, or of two sums of two, as a block is split across its diagonals or along its sides.
 
-Source: George (1973), SIAM J. Numer. Anal. 10(2); George and Liu (1981), Computer Solution of Large Sparse
-Positive Definite Systems, ch. 8.
-
-Sums over the pairs of rays of each object point, where a product of full rows would mostly multiply zeros.
-
-Y Y' and Y' Q need only the blocks of photographs that share a point. They are summed tile by tile: TILE
+Sums over the pairs of rays of each object point, where a product of full rows would mostly multiply zeros. Y
+Y' and Y' Q need only the blocks of photographs that share a point. They are summed tile by tile: TILE
 photographs by as many others, which stay in the cache while all object points add to them.
 
-Source: Brown (1976), Photogramm. Eng. Remote Sens. 42(8); tiles: Golub and Van Loan (2013), sec. 1.5.
+Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1); George (1973), SIAM
+J. Numer. Anal. 10(2); George and Liu (1981), Computer Solution of Large Sparse Positive Definite Systems, ch.
+8; Brown (1976), Photogramm. Eng. Remote Sens. 42(8); tiles: Golub and Van Loan (2013), sec. 1.5.
 """
 
 from __future__ import annotations

@@ -8,18 +8,15 @@ rest to the next. The motions that the datum leaves open, and any further null v
 to one diagonal element for each: with g free of the null space these unknowns get dx = 0 and nothing else
 changes, a minimal constraint.
 
+Null vectors of a reduced normal matrix that is never put together, by subspace iteration. The matrix with a
+small shift of its diagonal is factored; solving with it again and again brings forward the directions that
+the observations leave open, of which Rayleigh and Ritz's method then takes those with eigenvalue 0. They
+carry the rounding of a factor that is all but singular; one step with the factor in which they are held takes
+them to the rounding of the matrix itself, as its eigenvalue decomposition would.
+
 Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1); Foerstner and
-Wrobel (2016), sec. 15.2.4 and 4.5.
-
-Null vectors of a reduced normal matrix that is never put together, by subspace iteration.
-
-The matrix with a small shift of its diagonal is factored; solving with it again and again brings forward the
-directions that the observations leave open, of which Rayleigh and Ritz's method then takes those with
-eigenvalue 0. They carry the rounding of a factor that is all but singular; one step with the factor in
-which they are held takes them to the rounding of the matrix itself, as its eigenvalue decomposition would.
-
-Source: Golub and Van Loan (2013), Matrix Computations, sec. 8.2.4 and 8.1; Wilkinson (1965), The Algebraic
-Eigenvalue Problem, ch. 9 (inverse iteration).
+Wrobel (2016), sec. 15.2.4 and 4.5; Golub and Van Loan (2013), Matrix Computations, sec. 8.2.4 and 8.1;
+Wilkinson (1965), The Algebraic Eigenvalue Problem, ch. 9 (inverse iteration).
 """
 
 from __future__ import annotations

@@ -11,19 +11,16 @@ Huber's estimator bounds the influence of an image point, Tukey's biweight takes
 beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
 has many minima, and both take their scale from the median of the residuals.
 
-Source: Pope (1976), NOAA TR NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier testing;
-Huber and Ronchetti (2009), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for
-the biweight; Maronna et al. (2019), Robust Statistics, sec. 2.3, for efficiency.
+Several wrong rays of one object point, taken out one after another from one adjustment. A ray that leaves
+moves the residuals of the other rays of its point much, and those of all else by its leverage on a photograph
+only. With the cameras fixed the cofactors of the residuals of a point's rays are I - B V^-1 B', and residuals
+and cofactors after a ray has left follow from those before, without another adjustment.
 
-Several wrong rays of one object point, taken out one after another from one adjustment.
-
-A ray that leaves moves the residuals of the other rays of its point much, and those of all else by its
-leverage on a photograph only. With the cameras fixed the cofactors of the residuals of a point's rays are
-I - B V^-1 B', and residuals and cofactors after a ray has left follow from those before, without another
-adjustment.
-
-Source: Cook and Weisberg (1982), Residuals and Influence in Regression, sec. 2.2.3, for the residuals when
-observations are left out; Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.
+Source: Pope (1976), NOAA TR NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier testing; Huber
+and Ronchetti (2009), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for the
+biweight; Maronna et al. (2019), Robust Statistics, sec. 2.3, for efficiency; Cook and Weisberg (1982),
+Residuals and Influence in Regression, sec. 2.2.3, for the residuals when observations are left out; Foerstner
+and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.
 """
 
 from __future__ import annotations
