@@ -30,7 +30,7 @@ AXES, SIGMAS = ("X", "Y", "Z"), ("sX", "sY", "sZ")
 COVARIANCES, CHECKS = ("cXY", "cXZ", "cYZ"), ("checkX", "checkY", "checkZ")
 CONTROL = "control.csv"
 ORIENTATION = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
-BETWEEN = ("XY", "XZ", "YZ")  # of correlated coordinates
+COVARIANCE_PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates
 
 
 class Statistics(Content):
@@ -86,7 +86,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             xyz, C = control.setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
             k = "XYZ".index(coordinate)
             xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else np.inf
-        elif kind == CONTROL_COVARIANCE and index.get(name) in control and coordinate in BETWEEN:
+        elif kind == CONTROL_COVARIANCE and index.get(name) in control and coordinate in COVARIANCE_PAIRS:
             C, (row, column) = control[index[name]][1], map("XYZ".index, coordinate)
             C[row, column] = C[column, row] = given
         elif kind == "interior orientation":

@@ -29,19 +29,15 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import inlined
 
-MODEL = "brown_forward"  # the model of this form
+BALANCED_MODEL = "brown_forward"  # the model whose other form is the balanced one
 BALANCED = ("c", "x0", "y0", "A1", "A2", "A3", "R0", "B1", "B2", "C1", "C2")
-UNITS = ("mm", "mm", "mm", "mm^-2", "mm^-4", "mm^-6", "mm", "mm^-1", "mm^-1", "1", "1")
+BALANCED_UNITS = ("mm", "mm", "mm", "mm^-2", "mm^-4", "mm^-6", "mm", "mm^-1", "mm^-1", "1", "1")
 BALANCED_STEPS = 50  # of Newton's method at most
 CONVERGED = 1e-15  # last step of s, which is near 1
 Values = tuple[tuple[str, float], ...]
-LOCATED_PX = (
-    0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square
-)
+LOCATED_PX = 0.25  # Newton's step after which one more leaves nothing: its error is curvature by its square
 STEPS = 20  # Newton's steps at most
-FOLDED = (
-    0.01  # determinant of d(corrected)/d(measured), 1 without distortion, below which corrections fold over
-)
+FOLDED = 0.01  # determinant of d(corrected)/d(measured), 1 without distortion: corrections fold over below it
 
 
 @inlined

@@ -190,7 +190,7 @@ def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 
         camera=camera.name,
         parameters=names,
         sigma=np.where(sigma > 0, sigma, np.nan),
-        contribution=_contribution(camera, a.covariance.interior[camera_index], xy) / prediction.sigma_px,
+        contribution=_angle_sigma_px(camera, a.covariance.interior[camera_index], xy) / prediction.sigma_px,
         cost=free.rms_sigma / fixed.rms_sigma,
         rolled=rolled_share(R),
         convergence_deg=float(np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1).min()))),
@@ -216,7 +216,7 @@ def rolled_share(rotation: FloatArray) -> float:
     return float(min(upright.mean(), 1 - upright.mean()))
 
 
-def _contribution(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
+def _angle_sigma_px(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
     """Return what the uncertainty of the interior orientation does to the angles between rays, RMS, px.
 
     A principal point that is off by little and a camera that is turned by as much cannot be distinguished,
@@ -253,14 +253,16 @@ def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
     found = []
     if a.estimate.mounts is not None and a.network.moment is not None:
         moments = len(np.unique(a.network.moment))
-        found.append(_gain_of(a, RIG, moments, *_without_rig(a.network, a.estimate)))
+        found.append(_contribution_of(a, RIG, moments, *_without_rig(a.network, a.estimate)))
     for name in dict.fromkeys(kind.name for kind in a.network.kinds if len(kind)):
         count = sum(len(kind) for kind in a.network.kinds if kind.name == name)
-        found.append(_gain_of(a, name, count, *_without(a.network, a.estimate, name)))
+        found.append(_contribution_of(a, name, count, *_without(a.network, a.estimate, name)))
     return tuple(found)
 
 
-def _gain_of(a: Adjustment, name: str, count: int, network: Network, estimate: Estimate) -> Contribution:
+def _contribution_of(
+    a: Adjustment, name: str, count: int, network: Network, estimate: Estimate
+) -> Contribution:
     """Return what is gained from a network without a kind to the whole one."""
     rest = tuple(kind for kind in network.observations if not kind.needs_scale)
     known, less = _determined(a), None

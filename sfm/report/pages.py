@@ -44,11 +44,6 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import is_number
 
-WIDTH = 100
-MAX_ROWS = 10  # of a table
-NAME_WIDTH = 36  # of what a fact is about, at most
-MARGIN = "  "
-NOTHING = "'none'"
 PAGES: Mapping[str, str] = {
     "Acceptance": "sfm.report.measurement:acceptance_page",
     "EpochSeries": "sfm.report.epochs:page",
@@ -62,6 +57,11 @@ PAGES: Mapping[str, str] = {
     "ViewerScene": "sfm.report.view_page:page",
 }
 """The type of a result, and the module, imported when needed, with the function that declares its page."""
+NO_SOURCE = "'none'"  # of a Content-Security-Policy
+WIDTH = 100  # of the text, columns
+MARGIN = "  "  # before its lines
+MAX_ROWS = 10  # of a table in it
+NAME_WIDTH = 36  # of what a fact is about, at most
 
 
 def page_of(found: Any, **beside: Any) -> Page:
@@ -166,14 +166,14 @@ def content_policy(
         pictures_beside: whether it shows pictures that lie beside it, which the policy calls 'self'.
     """
     allowed = {
-        "default-src": [NOTHING],
+        "default-src": [NO_SOURCE],
         "img-src": ["data:", "'self'"] if pictures_beside else ["data:"],
         "style-src": [_hash(text) for text in styles],
         "script-src": [_hash(text) for text in scripts],
-        "base-uri": [NOTHING],
-        "form-action": [NOTHING],
+        "base-uri": [NO_SOURCE],
+        "form-action": [NO_SOURCE],
     }
-    return "; ".join(" ".join((name, *(sources or [NOTHING]))) for name, sources in allowed.items())
+    return "; ".join(" ".join((name, *(sources or [NO_SOURCE]))) for name, sources in allowed.items())
 
 
 def _hash(text: str) -> str:

@@ -216,11 +216,11 @@ def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, Flo
         if step @ parts.N.sum(axis=0) @ step < LAST_STEP_SIGMAS**2:
             break
         X = X + step
-        alone = replace(alone, residuals=_residuals(alone, X), estimate=_point_moved(alone.estimate, j, X))
+        alone = replace(alone, residuals=_residuals(alone, X), estimate=_with_point(alone.estimate, j, X))
     return X, Q, parts.misfit(every)
 
 
-def _point_moved(estimate: Estimate, point: int, X: FloatArray) -> Estimate:
+def _with_point(estimate: Estimate, point: int, X: FloatArray) -> Estimate:
     points = estimate.points.copy()
     points[point] = X
     return replace(estimate, points=points)

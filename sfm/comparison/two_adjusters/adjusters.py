@@ -44,6 +44,12 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.reduced_network import reduce_network, supported
 from sfm.runtime.progress import report_step
 
+MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
+# The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
+# does not show whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
+MAX_ITERATIONS = 200
+ALPHA = 0.05  # of the chi-square test whether the image points distinguish two solutions, with 1 freedom
+Outcome = Literal["agrees", "fits alike", "differs"]
 CAMERA_ALPHA = 0.001  # probability of the F-test where both cameras fit alike
 MIN_RMS_RATIO = 1.1  # times; below it the difference is not seen in the coordinates
 
@@ -60,14 +66,6 @@ class BetterFit:
     def times(self) -> float:
         """How many times smaller the residuals are."""
         return self.own_rms_px / self.rms_px if self.rms_px > 0 else np.inf
-
-
-MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
-# The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
-# does not show whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
-MAX_ITERATIONS = 200
-ALPHA = 0.05  # of the chi-square test whether the image points distinguish two solutions, with 1 freedom
-Outcome = Literal["agrees", "fits alike", "differs"]
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.shapes.kinds import Shape
 
-DISTANCE_ITERATIONS = 400  # large residuals on short arcs converge slowly
+ORTHOGONAL_ITERATIONS = 400  # of equal weights: large residuals on short arcs converge slowly
 FIRST_DAMPING = 1e-4
-DISTANCE_CONVERGED = 1e-15  # step over the unit size of the points
+ORTHOGONAL_CONVERGED = 1e-15  # step over the unit size of the points
 ITERATIONS = 100
 CONVERGED = 1e-13  # of steps over the unit size of the points
 SAME_NORMALS = 1e-9  # change of normals that leaves the weights as they are
@@ -242,7 +242,7 @@ def refine_orthogonal(
     offset: FloatArray,
     weight: FloatArray | None = None,
     placed: bool = True,
-    iterations: int = DISTANCE_ITERATIONS,
+    iterations: int = ORTHOGONAL_ITERATIONS,
 ) -> tuple[Shape, float, bool]:
     """Return the shape of the least sum of squared distances near a start.
 
@@ -279,7 +279,7 @@ def refine_orthogonal(
         size = float(np.abs(step).max())
         if not np.isfinite(size):
             return shape, cost, False
-        if size <= DISTANCE_CONVERGED * max(1.0, float(np.abs(shape.form).max(initial=0.0))):
+        if size <= ORTHOGONAL_CONVERGED * max(1.0, float(np.abs(shape.form).max(initial=0.0))):
             return shape, cost, True
         trial = shape.moved(step, nothing) if placed else moved_in_place(shape, step)
         new_e, new_A = system(trial)

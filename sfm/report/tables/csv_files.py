@@ -12,8 +12,14 @@ from sfm.adjustment.quality.statistics import MIN_CHECKED_REDUNDANCY
 from sfm.adjustment.result import Adjustment
 from sfm.camera import base_name
 from sfm.conventions import FloatArray
-from sfm.distortion.brown import BALANCED, UNITS, brown_by_balanced, from_balanced, to_balanced
-from sfm.distortion.brown import MODEL as BALANCED_MODEL
+from sfm.distortion.brown import (
+    BALANCED,
+    BALANCED_MODEL,
+    BALANCED_UNITS,
+    brown_by_balanced,
+    from_balanced,
+    to_balanced,
+)
 from sfm.errors import GeometryError
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
@@ -104,7 +110,7 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
         variance = np.diagonal(inverse @ Q[np.ix_(order, order)] @ inverse.T)
         sigma = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.nan)
         at_R0 = BALANCED.index("R0")
-        for (name, value), s, unit in zip(rows, np.insert(sigma, at_R0, np.nan), UNITS, strict=True):
+        for (name, value), s, unit in zip(rows, np.insert(sigma, at_R0, np.nan), BALANCED_UNITS, strict=True):
             yield (camera.name, name, -value if name == "c" else value, s, unit)
 
 

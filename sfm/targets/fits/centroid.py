@@ -14,12 +14,19 @@ from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import as_grey
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 
+WEIGHTS = ("binary", "intensity", "squared")
+# The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
+# first part, where the blur of the edge has died away.
+MARGIN_PX, BLURRED_PX = 4.0, 2.5
+# Intensities that differ from the background by less than so many sigma are background.
+THRESHOLD_SIGMAS = 3.0
 # The edges are traced from the ellipse found last; three times do from a start that is half a radius off.
 TRACES = 3
 # Unknowns of an ellipse.
 UNKNOWNS = 5
 # Share of the rays that must agree with the ellipse.
 MIN_AGREEMENT = 0.7
+# Edges are looked for this far beyond the ellipse, px.
 EDGE_MARGIN_PX = 3.0
 # Edges farther from the ellipse than this, in radii, do not count.
 TOLERANCE = 0.15
@@ -27,12 +34,6 @@ TOLERANCE = 0.15
 NEXT_HARMONICS = slice(3, 6)
 # Samples to both sides of the edge over which its position is averaged.
 WINDOW = 5
-WEIGHTS = ("binary", "intensity", "squared")
-# The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
-# first part, where the blur of the edge has died away.
-MARGIN_PX, BLURRED_PX = 4.0, 2.5
-# Intensities that differ from the background by less than so many sigma are background.
-THRESHOLD_SIGMAS = 3.0
 # Variance of the position of an edge in its pixel, px^2: uniformly distributed.
 EDGE_VARIANCE = 1 / 12
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm.display import counted, listed
-from sfm.distortion.brown import BALANCED, from_balanced
-from sfm.distortion.brown import MODEL as BALANCED_MODEL
+from sfm.distortion.brown import BALANCED, BALANCED_MODEL, from_balanced
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.calibration import (
