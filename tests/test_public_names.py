@@ -296,7 +296,8 @@ def test_notebooks_show_tables_in_which_names_are_escaped(result: SurveyResult) 
     point = sfm.Solution("<script>", result.network, result.estimate)
     assert "<script>" not in point._repr_html_() and "&lt;script&gt;" in point._repr_html_()
     assert repr(result.points).splitlines()[1].split() == ["point", "X", "Y", "Z", "sX", "sY", "sZ", "rays"]
-    for value in (result.network, result.estimate, result.adjustment, result.point("1"), result.solution):
+    short = (result.network, result.estimate, result.adjustment, result.point("1"), result.solution)
+    for value in (*short, sfm.compare(result, result)):
         assert 20 < len(repr(value)) < 500, type(value)
 
 

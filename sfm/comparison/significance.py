@@ -35,6 +35,7 @@ from sfm.comparison.pairing import (
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
+from sfm.display import html_table, text_table
 from sfm.errors import GeometryError
 from sfm.network import Network
 from sfm.remarks.remark import Remark, remark
@@ -61,7 +62,7 @@ class InteriorDifference:
     conversion: Conversion | None  # of b's camera into a's model, None if it was the same
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ResultComparison:
     """Differences b - a of two results after b was aligned to a."""
 
@@ -106,6 +107,26 @@ class ResultComparison:
         return bool(
             self.global_statistic > self.global_critical or self.significant.any() or not self.majority
         )
+
+    def _rows(self) -> list[tuple[str, str]]:
+        longest = float(np.linalg.norm(self.point_difference, axis=1).max(initial=0.0))
+        test = f"{int(self.significant.sum())} of {len(self.points)} points moved"
+        if self.untested is not None:
+            test = self.untested.text
+        elif self.cause is not None or not self.majority:
+            test = "the points differ as a whole"
+        return [
+            ("points", f"{len(self.points)} common, aligned over {self.alignment}"),
+            ("photographs", f"{len(self.images)} common"),
+            ("largest difference", f"{longest:.3g} {self.unit}".rstrip()),
+            ("test", test),
+        ]
+
+    def __repr__(self) -> str:
+        return text_table(f"Comparison of {' and '.join(self.names)}", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Comparison of {' and '.join(self.names)}", ("", ""), self._rows())
 
 
 @checked_arguments()
