@@ -12,7 +12,6 @@ import tempfile
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 
 from sfm.errors import KolinearError, one_line
@@ -70,6 +69,8 @@ def ending_of(error: Exception) -> tuple[str, int]:
 
 def keep_traceback(error: Exception) -> Path | None:
     """Write a traceback into a new file that only this user can read; None if there is no place for it."""
+    from importlib.metadata import version
+
     lines = (f"kolinear {version('kolinear')}, Python {sys.version}\n", f"{sys.argv}\n\n")
     try:
         number, name = tempfile.mkstemp(prefix="kolinear-fault-", suffix=".txt")

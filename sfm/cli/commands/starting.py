@@ -1,6 +1,6 @@
 """Starting the program: the first compilation, Ctrl-C, and `doctor`, which checks an installation.
 
-Printing where a code page lacks characters, a disk is full or a reader ends early.
+What is printed is also guarded: a code page may lack characters, a disk be full, a reader end early.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
@@ -243,6 +242,8 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(name)
     except PackageNotFoundError:
