@@ -1,8 +1,7 @@
 """A part of a network, counted anew, and checks of networks before they are adjusted.
 
-Checks of the input of an adjustment from Python, as of files: shapes, indices, numbers, covariances.
-
-The first thing that is wrong is named, with what was expected.
+Input of an adjustment from Python is checked as files are: shapes, indices, numbers, covariances. The first
+thing that is wrong is named, with what was expected.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """3-D similarity (absolute orientation): closed form, weighted, with residuals and covariance.
 
-Two-dimensional similarity and affine transformations (fiducial marks) live in orientation/fiducials.
+Two-dimensional similarity and affine transformations (fiducial marks) are in
+`sfm.textbook.photo_coordinates`.
 
 Source: Szeliski and Kang (1997), IEEE PAMI 19(5), for the reversal of depth.
 """

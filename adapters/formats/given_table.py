@@ -1,11 +1,9 @@
 """Given values, control and check points of a result, read from and written to tables.
 
-Control and check points of a result: control.csv of converted tables, control_points.csv of a survey.
+    control.csv         of converted tables: id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], else empty
+    control_points.csv  of a survey: a row for each coordinate
 
-    control.csv         id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], empty where not known
-    control_points.csv  a row for each coordinate
-
-Source: RFC 4180 for CSV; the columns are described in the README.
+Source: RFC 4180 for CSV; docs/reference/results.md describes each column.
 """
 
 from __future__ import annotations

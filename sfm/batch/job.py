@@ -1,7 +1,5 @@
 """One survey of a batch, as a worker runs it, and which results `--resume` may keep.
 
-Which results were finished by batches of this user: what `--resume` may keep.
-
 A result that lies in the folder of a batch may have come with the survey, with a log and a manifest that fit.
 So whoever finishes a result notes it in the user's cache folder, by its path and the hash of its manifest,
 which has the hashes of its files.

@@ -1,12 +1,7 @@
 """OpenCV's models, and equidistant ones with decentring and thin prism distortion.
 
-The ideal point (a, b) goes to e = s(r2) (a, b), as in `radial`, and from there to the distorted point.
-
-Its outputs are described in `sfm.distortion.models`.
-
-The models of computer vision, in units of the focal lengths: OpenCV's, as COLMAP has them.
-
-They distort the ideal point. Its outputs are described in `sfm.distortion.models`.
+All are in units of the focal lengths, as COLMAP has them. The ideal point (a, b) goes to e = s(r2) (a, b), as
+in `radial`, and from there to the distorted point. Outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations

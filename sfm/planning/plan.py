@@ -1,9 +1,7 @@
 """A plan: stations, predicted precision and weaknesses; photographs to add after a survey.
 
-After a survey: which few photographs more would help its weakest points most.
-
-Directions are taken from the existing rays: a point faces the mean of its rays. Obstacles in other directions
-are not known.
+After a survey it states which few photographs more would help its weakest points most. Directions are taken
+from the existing rays: a point faces the mean of its rays. Obstacles in other directions are not known.
 
 Source: Fedorov (1972), Theory of Optimal Experiments (augmentation of a design).
 """

@@ -1,8 +1,6 @@
 """Sentences and numbers as several reports and the terminal print them.
 
-Numbers as people read them: significant digits, exponents, units of a readable size.
-
-Every report writes its numbers with these.
+Numbers are written as people read them: significant digits, exponents, units of a readable size.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Outlines that resemble ellipses, the candidates for targets, and the quality flags.
 
-Quality flags of targets and of rejected candidates: the one list of reasons.
-
-A measured target may carry several remarks (`SATURATED`, `CODE_UNREADABLE`, ...); a candidate that is not
-measured carries the first reason that excluded it.
+The quality flags are the one list of reasons, of targets and of rejected candidates. A measured target may
+carry several remarks (`SATURATED`, `CODE_UNREADABLE`, ...); a candidate that is not measured carries the
+first reason that excluded it.
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
 """Direct orientation of a pair onto control, and adjustment of points and photographs in turn.
 
-Separate adjustment: object points and orientations in turn, in place of all unknowns together.
-
-Each round first moves every object point with the orientations held (3 x 3 systems), then all
-orientations with the points held (one system of the exterior orientations and the interior parameters).
-It ends at the same optimum as the simultaneous adjustment, but converges only linearly and knows no
-covariance between points and orientations: what it would call the precision of a point is the limiting
-precision.
+Separate adjustment takes object points and orientations in turn, in place of all unknowns together. Each
+round first moves every object point with the orientations held (3 x 3 systems), then all orientations with
+the points held (one system of the exterior orientations and the interior parameters). It ends at the same
+optimum as the simultaneous adjustment, but converges only linearly and knows no covariance between points and
+orientations: what it would call the precision of a point is the limiting precision.
 
 Source: document 000 of the project's sources, sec. 2.4; block coordinate descent in Nocedal and Wright,
 Numerical Optimization (2006), sec. 9.3.

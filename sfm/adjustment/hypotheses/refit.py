@@ -3,11 +3,10 @@
 The parameters of the alternative take the score step, their effect leaves the image points, and the network
 is adjusted anew; a few rounds end at the joint optimum. Rejected image points come back where they fit.
 
-How wrong an assumption may be before the tests name it: external reliability of alternatives.
-
-Parameters b of an alternative have the noncentrality b'Hb and shift coordinates by E b. Where lambda is the
-noncentrality that the tests find with 80 % probability, a coordinate of standard deviation s with the row e
-of E shifts by up to sqrt(lambda e H^-1 e') / s before.
+External reliability is how wrong an assumption may be before the tests name it. Parameters b of an
+alternative have the noncentrality b'Hb and shift coordinates by E b. Where lambda is the noncentrality that
+the tests find with 80 % probability, a coordinate of standard deviation s with the row e of E shifts by up to
+sqrt(lambda e H^-1 e') / s before.
 
 Source: Baarda (1968), A testing procedure for use in geodetic networks (external reliability); Foerstner and
 Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4.2.

@@ -1,20 +1,16 @@
 """Comparison of two adjusters on one network, with a camera that both can estimate.
 
-Two adjusters are compared on what both can do: the accepted
-image points with equal weights, no control and no scale bars, and one functional model, which for a
-survey in `brown` is `full_opencv`.
+Two adjusters are compared on what both can do: the accepted image points with equal weights, no control and
+no scale bars, and one functional model, which for a survey in `brown` is `full_opencv`. Cameras that share
+single parameters get one each, for adjusters that know no such sharing.
 
 With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
 the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
 all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's
-from functools import partial
 result in both adjusters, and the comparison reports it.
 
-Cameras that share single parameters, for adjusters that know no such sharing.
-
-Whether the other adjuster's camera fits the image points better than that of the survey, and what to free.
-
-COLMAP frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
+Whether the other adjuster's camera fits the image points better than that of the survey is tested too: COLMAP
+frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
 that has more free than the survey's; that they agree then proves nothing about the survey.
 """
 

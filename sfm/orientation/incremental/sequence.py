@@ -8,10 +8,9 @@ orientation is learnt while the network grows. At last photographs that the othe
 values are start values: they are completed and adjusted as they are, and only where the image points do not
 fit the result are photographs oriented anew, with them or, if they lead nowhere, without them.
 
-Given start values of a network: completed and adjusted as they are, judged afterwards.
-
-A photograph is oriented anew only where most of its image points do not fit the others after the adjustment;
-where most photographs do not, the given values are wrong, and the caller starts without them.
+Given start values are judged afterwards. A photograph is oriented anew only where most of its image points do
+not fit the others after the adjustment; where most photographs do not, the given values are wrong, and the
+caller starts without them.
 """
 
 from __future__ import annotations

@@ -1,16 +1,12 @@
 """Everything that the reports of a survey state, computed once: findings, remarks and verdict.
 
-Remarks on given values after the adjustment: residuals, checks, and whether the scale can be.
+Whatever prints a result takes its numbers from `Findings`: statistics, checks, geometry, given values,
+precision, protocol, verdict.
 
 Given values are judged by the image points alone before they take part; these are the tests of those that
 took part, and of those that only check the result. Given interior orientation is not tested here: whether it
 is wrong is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object
 points.
-
-Everything that the reports of a survey state, computed once: Findings.
-
-Whatever prints a result takes its numbers from here: statistics, checks, geometry, given values, precision,
-protocol, verdict.
 """
 
 from __future__ import annotations

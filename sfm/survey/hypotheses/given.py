@@ -3,11 +3,10 @@
 A contradicting value is left out and named where the others identify it; where they do not, nothing that it
 touches is believed. The rest takes part in the adjustment.
 
-Given mounts of the cameras of a rig, judged by the photographs before they are used.
-
-A network without them has the mounts that its photographs give, with their covariance. Rotation and direction
-of the base are compared with those of the image points alone, which leave the length of the base open; the
-length with those of the other mounts, and of all else that gives a scale.
+Mounts of the cameras of a rig are judged by the photographs: a network without them has the mounts that its
+photographs give, with their covariance. Rotation and direction of the base are compared with those of the
+image points alone, which leave the length of the base open; the length with those of the other mounts, and of
+all else that gives a scale.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests).
 """

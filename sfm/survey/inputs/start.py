@@ -5,7 +5,7 @@ Image points outside their photograph: no photograph has them, so that a setting
 Single ones are gross errors and are left out by name. More of them refuse the survey, with what would bring
 them inside: x and y exchanged, another unit, or a larger photograph.
 
-Image points that are more than once in a table: one point measured twice in one photograph.
+An image point that is more than once in a table is one point measured twice in one photograph.
 """
 
 from __future__ import annotations

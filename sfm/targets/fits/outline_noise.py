@@ -4,12 +4,10 @@ Harmonics 3 to 6 of an outline follow no ellipse. They are estimated jointly wit
 edge. Deviations common to the targets of a photograph are shape. The rest shows the variance of the first
 harmonic, which is the centre, whatever makes it: rough printing, compression, correlated noise.
 
-Damage of the outlines of targets, found against the shape that the targets of a photograph share.
-
-The edge of a target is divided into sectors. The deviation h of the outline in a sector, in radii, follows
-from the residuals of the blurred ellipse there. The median over the targets of a photograph is shape:
-polygonal printing or sharpening, which moves all of them alike. A place is damaged where the rest is
-significant against the scatter along the edge, of this target and of the others.
+Damage is found against that shape. The edge of a target is divided into sectors. The deviation h of the
+outline in a sector, in radii, follows from the residuals of the blurred ellipse there. The median over the
+targets of a photograph is shape: polygonal printing or sharpening, which moves all of them alike. A place is
+damaged where the rest is significant against the scatter along the edge, of this target and of the others.
 """
 
 from __future__ import annotations
