@@ -1,6 +1,6 @@
 """Given values, control and check points of a result, read from and written to tables.
 
-    control.csv         of converted tables: id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], else empty
+    control.csv         of converted tables: id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], or empty
     control_points.csv  of a survey: a row for each coordinate
 
 Source: RFC 4180 for CSV; docs/reference/results.md describes each column.

@@ -83,19 +83,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    for module in (
-        "surveying",
-        "batching",
-        "comparing_epochs",
-        "measuring",
-        "solvers",
-        "refining",
-        "planning",
-        "drafting",
-        "viewing",
-        "checking",
-        "inspecting",
-    ):
+    for module in ("surveying", "batching", "measuring", "solvers", "planning", "inspecting", "starting"):
         monkeypatch.setattr(f"sfm.cli.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = run(capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()

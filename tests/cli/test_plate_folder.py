@@ -27,7 +27,7 @@ from tests.surveys import write_observed_survey
 
 FOUR_LINES = """
 import sys
-from sfm.cli.console import guard_streams
+from sfm.cli.commands.starting import guard_streams
 guard_streams()
 for k in range(2):
     print(2 * k)
