@@ -49,7 +49,7 @@ CV2_ROOMS = (
     *("sfm.orientation", "sfm.survey", "sfm.textbook"),
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
-TERMINAL = ("sfm.batch.table", "sfm.runtime.progress")
+TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
 STAGES = (  # of a survey, in the order of `sfm.pipeline`
     ("sfm.survey.inputs",),
     ("sfm.survey.measuring", "sfm.survey.target_network"),

@@ -22,7 +22,7 @@ from tests.places import ROOT, load_page_code
 VARIES = "…"
 MIN_WORDS = 4  # of what the rooms below say; shorter texts are parts of sentences, keys and units
 REASONS = (
-    "sfm/files/plain_text.py",
+    "sfm/files/globs.py",
     "sfm/survey/diagnosis",
     "sfm/survey/drafting/camera_groups.py",
     "sfm/survey/measuring/targets.py",

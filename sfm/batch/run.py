@@ -34,8 +34,9 @@ from sfm.batch.job import (
 )
 from sfm.batch.table import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
+from sfm.files.globs import BELOW, find_files
 from sfm.files.open_folders import MANIFEST, locked, owner_of, refuse_foreign_folder
-from sfm.files.plain_text import BELOW, as_plain, find_files
+from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB

@@ -214,7 +214,7 @@ def view(
 
         from adapters.formats.registry import format_of, read_comparable
         from adapters.formats.result_tables import read_targets
-        from sfm.files.plain_text import why_no_folder
+        from sfm.files.globs import why_no_folder
         from sfm.kernels.threads import cores
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.view_page import photographs_in, refuse_foreign_page, write_view

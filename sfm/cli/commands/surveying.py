@@ -205,7 +205,7 @@ def _run_survey(
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import print_result
-        from sfm.files.plain_text import nearest_name
+        from sfm.files.globs import nearest_name
         from sfm.kernels.threads import cores
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process

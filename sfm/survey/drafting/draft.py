@@ -13,7 +13,8 @@ import numpy as np
 
 from sfm.display import agreeing, counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.files.plain_text import as_plain, is_plain, why_no_folder
+from sfm.files.globs import why_no_folder
+from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress

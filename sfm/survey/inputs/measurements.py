@@ -14,7 +14,8 @@ from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.display import counted
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.files.plain_text import as_plain, find_files, is_plain, why_no_folder
+from sfm.files.globs import find_files, why_no_folder
+from sfm.files.plain_text import as_plain, is_plain
 from sfm.network import Network
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.remarks.remark import Remark

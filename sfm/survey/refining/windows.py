@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.files.plain_text import why_no_folder
+from sfm.files.globs import why_no_folder
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, plane_warps, points_apart
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import planes_at
