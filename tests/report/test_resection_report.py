@@ -7,7 +7,7 @@ import pytest
 
 from sfm.cli.commands.matching import read_task
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.report.measuring import comparison_table, resection_json, resection_text
+from sfm.report.single_photographs import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS
 from sfm.textbook.resection.by_method import resect, resect_by_all
 from tests.orientation.resection.test_least_squares import LAB2, TRUTH

@@ -17,7 +17,7 @@ from sfm.files.csv_tables import read_table
 from sfm.matching.conjugate import MIN_CORRELATION, match_points
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.overlays import draw_patches
-from sfm.report.measuring import (
+from sfm.report.single_photographs import (
     NAMES,
     matches_json,
     matches_table,

@@ -141,7 +141,12 @@ def resect(
     """
     with loading():
         from sfm.cli.commands.matching import read_task
-        from sfm.report.measuring import comparison_json, comparison_table, resection_json, resection_text
+        from sfm.report.single_photographs import (
+            comparison_json,
+            comparison_table,
+            resection_json,
+            resection_text,
+        )
         from sfm.textbook.resection.by_method import resect as resect_by
         from sfm.textbook.resection.by_method import resect_by_all
 

@@ -195,7 +195,7 @@ def each_photograph(
     found: dict[int, T] = {}
     failed: dict[int, FailedImage] = {}
     originals = []
-    for k, (name, first) in enumerate(zip(photographs.names, find_copies(photographs), strict=True)):
+    for k, (name, first) in enumerate(zip(photographs.names, find_same_files(photographs), strict=True)):
         if first == k:
             originals.append(k)
         else:
@@ -240,7 +240,7 @@ def each_photograph(
     return found, in_order
 
 
-def find_copies(photographs: PhotographList) -> tuple[int, ...]:
+def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
     """Return for every photograph the first one whose file has the same bytes, itself where there is none.
 
     A copy is no second observation: it would only make the result look more precise than it is.
