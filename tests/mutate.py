@@ -117,6 +117,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/survey/rigs.py": ("tests/survey/test_rigs.py",),
     "sfm/survey/observation_tables.py": ("tests/survey/test_survey_observations.py",),
     "sfm/survey/placing.py": (
+        "tests/survey/test_given_values.py",
         "tests/survey/test_exterior.py",
         "tests/survey/test_solution.py",
         "tests/survey/test_survey_observations.py",

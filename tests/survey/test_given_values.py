@@ -13,6 +13,7 @@ from adapters.formats.result_tables import write_tables as write_stored
 from datasets.camcal.reference import prepare
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network
+from sfm.observations.given import ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.checks import longest_residual
@@ -33,6 +34,7 @@ from sfm.survey.inputs.given import (
 )
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
+from sfm.survey.placing import place_on_control
 from tests.places import DATASETS, SHARED
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import SIZE_PX, make_network, seed_of
@@ -261,6 +263,17 @@ def test_control_with_unknown_coordinates_is_used_for_those_that_are_known(kind:
         assert given is not None and np.isnan(given.r[3, :2]).all() and np.isfinite(given.r[3, 2])
     else:
         assert result.control_check is not None and result.control_check.points == ("1", "2", "3")
+
+
+@pytest.mark.parametrize("bars", [True, False])
+def test_scale_bars_keep_their_scale_where_control_places_the_network(bars: bool) -> None:
+    """Control is 1 % larger than the network."""
+    network, truth = make_network(seed_of("placed"), images=4, points=10)
+    given = ObjectPoints(np.arange(5), 1.01 * truth.points[:5], np.zeros((5, 3, 3)))
+    one = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-4])) if bars else ScaleBars()
+    placed, check = place_on_control(replace(network, control=given, scale_bars=one), truth)
+    assert fit_similarity(truth.points, placed.points).scale == pytest.approx(1.0 if bars else 1.01)
+    assert check.scale == pytest.approx(1.01 if bars else 1.0)
 
 
 def test_a_wrong_height_is_found(tmp_path: Path) -> None:
