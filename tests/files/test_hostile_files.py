@@ -20,7 +20,7 @@ from adapters.formats.registry import read_any, read_comparable
 from adapters.formats.result_tables import read_result, write_tables
 from sfm.batch.run import find_surveys
 from sfm.errors import KolinearError, SurveyFileError
-from sfm.files import plain_text as globs
+from sfm.files import globs
 from sfm.files.csv_tables import read_header, read_table
 from sfm.inspection.planned_survey import read_plan
 from sfm.pipeline import run_survey
