@@ -4,7 +4,7 @@ A database has no object points. Which keypoints show the same point is stated b
 photographs, so points are written as matches between all photographs they were measured in and read back as
 the connected parts of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
-What is read is untrusted. The file is opened read-only and immutable, so that nothing is written to it or
+The file is not trusted. It is opened read-only and immutable, so that nothing is written to it or
 beside it, and only its own tables are read: no views, virtual tables or computed columns, whose expressions
 could run for ever.
 

@@ -1,4 +1,4 @@
-"""The installation: public names, foreign packages among its own, and settings of the current folder.
+"""The installation: public names, foreign packages among them, and settings of the current folder.
 
 Public names are imported when they are first asked for, and listed once, in the stub of their package.
 

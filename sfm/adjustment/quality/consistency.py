@@ -1,4 +1,4 @@
-"""Whether points and photographs were measured alike, and which rays cannot be told apart.
+"""Whether points and photographs were measured alike, and which rays cannot be distinguished.
 
 A bent target or a blurred photograph leaves residuals small enough for the tests of single image coordinates,
 and yet larger than chance makes them together. All tests are against sigma0 a posteriori, with cameras and

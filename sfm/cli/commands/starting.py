@@ -1,6 +1,6 @@
 """Starting the program: the first compilation, Ctrl-C, and `doctor`, which checks an installation.
 
-What is printed is also guarded: a code page may lack characters, a disk be full, a reader end early.
+Printing is guarded, too: a code page may lack characters, a disk be full, a reader end early.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the viewer of a page shows: the scene as parallel arrays, and pictures within a budget.
+"""Content of the viewer of a page: the scene as parallel arrays, and pictures within a budget.
 
 Thumbnails come first, then photographs, then crops, those of the largest residuals first. Files beside the
 page have what has no room in it: every photograph, and the crops of each in one picture of cells.
