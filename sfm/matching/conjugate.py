@@ -3,15 +3,13 @@
 Correlation finds the place to a pixel in a search window, least squares matching takes it from there. Points
 not found in this way are looked for again with templates that are turned and scaled.
 
-Affine maps from one photograph to another around points, from the key points near them.
-
 Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or
-something else. Key points, whose descriptors know neither scale nor rotation, give the map beforehand.
-
-Which of two photographs is blurred more, and the sharper one brought to the blur of the other.
+something else. Affine maps around points are taken beforehand from the key points near them, whose
+descriptors depend neither on scale nor on rotation.
 
 Out of focus, or moved during exposure, a photograph shows less of the same texture, and correlation and least
-squares matching find nothing alike. How much less needs no conjugate points: spectra of natural texture have
+squares matching find nothing alike: the sharper photograph is brought to the blur of the other. How much less
+texture there is needs no conjugate points: spectra of natural texture have
 one form, so that the ratio of those of two photographs of one object is that of their blurs.
 """
 

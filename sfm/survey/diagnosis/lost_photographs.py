@@ -1,14 +1,13 @@
 """Photographs without orientation: not connected, turned at one place, or of a second object.
 
-Photographs that a camera took while it turned at one place: rotations alone fit, and no point has a depth.
-
-An adjustment of such photographs has no minimum: it goes along a valley in which the base is as small as the
+Where a camera turned at one place, rotations alone fit, and no point has a depth. An adjustment of such
+photographs has no minimum: it goes along a valley in which the base is as small as the
 errors, takes wherever that ends for a solution, and with a wrong principal distance it even converges. The
 parallax is what rotations leave between conjugate rays, with the principal distance and the first radial
 distortion that make it least. A wall photographed from the front looks like a rotation with a lens without
 end; where the least parallax is at the end of what is tried, nothing is refused.
 
-Parts of a survey that do not fit the rest: a second object of the same codes, a mirror image, a motion.
+Parts of a survey that do not fit the rest are a second object of the same codes, a mirror image, or a motion.
 Photographs without orientation are oriented by themselves, both parts are adjusted, and the points that they
 have in common are compared as those of any two results (`sfm.comparison`): what a camera explains, that bends
 the whole, is no other object, nor is what agrees but for single points.
