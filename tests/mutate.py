@@ -88,6 +88,8 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     },
     "sfm/survey/hypotheses/given.py": (
         "tests/survey/test_given_thresholds.py",
+        "tests/survey/test_unchecked.py",
+        "tests/survey/test_wrong_scale.py",
         "tests/survey/test_rigs.py",
         "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
     ),
