@@ -77,15 +77,13 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     ),
     "sfm/comparison/causes.py": ("tests/comparison/test_causes.py",),
     "sfm/remarks/catalogue": ("tests/remarks",),
-    **{
-        f"sfm/survey/hypotheses/{module}.py": (
-            "tests/survey/test_given_thresholds.py",
-            "tests/survey/test_wrong_scale.py",
-            "tests/survey/test_unchecked.py",
-            "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
-        )
-        for module in ("given_scales",)
-    },
+    "sfm/survey/hypotheses/given_scales.py": (
+        "tests/survey/test_given_thresholds.py",
+        "tests/survey/test_wrong_scale.py",
+        "tests/survey/test_plates.py",
+        "tests/survey/test_unchecked.py",
+        "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
+    ),
     "sfm/survey/hypotheses/given.py": (
         "tests/survey/test_given_thresholds.py",
         "tests/survey/test_unchecked.py",
