@@ -83,7 +83,26 @@ def exterior_jacobian(M: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class ExteriorObservations(PoseObservations):
+class OfPhotographs(Kind):
+    """What is observed of single photographs."""
+
+    image: IntArray  # index of the photograph, (n,)
+
+    def blocks(self) -> tuple[Block, ...]:
+        """Return the photographs."""
+        return (Block(PHOTOGRAPH, self.image),)
+
+    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+        """Return the names of the photographs."""
+        return tuple(network.images[i] for i in self.image)
+
+    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
+        """Return them with the photographs at other places."""
+        return self if images is None else replace(self, image=images[self.image])
+
+
+@dataclass(frozen=True)
+class ExteriorObservations(OfPhotographs, PoseObservations):
     """Exterior orientation known beforehand (satellite positions, a calibrated rig)."""
 
     name: ClassVar[str] = "exterior orientation"
@@ -101,17 +120,9 @@ class ExteriorObservations(PoseObservations):
         """Return them with other positions and angles."""
         return replace(self, position=values[:, :3], angles=values[:, 3:])
 
-    def blocks(self) -> tuple[Block, ...]:
-        """Return the photographs."""
-        return (Block(PHOTOGRAPH, self.image),)
-
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return X0, (e, 3), and object to image axes, (e, 3, 3)."""
         return values.position[self.image], values.M[self.image]
-
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return the names of the photographs."""
-        return tuple(network.images[i] for i in self.image)
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the photographs."""
@@ -122,10 +133,6 @@ class ExteriorObservations(PoseObservations):
             angles=self.angles[rows],
             covariance=self.covariance[rows],
         )
-
-    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the photographs at other places."""
-        return self if images is None else replace(self, image=images[self.image])
 
     def shifted(self, by: FloatArray) -> Self:
         """Return them with a shift added to all projection centres."""
@@ -209,7 +216,7 @@ class RelativeOrientations(Pairs):
 
 
 @dataclass(frozen=True)
-class AntennaPositions(RowKind):
+class AntennaPositions(OfPhotographs, RowKind):
     """Positions of an antenna that is mounted on the camera."""
 
     name: ClassVar[str] = "antenna positions"
@@ -219,7 +226,6 @@ class AntennaPositions(RowKind):
     texts_of: ClassVar[str] = PHOTOGRAPH
     numbers: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
 
-    image: IntArray  # index of the photograph, (n,)
     lever: FloatArray  # the antenna in image axes from the projection centre, object unit, (n, 3)
     position: FloatArray  # X, Y, Z of the antenna, object unit, (n, 3)
     sigma: FloatArray  # object unit, (n, 3)
@@ -245,20 +251,12 @@ class AntennaPositions(RowKind):
         """Return them with other standard deviations."""
         return replace(self, sigma=sigma)
 
-    def blocks(self) -> tuple[Block, ...]:
-        """Return the photographs."""
-        return (Block(PHOTOGRAPH, self.image),)
-
     def linearise(self, values: Values) -> Linear:
         """Return X0 + R lever - observed, and the derivatives I and -R [lever]x by X0, w."""
         R = np.swapaxes(values.M[self.image], 1, 2)
         computed = values.position[self.image] + np.einsum("nab,nb->na", R, self.lever)
         unit = np.broadcast_to(np.eye(3), (len(self), 3, 3))
         return Linear(computed - self.position, (np.concatenate([unit, -R @ skew(self.lever)], axis=2),))
-
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return the names of the photographs."""
-        return tuple(network.images[i] for i in self.image)
 
     def select(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the positions."""
@@ -269,10 +267,6 @@ class AntennaPositions(RowKind):
             position=self.position[rows],
             sigma=self.sigma[rows],
         )
-
-    def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the photographs at other places."""
-        return self if images is None else replace(self, image=images[self.image])
 
     def shifted(self, by: FloatArray) -> Self:
         """Return them with a shift added to all positions."""
