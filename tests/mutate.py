@@ -24,6 +24,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -37,7 +38,8 @@ import numpy as np
 
 from tests.places import ROOT
 
-TIMEOUT = 300  # s, of the tests of one mutation
+LONGER = 3.0  # times the tests of a room, on its unchanged modules, that those of one mutation may take
+COMPILING = 120.0  # s beside it, for kernels that a mutation makes compile again
 Ended = Literal["killed", "survived", "timed out"]
 ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that check it
     **{
@@ -273,8 +275,13 @@ def drawn(count: int, seed: int, rooms: Iterable[str]) -> list[Mutation]:
     return every[:count]
 
 
-def run_changed(sources: dict[str, str], tests: tuple[str, ...], folder: Path) -> tuple[Ended, str]:
-    """Return how tests end where modules are other ones, in a copy of the project, and their output."""
+def run_changed(
+    sources: dict[str, str], tests: tuple[str, ...], folder: Path, limit: float | None = None
+) -> tuple[Ended, str]:
+    """Return how tests end where modules are other ones, in a copy of the project, and their output.
+
+    The tests may take `limit` seconds.
+    """
     before = {file: (folder / file).read_text(encoding="utf-8") for file in sources}
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -282,7 +289,7 @@ def run_changed(sources: dict[str, str], tests: tuple[str, ...], folder: Path) -
         for file, source in sources.items():
             (folder / file).write_text(source, encoding="utf-8")
         ended = subprocess.run(
-            command, cwd=folder, capture_output=True, timeout=TIMEOUT, env=environment, text=True
+            command, cwd=folder, capture_output=True, timeout=limit, env=environment, text=True
         )
         return ("killed" if ended.returncode else "survived"), ended.stdout + ended.stderr
     except subprocess.TimeoutExpired:
@@ -292,11 +299,13 @@ def run_changed(sources: dict[str, str], tests: tuple[str, ...], folder: Path) -
             (folder / file).write_text(source, encoding="utf-8")
 
 
-def fails_unchanged(room: str, folder: Path) -> str:
-    """Return why the tests of a room say nothing: how they end on its unchanged modules; empty if well."""
+def run_unchanged(room: str, folder: Path) -> tuple[str, float]:
+    """Return why the tests of a room say nothing, empty if they pass unchanged, and how long they took, s."""
     sources = {file: ast.unparse(_tree_of(file)) for file in files_of(room)}
+    start = time.monotonic()
     ended, output = run_changed(sources, ROOMS[room], folder)
-    return "" if ended == "survived" else f"{room}: {ended} without a change\n{output}"
+    seconds = time.monotonic() - start
+    return ("" if ended == "survived" else f"{room}: {ended} without a change\n{output}"), seconds
 
 
 def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> int:
@@ -320,24 +329,30 @@ def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> in
             finally:
                 folders.put(folder)
 
-        def why_failed(room: str) -> str:
+        def unchanged(room: str) -> tuple[str, float]:
             with a_copy() as folder:
-                return fails_unchanged(room, folder)
-
-        def ended_of(one: Mutation) -> Ended:
-            with a_copy() as folder:
-                return run_changed({one.file: one.source}, one.tests, folder)[0]
+                return run_unchanged(room, folder)
 
         drawn_rooms = [room for room in ROOMS if files & set(files_of(room))]
-        failed = [why for why in pool.map(why_failed, drawn_rooms) if why]
+        before = dict(zip(drawn_rooms, pool.map(unchanged, drawn_rooms), strict=True))
+        failed = [why for why, _ in before.values() if why]
         if failed:
             print("\n".join(failed))
             return 2
+        limits = {
+            file: LONGER * seconds + COMPILING
+            for room, (_, seconds) in before.items()
+            for file in files_of(room)
+        }
 
-        for one, ended in zip(some, pool.map(ended_of, some), strict=True):
+        def ended_of(one: Mutation) -> Ended:
+            with a_copy() as folder:
+                return run_changed({one.file: one.source}, one.tests, folder, limits[one.file])[0]
+
+        for k, (one, ended) in enumerate(zip(some, pool.map(ended_of, some), strict=True), start=1):
             found[one.file, ended] += 1
             if ended != "killed":
-                print(f"{ended}: {one.file}:{one.line} {one.what}", flush=True)
+                print(f"{k} of {count}: {ended}: {one.file}:{one.line} {one.what}", flush=True)
     print(f"{'room':50} killed survived timed out")
     for file in sorted(files):
         print(_row(file, *(found[file, ended] for ended in ("killed", "survived", "timed out"))))
