@@ -129,7 +129,7 @@ TRIES = (
     Try(
         "a held camera", "free = [] and no distortion, of a lens that distorts by 40 px",
         _held, 0,
-        ("contradict the held values of c, x0, y0, K1, K2", "Calibrate the camera anew, or free"),
+        ("contradict the held values of c, x0, y0, K1, K2", "Calibrate the camera again, or free"),
     ),
     Try(
         "a nominal sensor size", "sensor_mm = [6.45, 4.8] in place of 6.4 x 4.8, free = [\"c\"]",
@@ -157,7 +157,7 @@ TRIES = (
     Try(
         "no overlap", "4 of 10 photographs share two points with the others",
         lambda folder: _image_points(folder, _halves(10, 4)), 0,
-        ("are not connected with the 6 oriented photographs", "with only points 21, 22 in common"),
+        ("are not connected to the 6 oriented photographs", "with only points 21, 22 in common"),
     ),
     Try(
         "most photographs lost", "7 of 12 photographs see nothing that another sees",

@@ -21,18 +21,19 @@ ROWS = (
     Kind(
         "fisheye_taken",
         "note",
-        "Camera {camera} has a fisheye lens and was adjusted with model opencv_fisheye: {fitting} of {total} "
-        "image points of the tie points fit, and {before} with a central perspective.",
+        "Camera {camera} has a fisheye lens and was adjusted with model opencv_fisheye: of {total} image "
+        "points of the tie points, {fitting} {fitting:fits|fit} this model and {before} a central "
+        "perspective.",
         "the survey file does not state the model",
-        "Write the model into the survey file, which saves the trial.",
+        "State the model in the survey file, which saves the trial.",
     ),
     Kind(
         "c_observed",
         "note",
         "With {photographs:photograph}, {parameter} of camera {camera} was weighted with its start value: "
         "{given}, standard deviation {sigma}.",
-        "the survey file does not state what is free; so few photographs may leave it uncertain, and a focal "
-        "length of EXIF data is no better",
+        "the survey file does not state what is free; so few photographs may leave it uncertain, and the "
+        "focal length in EXIF data is no more certain",
         "State a calibration, or add photographs, some turned by 90 degrees.",
     ),
     Kind(
@@ -48,8 +49,8 @@ ROWS = (
         "error",
         "Camera {camera} is not calibrated, and two photographs do not calibrate it: {parameters} "
         "{parameters:was|were} held fixed at the start values.",
-        "an error of c scales the depth, one of the distortion bends the object; standard deviations do not "
-        "contain it",
+        "an error of c scales the depth, one of the distortion bends the object; standard deviations do "
+        "not include it",
         "Give a calibrated camera, or add photographs.",
         explains=(
             "c_held_contradicted",
@@ -62,7 +63,7 @@ ROWS = (
     Kind(
         "pair_contradicted",
         "error",
-        "Two photographs that fit one another do not determine the camera, and {others:other photograph} "
+        "Two photographs that fit each other do not determine the camera, and {others:other photograph} "
         "{others:does|do} not fit at its start values.",
         "the start values of the camera are wrong, or the photographs have too little in common",
         "Give a calibrated camera, or add photographs between those that do not fit.",
@@ -71,16 +72,16 @@ ROWS = (
     Kind(
         "c_looks_wrong",
         "warning",
-        "c = {given} of camera {camera} looks wrong: from {better} on {oriented} of {total} photographs "
-        "can be oriented, in place of {before}.",
+        "c = {given} of camera {camera} looks wrong: starting from {better}, {oriented} of {total} "
+        "photographs can be oriented instead of {before}.",
         "a wrong start value of c or a wrong size of the pixels",
         "Correct c_mm and pixel_mm, or free c.",
     ),
     Kind(
         "c_looks_wrong_of_pair",
         "error",
-        "c = {given} of camera {camera} looks wrong: from {better} on {oriented} of {total} photographs "
-        "can be oriented, in place of {before}. Two photographs do not determine it.",
+        "c = {given} of camera {camera} looks wrong: starting from {better}, {oriented} of {total} "
+        "photographs can be oriented instead of {before}. Two photographs do not determine it.",
         "a wrong start value of c or a wrong size of the pixels",
         "Give a calibrated c, or add photographs.",
         explains=("interior_held_of_pair",),
@@ -103,26 +104,26 @@ ROWS = (
     Kind(
         "c_held_elsewhere",
         "error",
-        "c of camera {camera} was held at {found}, from which photographs can be oriented, and not at "
-        "{given}, which the survey states.",
+        "c of camera {camera} was held at {found}, with which photographs can be oriented, instead of "
+        "the stated {given}.",
         "c_mm or pixel_mm is wrong, or photographs that do not belong together fit another camera by chance",
-        "Give c from a calibration, or add photographs, which determine it.",
+        "Give c from a calibration, or add photographs that determine it.",
     ),
     Kind(
         "camera_not_calibrated",
         NOT_CALIBRATED,
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "
         "photograph (1 sigma)[[, {times} times sigma0]].",
-        "photographs from the front, whose distance takes up an error of c, or few and imprecise ones",
-        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+        "frontal photographs, whose distance absorbs an error of c, or few and imprecise ones",
+        "Add photographs that are tilted by 30 to 45 degrees relative to the plate, in several directions.",
     ),
     Kind(
         "calibration_failed",
         "error",
         "Camera {camera} is not calibrated: c was held fixed at {held}, as the photographs do not determine "
         "it.",
-        "photographs from the front, whose distance takes up an error of c, or too few of them",
-        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+        "frontal photographs, whose distance absorbs an error of c, or too few of them",
+        "Add photographs that are tilted by 30 to 45 degrees relative to the plate, in several directions.",
         explains=(
             *("interior_held", "held_to_converge", "held_parameter", "c_held_contradicted"),
             *("held_weakly_tested", "camera_varies", "camera_weakly_tested", "given_weakly_checked"),
@@ -133,15 +134,15 @@ ROWS = (
         "camera_not_determined",
         "error",
         "The photographs do not determine camera {camera}, whose calibration is the result.",
-        "photographs from the front, whose distance takes up an error of c, or too few of them",
-        "Add photographs that are tilted against the plate by 30 to 45 degrees, in several directions.",
+        "frontal photographs, whose distance absorbs an error of c, or too few of them",
+        "Add photographs that are tilted by 30 to 45 degrees relative to the plate, in several directions.",
     ),
     Kind(
         "margin_not_calibrated",
         NOT_CALIBRATED,
         "The projection uncertainty of camera {camera}, whose calibration is the result, is {rms} over the "
         "photograph (1 sigma)[[, {times} times sigma0]]: its image points cover {observed:%} of the format.",
-        "no image points in the margin of the photographs, where distortion then is extrapolated",
+        "no image points near the margins of the photographs, where the distortion is then extrapolated",
         "Add photographs that show the plate in the corners and along the sides of the format.",
     ),
     Kind(
@@ -149,7 +150,7 @@ ROWS = (
         # a warning where EXIF data and the size of a sensor give c as well; an error where three standard
         # deviations reach c = 0
         Grade("share", warning=0.05, error=1 / 3),
-        "{parameter} of camera {camera} is known to {share:%} only[[, strongly correlated with {partners}]].",
+        "{parameter} of camera {camera} is known only to {share:%}[[, strongly correlated with {partners}]].",
         "a long lens, few photographs, or small angles between them",
         "Hold it fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),
@@ -189,7 +190,7 @@ ROWS = (
     Kind(
         "pixels_not_square",
         "warning",
-        "The pixels of camera {camera} are {width} x {height} by {where}, {off} off squares.",
+        "According to {where}, the pixels of camera {camera} are {width} x {height}, {off} from square.",
         "the nominal size of a sensor is not that of the photographs",
         "Set pixel_mm to two equal numbers, or free b1 (fx and fy).",
     ),

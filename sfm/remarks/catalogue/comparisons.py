@@ -18,13 +18,13 @@ OTHER_PROGRAMS = (
         "The image points do not separate the solutions of Kolinear and {program}: v'Pv differs by {gap} "
         "variances.",
         "the network hardly determines the camera model of the comparison",
-        "The survey is valid; photograph from more directions and distances for a comparison of cameras.",
+        "The survey is valid; to compare the cameras, photograph from more directions and distances.",
     ),
     Kind(
         "adjuster_fits_better",
         "warning",
-        "The camera of {program} with {parameters} free fits {times} times better: {rms} in place of "
-        "{before} RMS.",
+        "The camera of {program} with {parameters} free fits {times} times better: RMS {rms} instead of "
+        "{before}.",
         "the camera model of the survey does not suit the lens",
         "Free these parameters.",
     ),
@@ -69,14 +69,14 @@ REFINING = (
         "photographs_not_adjusted",
         "warning",
         "{photographs:photograph} {photographs:was|were} not adjusted: {photographs}.",
-        "too few of {photographs:its|their} key points could be measured anew",
+        "too few of {photographs:its|their} key points could be re-measured",
         "See the reasons beside the key points; {photographs:the photograph keeps|the photographs keep} the "
         "orientation of the model.",
     ),
     Kind(
         "key_points_not_measured",
         Grade("missing", warning=0.5),  # more than half: photographs or windows are wrong
-        "Only {measured} of {total} key points {measured:was|were} measured anew.",
+        "Only {measured} of {total} key points {measured:was|were} re-measured.",
         "photographs of another size or state than those of the model, or little texture",
         "Give the photographs of the model; see the reasons beside the key points.",
     ),
@@ -85,17 +85,18 @@ ROWS = (
     Kind(
         "lengths_differ",
         "error",
-        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[; {moved:point} "
-        "{moved:differs|differ} besides]].",
-        "a scale bar or control that is wrong in one of them, or an object that expanded, as warmth does",
+        "Lengths in {second} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[; in addition, "
+        "{moved:point} {moved:differs|differ}]].",
+        "a scale bar or control that is wrong in one of them, or an object that expanded, for example "
+        "when it warmed up",
         "Check the lengths of the scale bars, and the temperature of both surveys.",
     ),
     Kind(
         "unit_differs",
         "error",
-        "Lengths in {second} are {lengths:.8g} times those in {first}[[, {rest:.8g} +- {sigma:.2g} beside "
-        "the factor {factor:.8g}]], as between {finer} and {coarser}[[; {moved:point} {moved:differs|differ} "
-        "besides]].",
+        "Lengths in {second} are {lengths:.8g} times those in {first}[[, {rest:.8g} +- {sigma:.2g} apart "
+        "from the factor {factor:.8g}]], as between {finer} and {coarser}[[; in addition, {moved:point} "
+        "{moved:differs|differ}]].",
         "lengths of bars or control were entered in another unit than the survey states",
         "Enter them in the object unit of the survey, or correct the unit.",
     ),
@@ -117,23 +118,25 @@ ROWS = (
         "another_object",
         "error",
         "The {points:point} of {first} and {second} with the same names show no common shape.",
-        "results of two objects, or names that were given anew",
+        "results of two objects, or points that were renamed",
         "Check that both results are of one object with the same targets.",
     ),
     Kind(
         "strained",
         "error",
-        "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[ beside "
-        "the factor {factor:.8g}]][[; {moved:point} {moved:differs|differ} besides]].",
-        "an object that expanded or was loaded in one direction, or a camera that is not described well",
+        "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}[[ "
+        "apart from the factor {factor:.8g}]][[; in addition, {moved:point} {moved:differs|differ}]].",
+        "an object that expanded or was loaded in one direction, or a camera model that does not suit "
+        "the lens",
         "Check temperature and load of the object; adjust both with per_photograph for c, and compare again.",
     ),
     Kind(
         "bent",
         "error",
-        "{second} is bent as a whole against {first}, by up to {distance}[[; {moved:point} "
-        "{moved:differs|differ} besides]].",
-        "a camera that is not described well, as a lens that was zoomed, focused or loose; or a real bending",
+        "{second} is bent as a whole relative to {first}, by up to {distance}[[; in addition, "
+        "{moved:point} {moved:differs|differ}]].",
+        "a camera model that does not suit the lens, or a lens that was zoomed, refocused or loose; or "
+        "the object really bent",
         "Adjust both with per_photograph for c, x0 and y0, and compare again.",
     ),
     Kind(
@@ -147,30 +150,31 @@ ROWS = (
     Kind(
         "points_differ_together",
         "error",
-        "The points differ as a whole (T {statistic}, limit {critical}), and none of them singly.",
+        "The points differ as a whole (T {statistic}, limit {critical}), but no single point does.",
         "many small displacements, or standard deviations that are too small",
-        "See the picture for a pattern.",
+        "Look for a pattern in the figure.",
     ),
     Kind(
         "no_majority_agrees",
         "error",
         "The points of {first} and {second} differ, and no half of them agrees.",
-        "a change of the whole that is no simple one, or standard deviations that are far too small",
+        "a complex change of the whole object, or standard deviations that are far too small",
         "Name points that are known to be stable (--reference, --align control).",
     ),
     Kind(
         "interior_differs",
         "note",
-        "Camera {camera} has another interior orientation: {parameter} differs by {difference}, {sigmas:.0f} "
-        "standard deviations.",
+        "Camera {camera} has a different interior orientation: {parameter} differs by {difference}, "
+        "{sigmas:.0f} standard deviations.",
         "zoom, focus or camera changed between the surveys, or a lens is loose",
         "Adjust both with per_photograph for the parameters, and compare again.",
     ),
     Kind(
         "tested_part",
         "note",
-        "{tested} of {points} points {tested:is|are} tested, whose covariance together both results keep.",
-        "of many points only a sample is kept with its covariance",
+        "{tested} of {points} points {tested:is|are} tested: those whose joint covariance both results "
+        "store.",
+        "of many points, results store the covariance of a sample only",
         "Nothing needs to be done.",
     ),
     Kind(
@@ -178,19 +182,19 @@ ROWS = (
         "note",
         "The test is approximate: the covariance between points is not known.",
         "the result is of another program, or of an older version",
-        "Compare results of this version.",
+        "Compare results that this version computed.",
     ),
     Kind(
         "no_common_points",
         "warning",
         "No points are common: only photographs and cameras are compared.",
-        "names, image points and places are not the same",
-        "See that names agree.",
+        "names, image points and positions differ",
+        "Make the names agree.",
     ),
     Kind(
         "same_image_points",
         "warning",
-        "Not tested: {share:%} of the image points of {first} are those of {second}.",
+        "Not tested: {share:%} of the image points of {first} are also those of {second}.",
         "two adjustments of one survey: the differences are those of adjusters, models and datum",
         "Compare results of separate photographs.",
     ),
@@ -204,7 +208,7 @@ ROWS = (
     Kind(
         "no_common_datum",
         "warning",
-        "Not tested: without an alignment only results in the datum of control are in one frame.",
+        "Not tested: without an alignment, only results in the datum of control share a frame.",
         "a free or minimal datum, and --align none",
         "Align them by points or control.",
     ),
@@ -212,8 +216,9 @@ ROWS = (
         "no_joint_covariance",
         "warning",
         "Not tested: the covariance between the points is not known.",
-        "in a minimal datum or one of control, and between different datums, nothing can be tested without",
-        "Run the survey again with this version, which keeps it.",
+        "in a minimal datum or one of control, and between different datums, nothing can be tested "
+        "without it",
+        "Run the survey again with this version, which stores it.",
     ),
     Kind(
         "untestable",
@@ -226,22 +231,22 @@ ROWS = (
         "displaced",
         "warning",
         "{first} to {second}: {displaced:point} of {tested} moved, by up to {distance}: {points}.",
-        "what the epochs are for",
+        "points moved between the epochs",
         "See the table of displacements.",
     ),
     Kind(
         "held_alike",
         "note",
-        "{first} and {second} use the same held interior orientation of camera {cameras}: no standard "
-        "deviation contains its error.",
+        "{first} and {second} hold the interior orientation of camera {cameras} fixed at the same "
+        "values: no standard deviation includes its error.",
         "its effect cancels only where photographs and object are the same; the rest can pass for a movement",
         "Adjust it (free), or together from a calibration with standard deviations (--together).",
     ),
     Kind(
         "held_apart",
         "note",
-        "The interior orientation of camera {cameras} is held in {first} or {second} only, or at other "
-        "values: no standard deviation contains its error.",
+        "The interior orientation of camera {cameras} is held fixed in only one of {first} and {second}, "
+        "or at different values: no standard deviation includes its error.",
         "its effect does not cancel, and can pass for a movement",
         "Adjust it (free).",
     ),
@@ -251,13 +256,13 @@ ROWS = (
         "Camera {camera} was moved on its rig between {first} and {second} (T {statistic}, limit "
         "{critical}).",
         "the camera was taken off or knocked, or the frame of the rig bent",
-        "Use mounts from the calibration that is nearer in time to a survey.",
+        "For each survey, use the mounts that were calibrated nearest to it in time.",
     ),
     Kind(
         "one_camera",
         "note",
-        "Camera {camera} has one interior orientation in {epochs}, on which they agree (T {statistic}, limit "
-        "{critical}).",
+        "Camera {camera} has one interior orientation in {epochs}, and they agree on it (T {statistic}, "
+        "limit {critical}).",
         "the epochs were adjusted together",
         "Nothing needs to be done.",
     ),

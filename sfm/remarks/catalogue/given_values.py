@@ -50,25 +50,25 @@ DATUM = (
     Kind(
         "exif_positions",
         "note",
-        "Projection centres of {positions} of {photographs} photographs are observed in EXIF data: X east "
-        "and Y north (WGS 84) from latitude {latitude:.3f}, longitude {longitude:.3f}, Z the height as "
-        "stated, above sea level or the ellipsoid.",
-        "[exterior] exif_sigma_m; EXIF data do not say what heights are above. Errors that photographs have "
-        "in common are in no standard deviation: the receiver's, of metres over minutes, and where its "
-        "antenna is on the camera",
+        "EXIF data give the projection centres of {positions} of {photographs} photographs, used as "
+        "observations: X east and Y north (WGS 84) from latitude {latitude:.3f}, longitude "
+        "{longitude:.3f}, Z the height as stated, above sea level or the ellipsoid.",
+        "exif_sigma_m in [exterior]. EXIF data do not state the reference of heights. Standard "
+        "deviations do not include errors that photographs share: those of the receiver, metres over "
+        "minutes, and the offset of its antenna from the camera",
         "Use bars or control for scale and coordinates that must be better than the receiver.",
     ),
     Kind(
         "exif_positions_far",
         "warning",
         "The positions of {far} in EXIF data are more than {limit} from the others and were not used.",
-        "a receiver without reception that stated its last or a default position",
+        "a receiver without reception that repeated its last position or a default",
         "Correct or remove the position if the photograph belongs to the survey.",
     ),
     Kind(
         "exterior_unused",
         "note",
-        "Observed exterior orientation takes no part in datum '{datum}'.",
+        "Observed exterior orientation is not used in datum '{datum}'.",
         "it determines position, attitude and scale, which this datum takes from the points",
         'Set datum.kind = "control" to use it.',
     ),
@@ -110,40 +110,40 @@ ROWS = (
     Kind(
         "kind_wrong",
         "error",
-        "The other observations contradict most {of}; none of them took part.[[ They agree if {mistake:@}.]]",
+        "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:@}.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
-        "Check the table: signs, units, which point or photograph each row is of.",
+        "Check the table: signs, units, and the point or photograph of each row.",
     ),
     Kind(
         "observations_wrong",
         "warning",
-        "{observations:survey observation} contradicted all others and took no part: {observations}."
-        "[[ {observations:It agrees|They agree} if {mistake:@}.]]",
+        "{observations:survey observation} contradicted all others and {observations:was|were} not used: "
+        "{observations}.[[ {observations:It agrees|They agree} if {mistake:@}.]]",
         "a misread or mistyped value, another point, or a standard deviation that is too small",
         "Correct {observations:this value|these values}, or state a larger standard deviation.",
     ),
     Kind(
         "observations_unused",
         "warning",
-        "{observations:survey observation} took no part: {observations}.",
-        "their points or photographs are not in the result, or too few of a group are: a plane needs 4 "
-        "points, a line 3, a station 2 targets",
+        "{observations:survey observation} {observations:was|were} not used: {observations}.",
+        "their points or photographs are not in the result, or too few points of a group are: a plane "
+        "needs 4, a line 3, a station 2 targets",
         "Correct the names, or look among the points that were left out.",
     ),
     Kind(
         "frame_points_computed",
         "note",
-        "{points:point} of rigid frames {points:is|are} in no photograph and computed from the other points "
-        "of the frame: {points}.",
+        "{points:point} of rigid frames {points:is|are} in no photograph and {points:was|were} computed "
+        "from the other points of the frame: {points}.",
         "a tip that touches the object, or a mistyped name",
         "Nothing needs to be done if photographs do not show {points:it|them}; otherwise correct the name.",
     ),
     Kind(
         "bar_left_out",
         "warning",
-        "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length by the other given "
-        "values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} "
-        "and {coarser}]]. It was left out.",
+        "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length that the other "
+        "given values imply, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
+        "between {finer} and {coarser}]]. It was left out.",
         CHECK_THE_LIST,
         "Correct the length of this bar or remove it.",
     ),
@@ -178,18 +178,18 @@ ROWS = (
     Kind(
         "mounts_scale_contradicted",
         "error",
-        "No dependable scale: that by the given {cameras:mount|mounts} of {cameras} [[differs by {off:+} "
-        "from]][[is {times} times]] that by {others:@}, {sigmas} standard deviations[[; nearly a factor of "
-        "{unit_factor}, as between {finer} and {coarser}]]. Given mounts were not used.",
+        "No dependable scale: the scale by the given {cameras:mount|mounts} of {cameras} [[differs by "
+        "{off:+} from]][[is {times} times]] that by {others:@}, {sigmas} standard deviations[[; nearly a "
+        "factor of {unit_factor}, as between {finer} and {coarser}]]. Given mounts were not used.",
         CHECK_THE_LIST,
         "Check the base and these values and their unit; a third source of scale shows which is wrong.",
     ),
     Kind(
         "plate_size_left_out",
         "warning",
-        "The size of {given} [[differs by {off:+} from]][[is {times} times]] that by the other given values, "
-        "{sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} and "
-        "{coarser}]]. It was left out.",
+        "The size of {given} [[differs by {off:+} from]][[is {times} times]] the size that the other "
+        "given values imply, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
+        "between {finer} and {coarser}]]. It was left out.",
         WRONG_SIZE,
         "Correct pitch of this plate, or state plate_sigma.",
     ),
@@ -205,8 +205,8 @@ ROWS = (
     Kind(
         "datum_contradicted",
         "error",
-        "No dependable datum: {given:@} fit the network of the image points each by themselves, but place it "
-        "up to {distance} apart (chi-square {chi2}, {dof} degrees of freedom): neither was used.",
+        "No dependable datum: {given:@} each fit the network of the image points, but place it up to "
+        "{distance} apart (chi-square {chi2}, {dof} degrees of freedom): neither was used.",
         "coordinates of two systems or epochs, or antennas or prisms that are not in the projection centres",
         "Find out which of them are wrong; give projection centres in the system of the control, reduced by "
         "the offset from antenna or prism to camera.",
@@ -222,19 +222,19 @@ ROWS = (
     Kind(
         "given_contradicted",
         DETECTED,
-        "Some of {of:@} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
-        "wrong[[, one of them, which shifts coordinates by up to {shift} standard deviations]].[[ The names "
-        "of {exchanged} may be exchanged, in more than one way.]]",
+        "Some of {of:@} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} "
+        "may be wrong[[; the wrong one shifts coordinates by up to {shift} standard deviations]].[[ The "
+        "names of {exchanged} may be swapped, in more than one way.]]",
         CHECK_THE_LIST,
         "Check these coordinates; more given points show which one is wrong.",
     ),
     Kind(
         "given_strained",
         "error",
-        "The coordinates of {of:@} are stretched by {elongation:+}[[ along {axis}]] (chi-square {chi2} as "
-        "given, {fitting} if not stretched): scale and shape of the result are not dependable.",
-        "coordinates of a print or a scan, or axes of different scale or unit",
-        "Correct the scale of the axes, or give coordinates that were measured.",
+        "The coordinates of {of:@} are stretched by {elongation:+}[[ along {axis}]] (chi-square {chi2} "
+        "as given, {fitting} without the stretch): scale and shape of the result are not dependable.",
+        "coordinates of a print or a scan, or axes with different scales or units",
+        "Correct the scale of the axes, or give measured coordinates.",
         explains=(*PULLED, "shape_of_control"),
     ),
     Kind(
@@ -242,17 +242,17 @@ ROWS = (
         "warning",
         "Of {of:@}, {given} {given:has|have} the coordinates of {given:another point|other points}: "
         "{given:its|their} coordinates were reassigned.",
-        "names exchanged or a list shifted by a row, in the given coordinates or in the photographs",
+        "swapped names or a list shifted by one row, in the given coordinates or in the photographs",
         "Correct {given:this name|these names}.",
     ),
     Kind(
         "given_mirrored",
         "error",
-        "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored)[[, or "
-        "the names of {exchanged} are exchanged]]: they were not used.[[ Even mirrored, {given} "
+        "The coordinates of {of:@} are mirrored (chi-square {chi2} as given, {mirrored} if mirrored)[[, "
+        "or the names of {exchanged} are swapped]]: they were not used.[[ Even mirrored, {given} "
         "{given:does|do} not fit: the second chi-square is without {given:it|them}.]]",
-        "left-handed coordinates, two axes exchanged, the sign of one axis changed, mirrored photographs, or "
-        "the names of left and right exchanged",
+        "left-handed coordinates, two axes swapped, the sign of one axis changed, mirrored photographs, "
+        "or the names of left and right swapped",
         "Give X, Y and Z of a right-handed system; check the names of the points.",
     ),
     Kind(
@@ -260,7 +260,7 @@ ROWS = (
         "warning",
         "The standard deviations stated for {of:@} are {factor} times too small[[: the adjustment used "
         "{used} times the stated ones]].",
-        "standard deviations of another unit or of the instrument alone, or points that moved",
+        "standard deviations in another unit or of the instrument alone, or points that moved",
         "State standard deviations that the differences at these points confirm.",
     ),
     Kind(
@@ -268,8 +268,8 @@ ROWS = (
         # the test is of the differences: a result that they hardly shift has lost nothing
         Grade("shift", warning=EXPECTED_SIGMAS, error=WRONG_SIGMAS),
         "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points, more "
-        "than by chance. This shifts the result by up to {shift} of its standard deviations, which do not "
-        "contain it.",
+        "than by chance. This shifts the result by up to {shift} of its standard deviations, which do "
+        "not include it.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
         explains=PULLED,
@@ -277,8 +277,8 @@ ROWS = (
     Kind(
         "given_rounded",
         "note",
-        "The rounding of {of:@} to {step} exceeds what the network allows: they took part with the standard "
-        "deviation of this rounding, {sigma}.",
+        "The rounding of {of:@} to {step} is coarse for this network: they were weighted with the "
+        "standard deviation of the rounding, {sigma}.",
         "coordinates printed with few decimals",
         "Give more decimals, or the standard deviations of these coordinates.",
     ),
@@ -312,7 +312,7 @@ ROWS = (
         "{count} of the {all} check points {count:differs from its|differ from their} given coordinates, "
         "by up "
         "to {distance}.",
-        "wrong control or scale, a weak network, or check points of another system or epoch",
+        "wrong control or scale, a weak network, or check points in another system or of another epoch",
         "Find out whether control or check points are wrong before you use the result.",
     ),
     Kind(
@@ -320,27 +320,27 @@ ROWS = (
         "note",
         "The scale rests on {given:@bar} alone: nothing checks it.",
         "one length or one source of lengths",
-        "Add a scale bar of another origin.",
+        "Add a scale bar from another source.",
     ),
     Kind(
         "given_unchecked",
         "note",
         "Nothing checks {given:@} among {of:@}.",
-        "as many given values as the datum needs",
+        "no more given values than the datum needs",
         "Add control or scale bars.",
     ),
     Kind(
         "given_partly_checked",
         "note",
-        "An error of {given:@} among {of:@} is found in some directions only.",
-        "hardly more given values than the datum needs",
+        "An error of {given:@} among {of:@} would be detected in some directions only.",
+        "only a few more given values than the datum needs",
         "Add control or scale bars.",
     ),
     Kind(
         "given_weakly_checked",
         "note",
-        "An error of {given:@} among {of:@} may stay unnoticed and shift the result by up to {sigmas} of its "
-        "standard deviations.",
+        "An error of {given:@} among {of:@} may remain undetected and shift the result by up to {sigmas} "
+        "of its standard deviations.",
         "few control points or bars, all on one side, or one far more precise than the others",
         "Add control or scale bars.",
     ),

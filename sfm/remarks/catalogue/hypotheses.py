@@ -24,15 +24,16 @@ ADJUSTMENT = (
         "rank_defect",
         "error",
         "The rank defect is {defect}, expected {expected}[[; not determined ({undetermined})]].",
-        "no observation determines something",
-        "Hold what is not determined, or add photographs: of points with few rays, or tilted ones.",
+        "some unknowns have no observation that determines them",
+        "Hold the undetermined parameters fixed, or add photographs: of points with few rays, or tilted "
+        "ones.",
     ),
     Kind(
         "sigma0_high",
         SIGMA0,
         "Sigma0 is {ratio} times the expected standard deviation of an image coordinate ({stated}).[[ "
-        "Neighbours have errors of {common} in common over {length}: the camera model does not describe the "
-        "photographs, as with a rolling shutter or a stabiliser.]]",
+        "Image points within {length} of each other share errors of {common}: the camera model does not "
+        "describe the photographs, as happens with a rolling shutter or a stabiliser.]]",
         "the camera, misidentified points or given values contradict the photographs, or sigma_px is too "
         "small",
         "Look for a camera that changed between photographs, misidentified points and wrong given values; "
@@ -43,7 +44,7 @@ ADJUSTMENT = (
         "note",
         "The stated standard deviation of the image points, {stated}, is pessimistic: residuals show "
         "{found}.",
-        "sigma_px is larger than the measurements deserve",
+        "sigma_px is larger than the errors of the measurements",
         "Set sigma_px to what the residuals show.",
     ),
     Kind(
@@ -51,7 +52,7 @@ ADJUSTMENT = (
         RESIDUAL,
         "The residual of point {point} in {photograph} is {length}, {over_sigma} times its standard "
         "deviation, and was not rejected.",
-        "a wrong measurement in a place where nothing else checks it, or tests are switched off",
+        "a wrong measurement that no other observation checks, or tests that are switched off",
         "Look at the photograph; correct or remove the image point.",
     ),
     Kind(
@@ -88,8 +89,8 @@ ADJUSTMENT = (
     Kind(
         "snooping_unsolvable",
         "warning",
-        "Data snooping ended early: with {more:image point} rejected in place of {rejected} the network is "
-        "not determined.",
+        "Data snooping ended early: with {more:image point} rejected instead of {rejected}, the network "
+        "is not determined.",
         "rejections leave a photograph or a point without the rays that determine it",
         "Look at the rejected image points; add photographs.",
     ),
@@ -112,9 +113,8 @@ ADJUSTMENT = (
     Kind(
         "held_to_converge",
         "warning",
-        "{parameters} of camera {camera} {parameters:was|were} held fixed: with {parameters:it|them} free "
-        "the adjustment does not "
-        "converge.",
+        "{parameters} of camera {camera} {parameters:was|were} held fixed: with {parameters:it|them} "
+        "free, the adjustment does not converge.",
         "the photographs do not separate {parameters:this parameter|these parameters} from position and "
         "rotation",
         "Give {parameters:a calibrated value|calibrated values} and leave "
@@ -123,8 +123,8 @@ ADJUSTMENT = (
     Kind(
         "better_solution_taken",
         "note",
-        "The image points have two solutions: c of camera {camera} was {first} at first; with {better} "
-        "v'Pv is {vPv} times as large, which was taken.",
+        "The image points allow two solutions for c of camera {camera}: {first}, found first, and "
+        "{better}, which was taken because its v'Pv is {vPv} times as large.",
         "a flat object or a narrow range of angles",
         "Give a calibrated c, or add photographs at larger angles and other distances.",
     ),
@@ -156,32 +156,33 @@ ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "{photographs} {photographs:fits|fit} another camera than the others[[ of camera {camera}]]"
-        f"[[, c {{change:+}}]][[, principal point {{away}} away]]. {SHIFTED}{INSTEAD}",
+        "{photographs} {photographs:fits|fit} a different camera from the others[[ of camera "
+        f"{{camera}}]][[, c {{change:+}}]][[, principal point {{away}} away]]. {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
-        "Give {photographs:this photograph|these photographs} another camera in the survey file, or set "
-        "per_photograph.",
-        short="another camera in some photographs",
+        "Give {photographs:this photograph|these photographs} a separate camera in the survey file, or "
+        "set per_photograph.",
+        short="a different camera in some photographs",
         explains=OF_GIVEN,
     ),
     Kind(
         "two_cameras",
         SHIFT,
-        "{photographs}, taken as one camera[[ {camera}]], are not of one[[: from the first to the second c "
-        f"changes by {{change:+}}]][[, the principal point by {{away}}]]. {SHIFTED}{INSTEAD}",
+        "{photographs} were assumed to share one camera[[ ({camera})]], but do not[[: c changes by "
+        "{change:+} from the first to the second]][[, the principal point by {away}]]. "
+        f"{SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed between the two, or one of them was cropped or resampled",
-        "Give each a camera in the survey file, or set per_photograph.",
-        short="another camera in one of two photographs",
+        "Give each its camera in the survey file, or set per_photograph.",
+        short="a different camera in one of two photographs",
         explains=OF_GIVEN,
     ),
     Kind(
         "camera_varies",
         SHIFT,
-        "The camera differs from photograph to photograph"
-        f"[[, c by up to {{change}}]][[, the principal point by up to {{away}}]]. {SHIFTED}{INSTEAD}",
+        "The camera changes from photograph to photograph[[, c by up to {change}]][[, the principal "
+        f"point by up to {{away}}]]. {SHIFTED}{INSTEAD}",
         "autofocus, a stabiliser, a rolling shutter or a loose lens",
         "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
-        short="a camera that differs from photograph to photograph",
+        short="a camera that changes from photograph to photograph",
         explains=OF_GIVEN,
     ),
     Kind(
@@ -197,17 +198,17 @@ ROWS = (
     Kind(
         "held_parameter",
         SHIFT,
-        "The image points contradict the held values of {parameters} of camera {camera}"
-        f"[[: held at {{value}}, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
+        "The image points contradict the held values of {parameters} of camera {camera}[[: held at "
+        f"{{value}}, but {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
         "a calibration that does not describe these photographs",
-        "Calibrate the camera anew, or free the parameters if there are three photographs or more.",
+        "Calibrate the camera again, or free the parameters if there are three photographs or more.",
         short="wrong held parameters",
     ),
     Kind(
         "given_parameter",
         SHIFT,
-        "The image points contradict the given values of {parameters} of camera {camera}"
-        f"[[: {{value}} given, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
+        "The image points contradict the given values of {parameters} of camera {camera}[[: {value} is "
+        f"given, but {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
         "a certificate of another camera, zoom or focus, or standard deviations that are too small",
         "Correct the values, or their standard deviations.",
         short="wrong given parameters",
@@ -215,16 +216,16 @@ ROWS = (
     Kind(
         "distortion_not_described",
         SHIFT,
-        "Residuals depend on the place in the photograph, by up to {largest}: the camera model does not "
-        f"describe the lens. {SHIFTED}{INSTEAD}",
-        "distortion that the model does not have, or a film or sensor that is not plane",
+        "Residuals depend on the position in the photograph, by up to {largest}: the camera model does "
+        f"not describe the lens. {SHIFTED}{INSTEAD}",
+        "distortion that the model cannot describe, or a film or sensor that is not flat",
         "Free K2, K3, P1, P2, b1 and b2, or choose another model.",
-        short="distortion that the model does not have",
+        short="distortion that the model cannot describe",
     ),
     Kind(
         "object_deformed",
         SHIFT,
-        f"The object has another shape in {{photographs}}, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
+        f"The object has a different shape in {{photographs}}, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
         "the object expanded, bent or settled during the survey",
         "Adjust the two states as two surveys and compare them with epochs.",
         short="an object that deformed",
@@ -240,10 +241,11 @@ ROWS = (
     Kind(
         "shape_of_control",
         SHIFT,
-        f"The control points have another shape than stated, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
-        "coordinates of a print or a scan, a plate that is bent, or axes of different scale",
+        "The shape of the control points differs from the stated one, by up to {deformation}. "
+        f"{SHIFTED}{INSTEAD}",
+        "coordinates of a print or a scan, a plate that is bent, or axes with different scales",
         "Measure the control points, or state standard deviations that cover the difference.",
-        short="control points of another shape",
+        short="control points of a different shape",
     ),
     Kind(
         "rig_bumped",
@@ -264,7 +266,7 @@ ROWS = (
         "not triggered together",
         "Check the mounts that were given; list the photographs from each place of the camera as blocks of "
         "the rig.",
-        short="a camera that is not where its rig has it",
+        short="a camera that is not where its rig places it",
     ),
     Kind(
         "points_moved",
@@ -278,36 +280,36 @@ ROWS = (
     Kind(
         "windows_elsewhere",
         SHIFT,
-        "The windows of {points:point} show another place from {from} on, {distance} away at most, {shift} "
-        f"standard deviations: {{points}}.{INSTEAD}",
-        "edges of a surface before another, shine, shadows, or something that moved",
-        "Do not use {points:this point|these points}; photographs at smaller steps show fewer of them.",
-        short="windows that show another place",
+        "From {from} on, the windows of {points:point} show a different spot, up to {distance} away, "
+        f"{{shift}} standard deviations: {{points}}.{INSTEAD}",
+        "an edge in front of another surface, shine, shadows, or something that moved",
+        "Do not use {points:this point|these points}; photographs at smaller steps produce fewer of them.",
+        short="windows that show a different spot",
     ),
     Kind(
         "plate_moved",
         SHIFT,
-        "A plate moved against the others from {from} on, by up to {distance}, {shift} standard deviations: "
-        f"that of {{points:point}} {{points}}.{INSTEAD}",
-        "a plate slipped between the photographs, or what carries the plates bent",
-        "Fix the plates to one another and photograph them anew, or adjust the photographs before and from "
-        "{from} on as two surveys.",
+        "A plate moved relative to the others from {from} on, by up to {distance}, {shift} standard "
+        f"deviations: that of {{points:point}} {{points}}.{INSTEAD}",
+        "a plate slipped between the photographs, or the support of the plates bent",
+        "Fix the plates to one another and photograph them again, or adjust the photographs before "
+        "{from} and those from {from} on as two surveys.",
         short="a plate that moved",
         explains=OF_GIVEN,
     ),
     Kind(
         "too_many_to_test",
         "note",
-        "One camera for all photographs and one shape of the object are assumed, not tested: "
-        "{photographs} photographs are too many.",
-        "the tests take the normal equations of all photographs together",
-        "Survey parts of the object by themselves to test them.",
+        "One camera for all photographs and one shape of the object are assumed but not tested: there "
+        "are too many photographs ({photographs}).",
+        "the tests need the normal equations of all photographs at once",
+        "Survey parts of the object separately to test them.",
     ),
     Kind(
         "assumptions_untested",
         "note",
-        "One camera for all photographs and one shape of the object are assumed, not tested: "
-        "the image points alone do not determine the network.",
+        "One camera for all photographs and one shape of the object are assumed but not tested: the "
+        "image points alone do not determine the network.",
         "too few photographs or points, or rejected ones without which the network falls apart",
         "Take more photographs from more directions.",
     ),
@@ -321,31 +323,31 @@ ROWS = (
     Kind(
         "cameras_untested",
         "note",
-        "Each of {cameras:camera} is assumed not to change, not tested: they are too many.",
-        "cameras of single photographs, or of a few",
-        "Make those one camera in the survey file that are one.",
+        "Each of {cameras:camera} is assumed not to change; this is not tested, as there are too many.",
+        "cameras with only one or a few photographs each",
+        "In the survey file, combine entries that describe the same camera.",
     ),
     Kind(
         "camera_weakly_tested",
         "note",
-        "The camera may change and shift coordinates[[ of the network without "
-        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
+        "A change of the camera may shift coordinates[[ of the network without {without:@}]] by up to "
+        "{sigmas} standard deviations before a test detects it.",
         "few photographs, or all from about the same directions",
         "Take more photographs from more directions, some of them rolled by 90 degrees.",
     ),
     Kind(
         "calibrated_from_few",
         "warning",
-        "Camera {camera} is calibrated from {photographs} alone: hardly anything shows whether it changed, "
-        "or whether the given points are as stated.",
+        "Camera {camera} is calibrated from {photographs} alone: almost nothing would show that it "
+        "changed, or that the given points are wrong.",
         "one or two photographs of a camera do not show how much others would differ from them",
         "Take four photographs or more, tilted by 30 to 45 degrees and rolled by 90 degrees.",
     ),
     Kind(
         "shape_weakly_tested",
         "note",
-        "The object may deform and shift coordinates[[ of the network without "
-        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
+        "A deformation of the object may shift coordinates[[ of the network without {without:@}]] by up "
+        "to {sigmas} standard deviations before a test detects it.",
         "few photographs, or few that show the same points before and after",
         "Photograph the whole object twice, one round after the other.",
     ),
@@ -353,24 +355,24 @@ ROWS = (
         "held_weakly_tested",
         "note",
         "Wrong held {parameters} of camera {camera} may shift coordinates[[ of the network without "
-        "{without:@}]] by up to {sigmas} standard deviations before a test shows it.",
-        "the exterior orientation of the photographs takes up what the parameters do",
+        "{without:@}]] by up to {sigmas} standard deviations before a test detects them.",
+        "the exterior orientation of the photographs absorbs errors of these parameters",
         "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
     ),
     Kind(
         "two_places",
         "warning",
-        "Point {point} is at a second place in {photographs}, {distance} away "
-        "({sigmas} standard deviations).",
-        "two points were taken for one, or the point moved",
-        "Measure the two places as two points, or remove the point.",
+        "Point {point} is at a different position in {photographs}, {distance} away ({sigmas} standard "
+        "deviations).",
+        "two points share one name, or the point moved",
+        "Measure the two positions as two points, or remove the point.",
     ),
     Kind(
         "names_exchanged",
         "warning",
-        "Points {first} and {second} are exchanged in {photographs}.",
+        "Points {first} and {second} are swapped in {photographs}.",
         "they were confused when the photographs were measured",
-        "Exchange the two in these photographs.",
+        "Swap the two in these photographs.",
     ),
     Kind(
         "image_points_misnamed",

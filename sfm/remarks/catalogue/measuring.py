@@ -8,16 +8,16 @@ POINTS = (
     Kind(
         "rays_rejected",
         "warning",
-        "More rays of {points:point} were rejected than chance makes: {points}.",
+        "More rays of {points:point} were rejected than expected by chance: {points}.",
         "a point moved, was misidentified, or is hard to measure",
         "Look at {points:its|their} rejected image points in the report.",
     ),
     Kind(
         "two_rays",
         "note",
-        "{two:point} of {total} {two:has|have} two rays, so that errors along the epipolar line are not "
-        "found.",
-        "two photographs show {two:it|them}",
+        "{two:point} of {total} {two:has|have} only two rays: errors along the epipolar line remain "
+        "undetected.",
+        "only two photographs show {two:it|them}",
         "Add a photograph of {two:this point|these points}.",
     ),
     Kind(
@@ -55,8 +55,8 @@ POINTS = (
         "point_with_parallel_rays",
         "note",
         "Its {rays} rays are parallel within their precision.",
-        "the point is far away, or its photographs are from one place",
-        "Add photographs from other places.",
+        "the point is far away, or its photographs were taken from one place",
+        "Add photographs from other positions.",
     ),
     Kind(
         "point_with_rays_apart",
@@ -83,16 +83,16 @@ POINTS = (
     Kind(
         "points_with_large_residuals",
         "warning",
-        "The residuals of {points:point} are together larger than chance: {points}.",
+        "Taken together, the residuals of {points:point} are larger than expected by chance: {points}.",
         "a point moved a little, is damaged, or is seen at a flat angle",
-        "Look at {points:it|them} in the photographs; leave out what you do not trust.",
+        "Look at {points:it|them} in the photographs; leave out any that you do not trust.",
     ),
     Kind(
         "image_points_identical",
         "note",
-        "{image_points:image point} {image_points:stands|stand} more than once with one position: "
+        "{image_points:image point} {image_points:appears|appear} more than once at the same position: "
         "{image_points}. Each counts once.",
-        "rows of the table were written twice",
+        "repeated rows in the table",
         "Remove the copies.",
     ),
     Kind(
@@ -106,57 +106,57 @@ POINTS = (
     Kind(
         "image_points_contradicting",
         "warning",
-        "{image_points:image point} {image_points:was|were} measured at different places and left out: "
-        "{image_points}.",
-        "two points of one photograph have one name",
+        "{image_points:image point} {image_points:was|were} measured at different positions and left "
+        "out: {image_points}.",
+        "two points in one photograph share a name",
         "Correct the names.",
     ),
     Kind(
         "code_at_several_places",
         "warning",
-        "Code {code} is read at several places: {photographs} {photographs:shows|show} it elsewhere than "
-        "{others:other photograph}[[, at {points}]].",
-        "a target was moved, two targets have one number, or a code was misread",
-        "Remove one of the targets, or survey the states by themselves.",
+        "Code {code} is read at several positions: {photographs} {photographs:shows|show} it elsewhere "
+        "than {others:other photograph}[[, at {points}]].",
+        "a target was moved, two targets share a number, or a code was misread",
+        "Remove one of the targets, or survey the states separately.",
     ),
     Kind(
         "plate_elsewhere",
         "warning",
-        "A plate is elsewhere in {photographs} than in the others: that of {points:point} {points}.",
-        "a plate slipped between the photographs, or what carries the plates bent",
-        "Fix the plates to one another and photograph them anew, or survey the states by themselves.",
+        "A plate is at a different position in {photographs}: that of {points:point} {points}.",
+        "a plate slipped between the photographs, or the support of the plates bent",
+        "Fix the plates to one another and photograph them again, or survey the states separately.",
     ),
     Kind(
         "code_rays_apart",
         "warning",
         "The rays to code {code} from {photographs} do not meet.",
-        "a target was moved, two targets have one number, or a code was misread",
-        "Remove one of the targets, or survey the states by themselves.",
+        "a target was moved, two targets share a number, or a code was misread",
+        "Remove one of the targets, or survey the states separately.",
     ),
     Kind(
         "codes_too_small",
         "note",
         "{targets:target} {targets:has a code that is|have codes that are} too small to read: dots are "
-        "{dot} across with "
-        "edges {blur} soft, {needed} are needed.",
+        "{dot} across, with edges blurred by {blur}; {needed} are needed.",
         "targets are too small or too far away, or photographs are not sharp",
-        "Print the targets larger, go nearer or focus better.",
+        "Print the targets larger, move closer or focus better.",
     ),
     Kind(
         "second_motion",
         # of rendered scenes none without a motion; a twentieth may be the object, hidden by what moves
         Grade("share", warning=0.01, error=0.05),
-        "{points:tie point}, {share:%} of all, in {photographs} {points:fits|fit} one another and not the "
-        "others: the photographs show two things that moved against each other.",
+        "{points:tie point}, {share:%} of all, in {photographs} {points:fits|fit} one another but not "
+        "the others: the photographs show two things that moved relative to each other.",
         "people, vehicles or leaves that moved together, a pattern that repeats, or a reflection",
-        "See which points are in the result; those of what moved may be. Photograph the object without it.",
+        "Check which points are in the result: they may be those of the thing that moved. Photograph the "
+        "object without it.",
     ),
     Kind(
         "windows_disagree",
         # 0.04 to 0.09 on stone and rendered surfaces; of windows at random within 3 px of where they are
         # looked for 0.33 agree by chance (ten photographs of a telephone)
         Grade("share", warning=0.3, error=0.6),
-        "{share:%} of the matched windows do not agree with each other, and some of the others do so by "
+        "{share:%} of the matched windows disagree with each other, and some of the others agree only by "
         "chance.",
         "the surface looks different from photograph to photograph: shine, steps, angles beyond 25 degrees",
         "Add photographs at smaller angles; coordinates may be worse than their standard deviations.",
@@ -179,7 +179,7 @@ POINTS = (
     Kind(
         "diameters_of_unknown",
         "warning",
-        "Diameters are stated of targets that are not in the survey: {targets}.",
+        "Diameters are stated for targets that are not in the survey: {targets}.",
         "ids that no target has",
         "Correct the ids in the table of diameters.",
     ),
@@ -195,9 +195,10 @@ ROWS = (
     Kind(
         "tolerance_undecided",
         "warning",
-        "{tolerance}: {undecided} of {total} deviations {undecided:is|are} too near the limit to be decided.",
+        "{tolerance}: {undecided} of {total} deviations {undecided:is|are} too close to the limit to be "
+        "decided.",
         "the uncertainty of the measurement reaches across the limit",
-        "Measure with a smaller uncertainty: more photographs, or larger in the photographs.",
+        "Measure with a smaller uncertainty: take more photographs, or move closer.",
     ),
     Kind(
         "tolerance_unknown",
@@ -225,15 +226,15 @@ ROWS = (
         "covariance_of_sample",
         "warning",
         "The covariance between points is known of {known} of {total} points: standard deviations of the "
-        "others leave out correlations.",
-        "of many points only a sample is kept with its covariance",
-        "Give the points that are measured names; those come first.",
+        "others ignore correlations.",
+        "of many points, results store the covariance of a sample only",
+        "Give the points that you measure names: named points come first.",
     ),
     Kind(
         "covariance_of_single_points",
         "warning",
         "Only the covariance of each single point is known: standard deviations of shapes and distances "
-        "leave out correlations.",
+        "ignore correlations.",
         "the result is of another program or an older version",
         "Run the survey again.",
     ),
@@ -277,13 +278,13 @@ ROWS = (
         "correlations_unknown",
         "note",
         "The correlations of the points are not known.",
-        "the covariance of the points was not kept together",
+        "the joint covariance of the points was not stored",
         "Run the survey again.",
     ),
     Kind(
         "lengths_outside",
         "error",
-        "{outside} of {total} lengths {outside:is|are} proven to be outside of the limit.",
+        "{outside} of {total} lengths {outside:is|are} proven to be outside the limit.",
         "the error of length measurement is larger than the limit and the uncertainty of the calibration",
         "See the table of lengths.",
     ),
@@ -299,7 +300,7 @@ ROWS = (
     Kind(
         "lengths_undecided",
         "warning",
-        "{undecided} of {total} lengths {undecided:is|are} proven neither inside nor outside of the limit.",
+        "{undecided} of {total} lengths {undecided:is|are} proven neither inside nor outside the limit.",
         "the uncertainty of the calibration reaches across the limit",
         "Use lengths with a better calibration.",
     ),
@@ -329,13 +330,13 @@ ROWS = (
         "line_not_straight",
         "warning",
         "The lengths of line {line} are not on one line.",
-        "points of two lines have one name of a line",
+        "points of two lines share a line name",
         "Correct the column line.",
     ),
     Kind(
         "lines_parallel",
         "warning",
-        "Lines {lines} have one direction; part 1 asks for different ones.",
+        "Lines {lines} have the same direction; part 1 asks for different ones.",
         "VDI/VDE 2634 part 1, sec. 4",
         "Place the lines in different directions.",
     ),

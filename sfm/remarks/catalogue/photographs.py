@@ -16,8 +16,8 @@ DRAFTS = (
     Kind(
         "photographs_marked_as_turned",
         "note",
-        "{photographs:photograph} of camera {camera} {photographs:is|are} marked as turned.",
-        "pixels are taken as they are stored, which is right for one camera",
+        "{photographs:photograph} of camera {camera} {photographs:is|are} marked as rotated.",
+        "EXIF data state a rotation; pixels are read as stored, which is right for one camera",
         "Nothing needs to be done.",
     ),
     Kind(
@@ -30,9 +30,9 @@ DRAFTS = (
     Kind(
         "several_cameras",
         "note",
-        "The photographs are of {cameras:camera} or settings: {cameras}.",
+        "The photographs are from {cameras:camera} or settings: {cameras}.",
         "another body, zoom, size or orientation of the photographs",
-        "Make them one camera in the survey file if they are one.",
+        "If they are one camera, combine them in the survey file.",
     ),
     Kind(
         "targets_blurred",
@@ -46,7 +46,7 @@ DRAFTS = (
         "warning",
         "A photograph has {circles:circle}, but no code of a known family: texture orients the photographs.",
         "targets without codes",
-        "Put coded targets among them.",
+        "Add coded targets.",
     ),
     Kind(
         "plate_pitch_assumed",
@@ -70,13 +70,13 @@ INPUT = (
         "note",
         "{copies:photograph} {copies:is a copy|are copies} of another, and {copies:counts|count} once: "
         "{copies}.",
-        "the same photograph was copied or saved again; it is no second observation",
+        "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copies.",
     ),
     Kind(
         "image_points_outside",
         "note",
-        "{image_points:image point} {image_points:is|are} outside of {image_points:its photograph|their "
+        "{image_points:image point} {image_points:is|are} outside {image_points:its photograph|their "
         "photographs} and left out: {image_points}.",
         "a gross error or a mistyped coordinate",
         "Correct or remove the image points that are named.",
@@ -85,7 +85,8 @@ INPUT = (
         "handedness_unchecked",
         "note",
         "Nothing checks whether image coordinates are mirrored: y must count downwards.",
-        "image points of a file, and no control points or projection centres in space that take part",
+        "image points from a file, without control points or projection centres that are not all in one "
+        "plane",
         "Compare the result with the object, or give four points that do not lie in a plane.",
     ),
 )
@@ -100,9 +101,9 @@ ROWS = (
     Kind(
         "not_connected",
         "warning",
-        "{photographs} {photographs:is|are} not connected with the {oriented} oriented "
-        "photographs[[, with only {shared:point|points} {shared} in common]].[[ A photograph that "
-        "shows {needed} of points {points} and {needed} of {others} connects them.]]",
+        "{photographs} {photographs:is|are} not connected to the {oriented} oriented photographs[[, with "
+        "only {shared:point|points} {shared} in common]].[[ A photograph that shows {needed} of points "
+        "{points} and {needed} of {others} would connect them.]]",
         "groups of photographs with too few common points",
         "Add a photograph that shows points of both groups.",
         explains=("photograph_not_connected",),
@@ -117,20 +118,19 @@ ROWS = (
     Kind(
         "pairs_matched",
         "note",
-        "{pairs} of {possible} pairs of photographs were matched: those with most in common[[, neighbours in "
-        "the series of {in_sequence:photograph} (EXIF time or numbers in the names)]][[, neighbours by "
-        "satellite navigation of {by_position:photograph} (EXIF)]].",
+        "{pairs} of {possible} pairs of photographs were matched: those with most in common[[, "
+        "neighbours in the series of {in_sequence:photograph} (EXIF time or numbers in the names)]][[, "
+        "neighbours by satellite navigation of {by_position:photograph} (EXIF)]].",
         "matching all pairs takes time with the square of the number of photographs",
         "Nothing needs to be done. If photographs that overlap are not connected, take one between them.",
     ),
     Kind(
         "clock_differs",
         "note",
-        "By the times in EXIF data the clock of camera {camera} is {ahead} ahead of that of camera "
-        "{reference}; "
-        "times are compared without this difference.",
+        "According to the times in EXIF data, the clock of camera {camera} is {ahead} ahead of that of "
+        "camera {reference}; times are compared after removing this difference.",
         "clocks that were not set to the same time",
-        "Check in the report that the photographs of a moment show the same scene.",
+        "Check in the report that photographs of the same moment show the same scene.",
     ),
     Kind(
         "photographs_uneven",
@@ -143,16 +143,16 @@ ROWS = (
     Kind(
         "photographs_blurred",
         "note",
-        "{photographs} {photographs:is|are} blurred: edges of targets are {blur} soft (standard deviation), "
-        "those of the other photographs[[ of camera {camera}]] {others}.",
+        "{photographs} {photographs:is|are} blurred: edges of targets are blurred by {blur} (standard "
+        "deviation), those of the other photographs[[ of camera {camera}]] by {others}.",
         "out of focus, or the camera or the object moved during the exposure",
         "Take {photographs:the photograph|these photographs} again, or leave {photographs:it|them} out.",
     ),
     Kind(
         "camera_by_size",
         "note",
-        "{photographs:photograph} of camera {camera} {photographs:has|have} {size} in place of {usual} "
-        "({what}) and became camera {new}: {photographs}.",
+        "{photographs:photograph} of camera {camera} {photographs:has|have} {size} instead of {usual} "
+        "({what}) and {photographs:was|were} assigned to camera {new}: {photographs}.",
         "photographs that are cropped, resampled or turned, or from another sensor",
         "Use original photographs.",
     ),
@@ -162,21 +162,21 @@ ROWS = (
         "{photograph} does not fit camera {camera} ({rejected} of {points:point} rejected); with "
         "{parameters} per photograph, c {change:+}, residuals are {rms}.[[ It may be "
         "{other}, the other photograph of this camera, that changed.]]",
-        "zoomed, focused anew, cropped or resampled",
-        "Give this photograph a camera in the survey file, or leave it out.",
+        "zoomed, refocused, cropped or resampled",
+        "Give this photograph a separate camera in the survey file, or leave it out.",
     ),
     Kind(
         "c_per_photograph",
         "warning",
-        "c of camera {camera} differs among its photographs and was adjusted in each: {least} to {most}.",
+        "c of camera {camera} differs among its photographs and was adjusted for each: {least} to {most}.",
         "a zoom that slipped, autofocus or a stabiliser",
-        "Hold zoom and focus in place; coordinates are less precise with c per photograph.",
+        "Fix zoom and focus; coordinates are less precise with c per photograph.",
     ),
     Kind(
         "plate_not_found",
         "note",
         "The calibration plate of {size} dots was not found in {photographs:photograph}: {photographs}.",
-        "a plate without marks must be seen whole, one with marks with enough of them",
+        "a plate without marks must be seen whole; of one with marks, enough marks must be seen",
         "Show all of it; check the polarity of the dots.",
         explains=("photograph_with_few_points",),
     ),
@@ -191,20 +191,20 @@ ROWS = (
         "plate_not_recognised",
         "note",
         "In {photographs:photograph} {dots:dot} {dots:does|do} not fit the plate of {size}: {photographs}.",
-        "rows, columns or marks are not those of the plate; its marks are hidden or blurred; or a part "
-        "of it without marks",
+        "rows, columns or marks are not those of the plate; its marks are hidden or blurred; or only a "
+        "part without marks is seen",
         "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
         explains=("photograph_with_few_points",),
     ),
     Kind(
         "plate_looks_alike_turned",
         "warning",
-        "The plate looks alike turned: {cameras} may count its points from different corners in "
+        "The plate looks the same when rotated: {cameras} may count its points from different corners in "
         "{photographs:photograph} ({photographs}).",
-        "cameras that were not mounted together, photographs that are not of the same moments, or a plate "
-        "that was hardly moved",
-        "Number photographs of one moment alike; otherwise do not compare stations of one camera with those "
-        "of the other, or take a plate with marks.",
+        "cameras that were not mounted together, photographs that were not taken at the same moments, or "
+        "a plate that was hardly moved",
+        "Give photographs of one moment the same number; otherwise do not compare stations of one camera "
+        "with those of the other, or use a plate with marks.",
     ),
     Kind(
         "checkerboard_not_found",
@@ -234,16 +234,16 @@ ROWS = (
     Kind(
         "plate_side_not_found",
         "warning",
-        "Nothing was found of the {sides} of the {codes} of {size}; "
-        "{views:photograph} {views:shows|show} the place.",
-        "rows, columns or the first tag of the plate are others, so that points have wrong names, or this "
+        "Nothing was found of the {sides} of the {codes} of {size}; {views:photograph} "
+        "{views:shows|show} the area.",
+        "rows, columns or the first tag of the plate are wrong, so that points have wrong names, or this "
         "side is hidden",
         "Check rows and columns, and first_tag of a plate with tags.",
     ),
     Kind(
         "plane_ambiguous",
         "error",
-        "The common points of {photographs} lie in a plane, and two orientations fit them alike.",
+        "The common points of {photographs} lie in a plane, and two orientations fit them equally well.",
         "the photographs do not decide which of the two is true",
         "Add points off the plane, or a third photograph.",
     ),
@@ -252,28 +252,28 @@ ROWS = (
         "copy_of_file",
         "note",
         "It is a copy of {original}: the files are the same.",
-        "the same photograph was copied or saved again; it is no second observation",
+        "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_picture",
         "note",
         "It is a copy of {original}: the pictures are the same.",
-        "the same photograph was copied or saved again; it is no second observation",
+        "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_image_points",
         "note",
         "It is a copy of {original}: the image points are the same.",
-        "the same photograph was copied or saved again; it is no second observation",
+        "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copy.",
     ),
     Kind(
         "copy_of_errors",
         "note",
         "It is a copy of {original}: the errors of the image points are the same.",
-        "the same photograph was copied or saved again; it is no second observation",
+        "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copy.",
     ),
     Kind(
@@ -281,7 +281,7 @@ ROWS = (
         "warning",
         "Not readable: {reason}.",
         "a damaged file, or no photograph",
-        "Copy it anew, or convert it to JPEG or TIFF.",
+        "Copy it again, or convert it to JPEG or TIFF.",
     ),
     Kind(
         "photographs_not_drawn",
@@ -294,15 +294,15 @@ ROWS = (
     Kind(
         "photograph_of_other_size",
         "warning",
-        "It has {size}, the others of camera {camera} have {usual} ({what}); {needed} such photographs would "
-        "be a camera.",
+        "It has {size}, the others of camera {camera} have {usual} ({what}); {needed} such photographs "
+        "would form a separate camera.",
         "photographs that are cropped, resampled or turned, or from another sensor",
         "Use original photographs.",
     ),
     Kind(
         "photograph_outside_calibration",
         "warning",
-        "It has {size}, the calibration of camera {camera} is of {usual} ({what}).",
+        "It has {size}, the calibration of camera {camera} is for {usual} ({what}).",
         "photographs that are cropped or turned, or from another sensor",
         "Use original photographs, or describe their camera.",
     ),
@@ -334,14 +334,14 @@ ROWS = (
         "points "
         "{against:contradicts|contradict} it.",
         "another object, a mirrored picture, wrong codes, or matches of a repeated pattern",
-        "Leave it out, or survey it by itself.",
+        "Leave it out, or survey it separately.",
     ),
     Kind(
         "photograph_against_the_others",
         "warning",
         "Its image points contradict the others.",
         "another object or misidentified points",
-        "Leave it out, or survey it by itself.",
+        "Leave it out, or survey it separately.",
     ),
     Kind(
         "photograph_mirrored",
@@ -354,7 +354,8 @@ ROWS = (
     Kind(
         "photograph_of_mirror_image",
         "warning",
-        "{photographs} {photographs:shows|show} the mirror image of the others, by {points:common point}.",
+        "{photographs} {photographs:shows|show} the mirror image of the others, judging by "
+        "{points:common point}.",
         "{photographs:this photograph|these photographs} or the others were mirrored by a program, or x "
         "was reversed",
         "Use the original photographs; check the handedness of the result.",
@@ -362,11 +363,10 @@ ROWS = (
     Kind(
         "photograph_of_second_object",
         "warning",
-        "{photographs} fit one another and not the others: {points:common point} {points:differs|differ} "
-        "by {misfit:%} of "
-        "their spread.",
+        "{photographs} fit one another but not the others: {points:common point} {points:differs|differ} "
+        "by {misfit:%} of their spread.",
         "a second object with the same codes, or this one in another state",
-        "Survey them by themselves.",
+        "Survey them separately.",
     ),
     Kind(
         "photograph_with_codes_elsewhere",
@@ -374,7 +374,7 @@ ROWS = (
         "{codes:code} {codes:is|are} elsewhere than in the others: {codes}[[; {agreeing} "
         "{agreeing:agrees|agree} with it]].",
         "another object with the same codes, this one in another state, or wrong codes",
-        "Survey it by itself, or correct the codes.",
+        "Survey it separately, or correct the codes.",
     ),
     Kind(
         "photograph_not_explained",
@@ -383,7 +383,7 @@ ROWS = (
         "explains "
         "{against:it|them}.",
         "another state of the object, another object or wrong codes",
-        "Leave it out, or survey it by itself.",
+        "Leave it out, or survey it separately.",
     ),
     Kind(
         "photograph_with_few_accepted",

@@ -16,7 +16,7 @@ BATCHES = (
         "surveys_set_aside",
         "error",
         "{surveys:survey} {surveys:was|were} set aside: {surveys}.",
-        "the process that computed {surveys:it|them} died, as where memory is not enough",
+        "the process that computed {surveys:it|them} died, for example for lack of memory",
         "Run {surveys:this survey alone|each of these surveys alone}.",
     ),
     Kind(
@@ -67,7 +67,7 @@ BATCHES = (
     Kind(
         "kolinear_failed",
         "error",
-        "Network {network}: Kolinear finds no solution, {program} does[[: {message}]].",
+        "Network {network}: Kolinear finds no solution, but {program} does[[: {message}]].",
         "a fault of the adjuster, or start values too far off",
         "Look at this network in the table.",
         short="Kolinear failed",
@@ -75,7 +75,7 @@ BATCHES = (
     Kind(
         "other_adjuster_failed",
         "warning",
-        "Network {network}: {program} finds no solution, Kolinear does[[: {their_message}]].",
+        "Network {network}: {program} finds no solution, but Kolinear does[[: {their_message}]].",
         "the other program stops early, or loses points",
         "Look at this network in the table.",
         short="the other adjuster failed",
@@ -104,7 +104,7 @@ ROWS = (
         "{photographs} {photographs:shares|share} fewer than {needed} points with {others}: they are "
         "separate "
         "networks.",
-        "steps between directions or heights that are too large, or parts of the object that nothing joins",
+        "too large steps between directions or heights, or parts of the object that nothing joins",
         "Add stations between them, from which points of both are seen.",
         explains=("plan_undetermined",),
     ),
@@ -118,9 +118,9 @@ ROWS = (
     Kind(
         "plan_short_of_wanted",
         "warning",
-        "The uncertainty is {times} times that wanted.",
+        "The uncertainty is {times} times the wanted one.",
         "too few photographs, or from too far away",
-        "Add stations, go nearer, or allow more photographs.",
+        "Add stations, move closer, or allow more photographs.",
     ),
     Kind(
         "plan_points_with_few_rays",
@@ -134,7 +134,7 @@ ROWS = (
         "warning",
         "The network does not determine the camera: {reasons}.",
         "too few directions or rolls, or too little of the photographs is filled",
-        "Calibrate the camera before, or hold it.",
+        "Calibrate the camera beforehand, or hold it fixed.",
     ),
     Kind(
         "plan_limited",
@@ -154,7 +154,8 @@ ROWS = (
     Kind(
         "plan_without_scale",
         "note",
-        "The scale is taken as known: without a scale bar, standard deviations leave it out.",
+        "The scale is assumed to be known: without a scale bar, standard deviations do not include its "
+        "error.",
         "no scale bar and nothing else that gives the scale was planned",
         "Give --scale-bar, or observations in a survey file with --survey.",
     ),
@@ -168,7 +169,7 @@ ROWS = (
     Kind(
         "plan_few_codes",
         "note",
-        "{photographs:photograph} {photographs:has|have} fewer than {needed} places of coded targets: "
+        "{photographs:photograph} {photographs:has|have} fewer than {needed} positions of coded targets: "
         "{photographs}.",
         "{photographs:it shows|they show} few points",
         "Plan more coded targets there.",
@@ -183,7 +184,8 @@ ROWS = (
     Kind(
         "plan_sigma_of_targets",
         "note",
-        "The standard deviation of image coordinates is what the targets allow; lens and sensor add to it.",
+        "The standard deviation of image coordinates is the limit that the targets set; lens and sensor "
+        "add to it.",
         "no --sigma-px was given",
         "Give --sigma-px from an earlier survey.",
     ),
