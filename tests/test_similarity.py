@@ -8,7 +8,14 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity, fit_motions, fit_similarities, fit_similarity, similarity_motions
+from sfm.similarity import (
+    Similarity,
+    extended_axes,
+    fit_motions,
+    fit_similarities,
+    fit_similarity,
+    similarity_motions,
+)
 from tests.synthetic import make_network, seed_of
 
 TRUE = Similarity(2.5, rotation_from_angles(0.3, -1.1, 2.9), np.array([10.0, -4.0, 7.0]))
@@ -109,3 +116,10 @@ def test_all_seven_motions_are_the_similarity_and_none_is_none() -> None:
     found, whole = fit_motions(source, target, motions), fit_similarity(source, target)
     np.testing.assert_allclose(found.apply(source), whole.apply(source), atol=1e-9)
     np.testing.assert_array_equal(fit_motions(source, target, motions[:, :, :0]).apply(source), source)
+
+
+@pytest.mark.parametrize(("depth", "axes"), [(0.04, 2), (0.06, 3)])
+def test_points_have_depth_from_a_twentieth_of_their_extent(depth: float, axes: int) -> None:
+    box = np.array([[x, y, z] for x in (-1, 1) for y in (-0.8, 0.8) for z in (-depth, depth)])
+    found, along = extended_axes(box)
+    assert found.shape == (axes, 3) and along.shape == (8, axes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate
+from sfm.network import Estimate, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
 from sfm.report.findings.bundle_statistics import given_of
@@ -186,6 +187,28 @@ def test_projection_centres_on_a_line_do_not_place_a_network(tmp_path: Path, off
         GeometryError, match="places of projection centres and control points with X, Y and Z, on a line, and"
     ):
         solved(path)
+
+
+def test_extents_of_places_do_not_depend_on_where_they_are() -> None:
+    line = np.array([100.0, -50.0, 7.0]) + np.linspace(0.0, 3.0, 5)[:, None] * [0.6, 0.0, 0.8]
+    length, breadth = placing._extents(line, np.array([1.0, 2.0, 3.0, 2.0, 1.0]))
+    assert length == pytest.approx(0.75 * np.sqrt(12 / 9)) and breadth < 1e-12
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e3])
+@pytest.mark.parametrize(("breadth", "placed"), [(0.1, True), (0.02, False)])
+def test_control_places_a_network_from_a_twentieth_of_its_length(
+    size: float, breadth: float, placed: bool
+) -> None:
+    """Broad control has placed the orientation before; narrow control places it here."""
+    b = breadth
+    figure = size * np.array([[-1, -b, 0], [1, -b, 0], [1, b, 0], [-1, b, 0.5 * b]])
+    network, truth = make_network(seed_of("breadth"), images=3, points=4, free=(), figure=figure)
+    control = ObjectPoints(np.arange(4), truth.points + 3.0 * size, np.zeros((4, 3, 3)))
+    found = placing.place_on_exterior(replace(network, control=control), truth)
+    assert (found is truth) is placed
+    if not placed:
+        np.testing.assert_allclose(found.points, control.xyz, atol=1e-9 * size)
 
 
 @pytest.mark.parametrize(("breadth", "on_a_line"), [(0.8e-6, True), (1.5e-6, False)])

@@ -23,8 +23,8 @@ from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
-from sfm.survey.inputs.survey import read_survey
-from sfm.survey.rigs import mounts_of, place_by_rigs
+from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
+from sfm.survey.rigs import mounts_of, place_by_rigs, planned_mounts
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 
@@ -323,3 +323,17 @@ def test_photographs_are_of_one_block(change: tuple[str, str], said: str, tmp_pa
     network, truth, _ = moved_rig("blocks")
     with pytest.raises(SurveyFileError, match=re.escape(said)):
         run_survey(read_survey(written(tmp_path, network, truth, BLOCKS.replace(*change))))
+
+
+@pytest.mark.parametrize("rigs", [[], [(1, 2, 3)], [(1, 2), (3, 4)]])
+def test_a_plan_needs_one_rig_of_all_cameras(rigs: list[tuple[int, ...]]) -> None:
+    """Of four cameras none is on a rig, three are, or they are on two rigs."""
+    cameras = [CameraSetup(name=f"camera {k}", images=f"{k}-*", c_mm=10.0) for k in (1, 2, 3, 4)]
+    given = [
+        {"name": f"rig {n}", "cameras": [f"camera {k}" for k in some], "moment": "-(.*)"}
+        for n, some in enumerate(rigs)
+    ]
+    with pytest.raises(SurveyFileError) as error:
+        planned_mounts(Survey(name="plan", cameras=cameras, rigs=given))
+    on = "camera 1, camera 2" if rigs else "none;"
+    assert f"on rigs {on}" in str(error.value) and "one rig of all cameras" in str(error.value)

@@ -300,15 +300,16 @@ def test_planes_are_met_on_either_side_of_large_offsets() -> None:
 
 @pytest.mark.parametrize(("line", "own"), [(False, 6), (True, 5)])
 def test_frames_have_as_many_parameters_wherever_they_are(line: bool, own: int) -> None:
-    """A bar has five, and coordinates of its system may be large."""
+    """A bar has five. Frames may be small, and coordinates of their system large."""
     rng = seed_of("frame")
-    for away in (0.0, 1e4, 5e6):
-        local = rng.uniform(-0.5, 0.5, (5, 3)) * ([1, 0, 0] if line else [1, 1, 1])
-        X = local @ np.linalg.qr(rng.normal(0, 1, (3, 3)))[0].T + 1e-4 * rng.standard_normal((5, 3))
+    for away, size in ((0.0, 1.0), (1e4, 1.0), (5e6, 1.0), (0.0, 1e-4)):
+        local = size * rng.uniform(-0.5, 0.5, (5, 3)) * ([1, 0, 0] if line else [1, 1, 1])
+        noise = 1e-4 * size * rng.standard_normal((5, 3))
+        X = local @ np.linalg.qr(rng.normal(0, 1, (3, 3)))[0].T + noise
         frame = RigidFrames("bar", np.arange(5), local + away, np.full((5, 3), 1e-4))
         H = frame.fit(X).H.reshape(15, 6)
-        assert np.linalg.matrix_rank(H, tol=1e-6) == own
-        assert np.abs(frame.fit(X).difference).max() < 1e-3
+        assert np.linalg.matrix_rank(H / ([1.0] * 3 + [size] * 3), tol=1e-6) == own
+        assert np.abs(frame.fit(X).difference).max() < 1e-3 * size
 
 
 def test_heights_near_nothing_give_no_scale(tmp_path: Path) -> None:
@@ -527,6 +528,29 @@ def test_a_tip_that_no_photograph_shows_has_the_covariance_that_is_stated() -> N
         error = found.value - tip
         sums.append(error @ np.linalg.solve(found.covariance / a.sigma0**2, error))
     assert stats.kstest(sums, stats.chi2(3).cdf).pvalue > 0.001
+
+
+def test_a_tip_follows_the_points_of_its_frame() -> None:
+    """Its derivatives by them, far from the origin of the object and of the frame."""
+    rng = seed_of("tip follows")
+    local, tip = rng.uniform(-0.5, 0.5, (5, 3)) + np.array([3.0, -2.0, 4.0]), np.array([[3.3, -1.5, 4.2]])
+    R = rotation_from_vector(np.array([0.4, -0.7, 1.1]))
+    X = local @ R.T + [7.0, 5.0, -6.0] + 1e-5 * rng.standard_normal((5, 3))
+    frame = RigidFrames(
+        "probe", np.arange(5), local, np.full((5, 3), 1e-4), ("tip",), tip, np.full((1, 3), 1e-4)
+    )
+    _, truth = make_network(seed_of("tip follows"), images=3, points=5, free=())
+
+    def tip_of(points: FloatArray) -> FloatArray:
+        return frame.own_parameters(values_of(replace(truth, points=points))).value
+
+    found = frame.own_parameters(values_of(replace(truth, points=X))).J
+    expected = np.zeros((3, 5, 3))
+    for p, axis in np.ndindex(5, 3):
+        step = np.zeros((5, 3))
+        step[p, axis] = 1e-6
+        expected[:, p, axis] = (tip_of(X + step) - tip_of(X - step)) / 2e-6
+    np.testing.assert_allclose(found, expected, atol=2e-4)
 
 
 def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:

@@ -114,10 +114,11 @@ def test_normal_equations_against_differences():
     J = np.stack([(residuals(e) - residuals(-e)) / (2 * h) for e in np.eye(6) * h], axis=1).reshape(n, 2, 6)
     v = residuals(np.zeros(6)).reshape(n, 2)
     N, b, out = np.empty((6, 6)), np.empty(6), np.empty((n, 2))
-    cost, _ = pose_normals(measured, points, P, np.ones(n, dtype=bool), X0, R, N, b, out)
+    cost, distance = pose_normals(measured, points, P, np.ones(n, dtype=bool), X0, R, N, b, out)
     np.testing.assert_allclose(N, np.einsum("nia,nij,njb->ab", J, P, J), rtol=1e-7, atol=1e-6)
     np.testing.assert_allclose(b, -np.einsum("nia,nij,nj->a", J, P, v), rtol=1e-7, atol=1e-7)
     assert cost == pytest.approx(np.einsum("ni,nij,nj", v, P, v))
+    assert distance == pytest.approx(np.linalg.norm(points - X0, axis=1).mean())
 
 
 def test_dispersion_is_that_of_many_solutions():
