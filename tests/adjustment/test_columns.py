@@ -149,3 +149,9 @@ def test_c_moves_image_points_as_its_camera_does(model: str) -> None:
             for one in (camera, longer)
         )
         np.testing.assert_allclose(found.freedoms[rows, :, 0], (away - at) / 1e-6 / 1000, atol=1e-3)
+
+
+def test_every_freedom_of_a_photograph_has_one_place() -> None:
+    places = columns.CAMERA_PLACES + columns.STRAIN_PLACES + columns.BENDING_PLACES
+    assert places == tuple(range(len(columns.CAMERA) + columns.STRAIN + columns.BENDING))
+    assert (len(columns.CAMERA), columns.STRAIN, columns.BENDING) == (9, 5, 18)

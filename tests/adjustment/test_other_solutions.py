@@ -146,3 +146,24 @@ def test_other_solutions_are_described_by_the_first_camera_whose_c_is_free() -> 
         found = searched._Place(a).describe(other, 1.0)
         assert (found.camera, found.c, found.unit) == (name, pytest.approx(30.0), "mm")
         assert found.c_moved == pytest.approx(5.0) and not found.reflected
+
+
+@pytest.mark.parametrize(("heights", "adjusted"), [([1.0, 9.0, 5.0, 9.0], [5.0]), ([1.0, 9.0, 12.0], [])])
+def test_minima_along_c_are_adjusted_and_the_start_is_not(
+    heights: list[float], adjusted: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start is the result, whose minimum is known; a minimum farther along is adjusted with c free."""
+    start, again = stub().estimate, []
+    monkeypatch.setattr(searched, "_with_free", lambda estimate, _: estimate)
+
+    def along(one: Any, factor: float, steps: int, vPv: float) -> list[Any]:
+        return [searched._Candidate(one if k == 0 else stub().estimate, h) for k, h in enumerate(heights)]
+
+    def adjust_freely(one: Any) -> Any:
+        again.append(one)
+        return SimpleNamespace(converged=True, estimate=one, vPv=2.0)
+
+    search: Any = SimpleNamespace(_along=along, adjusted=adjust_freely, datum=SimpleNamespace(kind="control"))
+    found = list(searched._Search.candidates(search, start, (), 1.0, 1.5, follow_c=True))
+    assert len(again) == 2 * len(adjusted)  # with c larger, and smaller
+    assert [one.vPv for one in found] == 2 * ([1.0] + [2.0] * len(adjusted))

@@ -19,7 +19,7 @@ from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
-from sfm.observations.kind import PHOTOGRAPH, TableKind
+from sfm.observations.kind import PHOTOGRAPH, Group, TableKind
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
@@ -251,6 +251,9 @@ def test_every_kind_is_written_as_the_table_that_it_is_read_from(tmp_path: Path)
             (kind,) = (kind for kind, of in TABLES.items() if type(one) is of)
             table = read_observation_table(kind, tmp_path / f"{number}.csv", "survey.toml")
             (again,) = with_tables((table,), network).observations[len(network.observations) :]
+            if isinstance(one, Group):
+                assert isinstance(again, Group) and again.row_points(network) == one.row_points(network)
+                assert again.group == one.group
             np.testing.assert_allclose(again.values, one.values, rtol=1e-12)
             np.testing.assert_allclose(again.covariances(), one.covariances(), rtol=1e-12)
 

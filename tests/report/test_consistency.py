@@ -132,3 +132,17 @@ def test_residuals_are_rounding_up_to_a_billionth_of_the_coordinates() -> None:
     limit = 1e-9 * float(np.abs(network.image_points.xy).max())
     for factor, exact in ((0.6, True), (1.6, False)):
         assert replace(a, residuals=np.full_like(a.residuals, factor * limit)).is_exact == exact
+
+
+def test_a_point_moves_by_the_difference_of_two_choices_of_its_rays() -> None:
+    rng = seed_of("moved")
+    A = rng.normal(size=(4, 2, 3))
+    v = rng.normal(size=(4, 2))
+    parts = consistency.PointNormals(
+        np.einsum("kia,kib->kab", A, A), np.einsum("kia,ki->ka", A, v), (v**2).sum(axis=1)
+    )
+    kept, other = np.array([0, 1, 2]), np.array([0, 1, 3])
+    steps = [np.linalg.lstsq(A[k].reshape(-1, 3), v[k].ravel(), rcond=None)[0] for k in (kept, other)]
+    expected = np.linalg.norm(A[kept].reshape(-1, 3) @ (steps[1] - steps[0]))
+    assert consistency._moved(parts, kept, other) == pytest.approx(expected)
+    assert consistency._moved(parts, kept, kept) == 0

@@ -257,3 +257,28 @@ def test_mirrored_control_names_what_does_not_fit_either() -> None:
     said = said_of_control("mirrored and wrong", (1, 1, -1), fourth_off=0.02)
     assert said[0].kind == "given_mirrored" and said[0].names("given") == ("4",)
     assert said[0].number("mirrored") < 40 < said[0].number("chi2")  # 14 degrees of freedom
+
+
+@pytest.mark.parametrize(
+    ("case", "factor"),
+    [
+        ({}, 2.0),
+        ({"doubtful": ("a",)}, 3.0),
+        ({"factor": 1.0}, 1.0),
+        ({"rescale": False}, 1.0),
+        ({"estimated": True}, 1.0),
+        ({"fixed": True}, 1.0),
+    ],
+)
+def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
+    case: dict[str, Any], factor: float
+) -> None:
+    of = {"doubtful": (), "factor": 2.0, "rescale": True, "estimated": False, "fixed": False} | case
+    stated = np.diag([0.0, 0.0, np.inf] if of["fixed"] else [1e-4, 4e-4, np.inf])[None]
+    group: Any = SimpleNamespace(
+        rounded=False,
+        found=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
+        placed=SimpleNamespace(model=SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))),
+    )
+    found = given_scales.Group._confirmed(group, stated, of["rescale"])
+    np.testing.assert_allclose(found, np.where(np.isfinite(stated), factor**2 * stated, stated))

@@ -585,3 +585,12 @@ def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
     X = result.estimate.points[order]
     assert found.value[3:] == pytest.approx(X[0] + 4 * (X[2] - X[0]) / 2, abs=2e-3)
     assert "not determined" in text_report(findings_of(result))
+
+
+def test_differences_of_directions_have_no_mean() -> None:
+    """Their orientation takes it, however much they differ."""
+    rng = seed_of("directions")
+    X, value = rng.uniform(-1, 1, (7, 3)), rng.uniform(0, 2 * np.pi, (6, 1))
+    directions = HorizontalDirections("station", np.arange(7), value, rng.uniform(1e-4, 3e-4, (6, 1)))
+    l, w = directions.fit(X).difference[:, 0], directions.weights
+    assert np.abs(l).max() > 0.5 and abs((w * l).sum() / w.sum()) < 1e-12

@@ -319,3 +319,13 @@ def test_the_plate_is_control_and_start_value(tmp_path: Path) -> None:
     assert survey.start_points is survey.control
     assert np.allclose(survey.control.xyz[12], (12, -12, 0))
     assert replace(survey, name="again").control is not None
+
+
+def test_a_ring_is_ten_standard_deviations_larger_than_the_dots() -> None:
+    rng = seed_of("ring sizes")
+    place = np.array([[row, column] for row in range(4) for column in range(5)])
+    radius = 8.0 * np.exp(0.01 * rng.standard_normal(20))
+    ring = np.arange(20) == 7
+    radius[7] *= 2.0
+    size = dot_plates.size_of_marks(Lattice(np.arange(20), place, np.zeros((20, 2))), radius, ring)
+    assert size[ring].tolist() == [10.0] and np.abs(size[~ring]).max() < 5.0

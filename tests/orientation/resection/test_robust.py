@@ -112,3 +112,10 @@ def test_table_of_trials():
             mean, deviation = expected_trials(w, n)
             assert mean == pytest.approx(printed, abs=0.06 if printed < 10 else 0.51)
             assert deviation == pytest.approx(np.sqrt(1 - w**n) / w**n)
+
+
+@pytest.mark.parametrize(("n", "triples"), [(5, 10), (8, 56)])
+def test_every_triple_of_few_points_is_tried_once(n: int, triples: int):
+    uv, points, _, _ = scene(seed_of("every triple"), n, sigma=1e-4)
+    uv[0] += 0.2
+    assert resect_robust(uv, points, tolerance=1e-3, max_trials=3).trials == triples
