@@ -514,3 +514,36 @@ def test_what_given_points_say_of_freedoms_is_what_an_adjustment_with_them_finds
         replace(network, camera=np.array([1, 0, 0, 0])), start, datum=Datum("control"), reject="none"
     )
     assert (a.vPv - apart.vPv) / a.sigma0**2 == pytest.approx(gain.value, rel=0.02)
+
+
+@pytest.mark.parametrize(("effect", "tried"), [(1.0, 2), (4.0, 1)])
+def test_a_parameter_of_all_photographs_is_tried_with_what_its_errors_in_common_leave(
+    effect: float, tried: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It gains 40 variances: 20 of ln likelihood, and 5 where image points count for a quarter."""
+
+    def alternative(name: str, family: object, evidence: float, effect: float) -> object:
+        gain = SimpleNamespace(value=40.0)
+        of = SimpleNamespace(cause=lambda one: (name,)) if family is None else family
+        return SimpleNamespace(family=of, gain=gain, evidence=evidence, price=6.0, design_effect=effect)
+
+    class Interior(hypotheses.InteriorFamily):
+        def __init__(self) -> None:
+            pass
+
+        def cause(self, one: object) -> tuple[object, ...]:
+            return ("interior",)
+
+    def refitted(_: object, to_try: list[object], count: int) -> list[object]:
+        assert count == tried
+        raise StopIteration
+
+    every = [alternative("clear", None, 30.0, 1.0), alternative("interior", Interior(), 0.0, effect)]
+    reduced = SimpleNamespace(redundancy=100_000)
+    monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
+    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: reduced)
+    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
+    monkeypatch.setattr(hypotheses, "is_significant", lambda one, count: True)
+    monkeypatch.setattr(hypotheses, "reported", refitted)
+    with pytest.raises(StopIteration):
+        hypotheses._best(SimpleNamespace(), ())  # type: ignore[arg-type]

@@ -301,3 +301,18 @@ def test_a_table_is_a_file_of_ten_megabytes_at_most(tmp_path: Path, monkeypatch:
 def test_numbers_have_eighteen_digits_at_most() -> None:
     assert rings._is_number("9" * 18) and not rings._is_number("9" * 19)
     assert not rings._is_number("٣") and not rings._is_number("1.0")
+
+
+@pytest.mark.parametrize("step", [0.7, 1.4])
+@pytest.mark.parametrize(("share", "read"), [(0.09, True), (0.11, False)])
+def test_a_clear_cell_is_as_the_background_to_a_tenth_of_the_step(
+    step: float, share: float, read: bool
+) -> None:
+    family = code_family("ring14")
+    assert isinstance(family, rings.CodeFamily)
+    bits = (int(family.pattern[5]) >> np.arange(13, -1, -1)) & 1
+    found = np.zeros((7, 14))
+    found[:3] = step * bits
+    found[:3, np.flatnonzero(bits == 0)[0]] = share * step
+    code, _ = rings._read_cells(found, family, 0.0)
+    assert code == (family.number[5] if read else rings.UNREADABLE)
