@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import FloatArray
@@ -243,3 +244,10 @@ def test_bad_input_is_one_line() -> None:
         block_motion(moved, np.ones(POINTS, dtype=bool), name="all")
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
         block_motion(moved, np.arange(POINTS) < 9, name="pier", model="bent")
+
+
+@pytest.mark.parametrize("m", [1, 3, 2000])
+def test_a_shift_is_found_with_the_power_that_is_stated(m: int) -> None:
+    """However many coordinates are tested together."""
+    shift = detectable_shift(0.001, 0.8, m, None)
+    assert stats.ncx2.sf(stats.chi2.isf(0.001, m), m, shift**2) == pytest.approx(0.8, abs=2e-3)
