@@ -141,7 +141,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/similarity.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
     "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),
     "sfm/epochs/displacements.py": ("tests/epochs/test_displacements.py",),
-    "sfm/conventions.py": ("tests/test_units.py",),
+    "sfm/conventions.py": ("tests/test_units.py", "tests/test_conventions_page.py"),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
     "sfm/targets/codes/dot_plates.py": ("tests/targets/test_plates.py",),
 }

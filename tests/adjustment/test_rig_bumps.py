@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.moved import _scores, bump_remarks, find_bumps
+from sfm.adjustment.hypotheses.moved import _gain, _scores, bump_remarks, find_bumps
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network
@@ -74,3 +74,17 @@ def test_scores_are_those_of_an_adjustment_with_a_pose_of_its_own() -> None:
     b = adjust(free, start, reject="none", tolerance=1e-9)
     fall = a.vPv - b.vPv
     assert (found.sigmas * a.sigma0) ** 2 == pytest.approx(fall, rel=0.01)
+
+
+def test_the_gain_of_a_pose_is_beside_those_of_others() -> None:
+    """Chi-square of all three less that of the two others; the shift is that of the joint solution."""
+    rng = seed_of("beside")
+    A = rng.normal(size=(60, 18))
+    G, s = A.T @ A, rng.normal(size=18)
+    gain, shift = _gain(s.reshape(3, 6), G.reshape(3, 6, 3, 6), 1, [0, 2])
+    others = np.r_[0:6, 12:18]
+    expected = s @ np.linalg.solve(G, s) - s[others] @ np.linalg.solve(G[np.ix_(others, others)], s[others])
+    assert gain == pytest.approx(expected)
+    np.testing.assert_allclose(np.abs(shift), np.abs(np.linalg.solve(G, s)[6:12]), rtol=1e-9)
+    alone, _ = _gain(s.reshape(3, 6), G.reshape(3, 6, 3, 6), 1, [])
+    assert alone == pytest.approx(s[6:12] @ np.linalg.solve(G[6:12, 6:12], s[6:12]))

@@ -329,3 +329,9 @@ def test_a_ring_is_ten_standard_deviations_larger_than_the_dots() -> None:
     radius[7] *= 2.0
     size = dot_plates.size_of_marks(Lattice(np.arange(20), place, np.zeros((20, 2))), radius, ring)
     assert size[ring].tolist() == [10.0] and np.abs(size[~ring]).max() < 5.0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_rings_are_of_the_other_polarity_than_most(sign: int) -> None:
+    polarity = sign * np.array([1, 1, -1, 1, 1, -1, 1])
+    assert dot_plates.rings_among(polarity).tolist() == [False, False, True, False, False, True, False]

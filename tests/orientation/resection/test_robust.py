@@ -84,7 +84,9 @@ def test_distortion_that_only_a_wide_tolerance_bears():
 
 def test_reasons():
     uv, points, X0, R = scene(seed_of("reasons"), 30)
-    assert resect_robust(uv[:3], points[:3], tolerance=1e-3).reason == "3 points, resection needs 4"
+    for least in ({}, {"min_inliers": 3}):  # a fourth point decides between the solutions of three
+        few = resect_robust(uv[:3], points[:3], tolerance=1e-3, **least)
+        assert few.reason == "3 points, resection needs 4"
     nothing = resect_robust(seed_of("noise").uniform(-0.6, 0.6, (30, 2)), points, tolerance=1e-5)
     assert "of 30 points fit within the tolerance, resection needs 4" in nothing.reason
     assert nothing.inliers.sum() < nothing.needed == 4
