@@ -299,3 +299,10 @@ def test_of_a_mount_the_length_of_its_base_is_left_open() -> None:
         np.testing.assert_allclose(model.v, [*(given_at - scale * X), 0.1, 0, 0], atol=1e-12)
         np.testing.assert_allclose(model.A, opened * scale * np.array([[*X, 0, 0, 0]]).T, atol=1e-12)
         np.testing.assert_allclose(np.diagonal(model.network), [scale**2 * 1e-6] * 3 + [1e-8] * 3)
+
+
+def test_four_points_that_are_not_in_a_plane_are_in_space() -> None:
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assert given_scales.are_in_space(corner)
+    assert not given_scales.are_in_space(corner[:3])
+    assert not given_scales.are_in_space(corner * [1, 1, 0.01])
