@@ -1,4 +1,4 @@
-"""Dask as the engine of batches: a cluster on this computer, or any scheduler that is running.
+"""Dask as the engine of batches: a cluster on this computer, or any running scheduler.
 
 Source: dask.distributed, Client futures API (https://distributed.dask.org/en/stable/client.html).
 """
@@ -43,14 +43,14 @@ from sfm.files.user_cache import scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
 from sfm.runtime.installation import closed_current_folder
 
-# Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
+# Worker deaths that Dask allows a call: one may be bad luck, and the call is tried on another worker.
 ALLOWED_FAILURES = 1
-WORKER_BYTES = 3 << 29  # 1.5 GiB, which a photograph of 100 megapixels may take
+WORKER_BYTES = 3 << 29  # 1.5 GiB, which a photograph of 100 megapixels may need
 CONNECT_SECONDS = 5.0
-NOBODY_SECONDS = 60.0  # without a single worker before a run gives up; a new one takes some 3 s
+NOBODY_SECONDS = 60.0  # without any worker before a run gives up; starting a new one takes about 3 s
 LOOK_SECONDS = 2.0
 CLOSE_SECONDS = 5.0
-# Numerical libraries that read how many threads they may start, at the start of a process.
+# Numerical libraries read these thread limits when a process starts.
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -61,14 +61,16 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-# Records that Dask keeps for its dashboard, which is not shown here. Call stacks, sampled 100 times a second
-# in each worker and kept for 1000 s, were 1.1 MiB a survey; its logs grow for the first hundreds of surveys.
+# Records that Dask keeps for its dashboard, which is not shown here. Call stacks are sampled 100 times a
+# second
+# in each worker and kept for 1000 s, which took 1.1 MiB a survey. Its logs grow for the first hundreds of
+# surveys.
 NO_DIARY = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 60,
 }
-# Pages for a browser, which would send anybody on this computer what is computed.
+# Web pages, which would show the computed data to anybody on this computer.
 NO_PAGES: dict[str, list[str]] = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -76,7 +78,7 @@ NO_PAGES: dict[str, list[str]] = {
 
 
 def fitting_workers() -> int:
-    """Return how many workers the cores and memory of this computer allow, or those granted of them."""
+    """Return how many workers the available cores and memory of this computer allow."""
     return max(1, min(dask.system.CPU_COUNT, distributed.system.MEMORY_LIMIT // WORKER_BYTES))
 
 
@@ -84,12 +86,12 @@ def fitting_workers() -> int:
 def local_engine(workers: int) -> Iterator[DaskEngine]:
     """Start worker processes on this computer, each with one thread.
 
-    Whoever reaches a Dask scheduler or worker can run programs in it, and everybody on this computer reaches
-    127.0.0.1. So they talk by TLS only, to those who have the key of this run, which is in the memory of its
-    processes and nowhere else; and what workers set aside on the disk lies in a folder of this user alone.
+    Anybody who reaches a Dask scheduler or worker can run programs in it, and everybody on this computer
+    reaches 127.0.0.1. The processes therefore use TLS with the key of this run, which exists only in their
+    memory. Data that workers spill to disk goes to a folder of this user alone.
 
     Args:
-        workers: how many; each is ended beyond an equal share of the computer's memory.
+        workers: number of workers; each is stopped if it exceeds an equal share of the computer's memory.
 
     Raises:
         BackendError: they do not start.
@@ -106,11 +108,11 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
             "MALLOC_ARENA_MAX": "2",
         },
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
-        "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that starts again for long given up
+        "distributed.deploy.lost-worker-timeout": "1h",  # a worker that takes long to restart is kept, too
     }
     with dask.config.set(settings), closed_current_folder(), ExitStack() as stack:
         scratch = stack.enter_context(scratch_folder())
-        with _interrupt_held_back():  # a Ctrl-C meanwhile comes when all of this is up, and can be ended
+        with _interrupt_held_back():  # a Ctrl-C is delivered when all of this has started and can be ended
             try:
                 cluster = LocalCluster(
                     n_workers=workers,
@@ -118,7 +120,7 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
                     processes=True,
                     memory_limit="auto",
                     host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
+                    dashboard_address="127.0.0.1:0",  # None opens a server on a fixed port to the world
                     scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL,
                     security=Security.temporary(),
@@ -135,28 +137,28 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
 
 
 def _silence() -> None:
-    """Keep Dask's messages and tracebacks from the terminal; some of its loggers have separate levels."""
+    """Keep Dask's messages and tracebacks out of the terminal; some of its loggers have separate levels."""
     for name in ("distributed", *logging.root.manager.loggerDict):
         if name.split(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _close(cluster: LocalCluster) -> None:
-    """Close a cluster that could not be closed in peace."""
+    """Close a cluster that was not closed normally."""
     with suppress(Exception):
         cluster.close(timeout=CLOSE_SECONDS)
 
 
 @contextmanager
 def _interrupt_held_back() -> Iterator[None]:
-    """Hold Ctrl-C back, which reaches all processes of a terminal, here and in what is started.
+    """Block Ctrl-C, which reaches all processes of a terminal, here and in processes started meanwhile.
 
-    Threads and processes that begin in here never see it: whoever started the workers ends them.
+    Threads and processes started inside never receive it: the process that starts the workers ends them.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows, where a plug-in must do
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, where the plug-in ignores the signal instead
         yield
         return
-    resource_tracker.ensure_running()  # which lets Ctrl-C in when it starts, with the first process
+    resource_tracker.ensure_running()  # starts with the first process, and would unblock Ctrl-C
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -165,19 +167,19 @@ def _interrupt_held_back() -> Iterator[None]:
 
 
 def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
-    """Use a scheduler that is running; its workers must have Kolinear and see the same folders.
+    """Use a running scheduler, whose workers must have Kolinear and access to the same folders.
 
     Args:
-        address: such as tcp://192.168.1.5:8786; whoever reaches a scheduler can run programs on its
-            workers, so it belongs in a network of trust. For tls:// Dask's configuration names the
+        address: such as tcp://192.168.1.5:8786. Anybody who reaches a scheduler can run programs on its
+            workers, so it belongs in a trusted network. For tls:// Dask's configuration names the
             certificates.
 
     Raises:
-        BackendError: no scheduler answers, which is known before anything else is begun.
+        BackendError: no scheduler answers; this is checked before anything else starts.
     """
     _silence()
     try:
-        # A Client that cannot connect is never done with it, and reports it half a minute later.
+        # A Client that cannot connect keeps trying, and reports it half a minute later.
         asyncio.run(_ask(address))
     except TimeoutError as error:
         raise BackendError(
@@ -189,7 +191,7 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
 
 
 async def _ask(address: str) -> None:
-    """Ask whoever is at an address whether it is a scheduler; ValueError if not."""
+    """Ask the server at an address whether it is a scheduler; ValueError if not."""
     credentials = Security().get_connection_args("client")
     async with (
         asyncio.timeout(CONNECT_SECONDS),
@@ -211,42 +213,42 @@ def _connected(address: str) -> Iterator[DaskEngine]:
 
 
 class _LocalWorker(WorkerPlugin):
-    """Keep Ctrl-C from workers where signals cannot be held back, and browsers."""
+    """Makes workers ignore Ctrl-C where signals cannot be blocked, and stops their web pages."""
 
     name = "kolinear-local-worker"
 
     def setup(self, worker: Worker) -> None:
-        """Called in every worker that starts, also in place of one that died."""
+        """Run in every worker that starts, including the replacement of one that died."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         worker.http_server.stop()
 
 
 def _close_pages(dask_scheduler: Scheduler) -> None:
-    dask_scheduler.http_server.stop()  # which would still list its pages, if not show them
+    dask_scheduler.http_server.stop()  # it would still list its pages, even if it does not show them
 
 
 @dataclass(frozen=True)
 class DaskEngine:
-    """Work in the processes of a Dask cluster."""
+    """Runs work in the processes of a Dask cluster."""
 
     client: Client
 
     @property
     def workers(self) -> int:
-        """How many calls run at a time, at least 1 while workers are still to come."""
+        """Number of calls that run at a time, at least 1 while workers are still starting."""
         threads: dict[str, int] = self.client.nthreads()
         return max(1, sum(threads.values()))
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens, see sfm.kernels.threads.Engine.
+        """Run all work and yield its events, see sfm.kernels.threads.Engine.
 
         Raises:
-            BackendError: the scheduler or all workers are gone, or the workers have no Kolinear.
-            KolinearError: what a called function raised.
+            BackendError: the scheduler or all workers are gone, or the workers lack Kolinear.
+            KolinearError: an error raised by a called function.
         """
         events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         run = f"kolinear-{uuid.uuid4().hex}"
-        running: dict[str, list[Future[Any]]] = {}  # the future of the whole comes first
+        running: dict[str, list[Future[Any]]] = {}  # the future of the whole work comes first
         left, turn = iter(works), count()
 
         def start(work: Work) -> None:
@@ -277,9 +279,9 @@ class DaskEngine:
                 self.client.unsubscribe_topic(run)
 
     def _submit(self, work: Work, run: str, *, priority: int) -> list[Future[Any]]:
-        """Submit the parts of a piece of work and then its whole, which comes first in the list.
+        """Submit the parts of a piece of work and then the whole, which comes first in the list.
 
-        Keys are without the name of the work: the scheduler remembers forever what stands before the digits.
+        Keys do not contain the name of the work: the scheduler remembers the text before the digits forever.
         """
 
         def submit(call: Call, name: str, *more: Any) -> Future[Any]:
@@ -312,7 +314,7 @@ class DaskEngine:
 
 
 def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) -> Any:
-    """Run a call in a worker, its libraries held to one thread each."""
+    """Run a call in a worker, with its libraries limited to one thread each."""
     worker = get_worker()
 
     def send(message: dict[str, Any]) -> None:
@@ -324,13 +326,13 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
             return call.function(*call.arguments, *more, send=send)
     finally:
         if parts is not None:
-            gc.collect()  # figures are full of cycles, and Python is in no hurry: 1 MiB a survey
+            gc.collect()  # figures are full of reference cycles, which Python collects late: 1 MiB a survey
 
 
 class _OneThread:
-    """Limits BLAS and OpenCV to one thread, in workers that others have started, too.
+    """Limits BLAS and OpenCV to one thread, including in workers that were started elsewhere.
 
-    Those may have several threads, and the last of their calls gives the libraries theirs back.
+    Such workers may have several threads; the last running call restores the limits of the libraries.
     """
 
     def __init__(self) -> None:
@@ -355,13 +357,13 @@ class _OneThread:
                 self._limits = None
 
 
-_HELD = _OneThread()  # libraries of this process
+_HELD = _OneThread()  # limits of this process
 
 
 def _event(key: str, future: Future[Any]) -> Event:
-    """Return how a piece of work ended, or raise what ends them all.
+    """Return how a piece of work ended, or raise an error that ends all work.
 
-    A result that is lost with its worker before it is here is computed again, and may then fail.
+    A result lost with its worker before it arrives here is computed again, and may then fail.
     """
     try:
         return Done(key, future.result())

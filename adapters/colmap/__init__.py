@@ -1,4 +1,5 @@
-"""COLMAP: its adjuster and mapper run on networks of Kolinear, its models and databases read and written.
+"""COLMAP: its adjuster and mapper run on Kolinear's networks; its models and databases are read and written.
 
-The origin of its pixel frame is a corner: the half pixel is added here and nowhere else.
+COLMAP's pixel frame has its origin in a corner. The half pixel between the frames is added here and nowhere
+else.
 """

@@ -1,11 +1,11 @@
-"""COLMAP through pycolmap: its Ceres bundle adjustment and covariances of our networks.
+"""COLMAP through pycolmap: its Ceres bundle adjustment and covariances of Kolinear's networks.
 
-The only module that imports pycolmap. Limits of its adjuster against Kolinear's:
+Only this module imports pycolmap. COLMAP's adjuster has two limits compared with Kolinear's:
 
-    weights        COLMAP's adjuster gives every image coordinate the same weight
-    constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras
+    weights        every image coordinate has the same weight
+    constants      focal lengths, principal points and distortion are freed in groups, for all cameras
 
-Pixel origin and axes are turned in adapters.colmap.reconstruction.
+`adapters.colmap.reconstruction` converts pixel origin and axes.
 
 Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models"; COLMAP 4.2, estimate_ba_covariance.
 """
@@ -31,32 +31,32 @@ from sfm.files.plain_text import as_plain
 from sfm.network import Estimate, Network
 
 NEEDED_VERSION = (4, 2)
-# The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
-# Gauss-Newton's. Ceres' tolerances stop long before the last digits.
+# From the default trust region radius of 1e4 Ceres converges slowly: 46 steps on 400 photographs, 6 with 1e8.
+# The steps are then Gauss-Newton's. Ceres' default tolerances stop long before the last digits.
 START_RADIUS = 1e8
 MAX_RADIUS = 1e32
 MIN_LM_DIAGONAL = 1e-30
 STILL = 1e-13  # relative decrease of the cost below which another run of Ceres has nothing to add
 MAX_RUNS = 8
-MAX_TOLD = 200  # characters of what COLMAP says of an error
+MAX_TOLD = 200  # maximum length of COLMAP's error text, characters
 DENSE_LIMIT = 200  # photographs up to which the reduced normal matrix is factorised densely
 
 
 @dataclass(frozen=True)
 class ColmapAdjustment:
-    """What COLMAP's bundle adjuster made of a network."""
+    """Result of COLMAP's bundle adjuster on a network."""
 
-    estimate: Estimate  # adjusted, in the gauge that COLMAP was left with
+    estimate: Estimate  # adjusted, in the gauge that Ceres ended in
     residuals: FloatArray  # computed - measured, px, pixel frame, NaN behind the camera, (k, 2)
     rms_px: float  # root mean square residual per coordinate, px; NaN if points ended behind cameras
     cost: float  # half the sum of squared residuals, px^2; NaN likewise
-    iterations: int  # steps of Ceres, unsuccessful ones included
-    converged: bool  # whether Ceres met a criterion of convergence
-    message: str  # Ceres' reason to stop
+    iterations: int  # steps of Ceres, including unsuccessful ones
+    converged: bool  # whether Ceres met a convergence criterion
+    message: str  # why Ceres stopped
     seconds: float  # time in Ceres, s; without building the problem
-    point_covariance: FloatArray | None = None  # of the points, photographs and cameras held, image points of
-
-    # standard deviation 1 px, object unit^2, (n, 3, 3); None where not asked for
+    # Of the points with photographs and cameras held, for image points of standard deviation 1 px, object
+    # unit^2, (n, 3, 3); None if not requested.
+    point_covariance: FloatArray | None = None
 
 
 def adjust_with_colmap(
@@ -70,21 +70,21 @@ def adjust_with_colmap(
 ) -> ColmapAdjustment:
     """Adjust a network with COLMAP's Ceres adjuster, all image coordinates with unit weight.
 
-    Free are the parameters that the cameras of the estimate declare; see `colmap_free`.
+    The parameters declared as free by the cameras of the estimate are adjusted; see `colmap_free`.
 
     Args:
-        network: photographs, points and image points, all of which take part.
-        estimate: start values, complete, cameras in a model that COLMAP has.
-        gauge: free | two_cameras | control. Free leaves the datum to Ceres' damping, which moves little;
-            two_cameras fixes 7 elements of the first two photographs, from where a poor start can lose
-            points behind cameras; control fixes the control points.
+        network: photographs, points and image points; all image points take part.
+        estimate: complete start values, with cameras in a model that COLMAP has.
+        gauge: free | two_cameras | control. "free" leaves the datum to Ceres' damping, which moves it little.
+            "two_cameras" fixes 7 elements of the first two photographs; from a poor start this can move
+            points behind cameras. "control" fixes the control points.
         threads: threads of Ceres.
         max_iterations: steps per run of Ceres.
-        polish: run Ceres again from its last result until the cost stands still.
+        polish: whether to run Ceres again from its last result until the cost stays constant.
 
     Raises:
-        BackendError: pycolmap is missing or of another version, a camera model or a set of free
-            parameters that COLMAP cannot express, weighted control, or Ceres fails.
+        BackendError: pycolmap is missing or has another version, COLMAP cannot express a camera model or a
+            set of free parameters, control has weights, or Ceres fails.
     """
     pycolmap = load_pycolmap()
     refine = colmap_free(estimate.cameras)
@@ -114,7 +114,7 @@ def adjust_with_colmap(
         residuals = residuals_of(scene, network)
     behind = int(np.isnan(residuals[:, 0]).sum())
     if behind:
-        # Ceres gives them no residual, so that losing a point behind a camera lowers its cost.
+        # Ceres gives such points no residual, so losing a point behind a camera lowers its cost.
         converged, message = False, f"{counted(behind, 'image point')} ended behind their camera"
     return ColmapAdjustment(
         adjusted,
@@ -129,7 +129,7 @@ def adjust_with_colmap(
 
 
 def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
-    """Return whether focal lengths, principal points and distortion are free, as COLMAP knows it.
+    """Return whether focal lengths, principal points and distortion are free, in COLMAP's groups.
 
     Raises:
         BackendError: a group is free in part, or in some of the cameras that are not fixed as a whole.
@@ -142,7 +142,7 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
         for name, group in zip(("focal length", "principal point", "distortion"), groups, strict=True):
             if group.any() and not group.all():
                 raise BackendError(
-                    f"camera {camera.name}: its {name} is free in part, COLMAP frees all of it or nothing"
+                    f"camera {camera.name}: its {name} is partly free; COLMAP frees all of it or nothing"
                 )
         found.add((bool(groups[0].any()), bool(groups[1].any()), bool(groups[2].any())))
     if len(found) > 1:
@@ -151,7 +151,7 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
 
 
 def load_pycolmap() -> ModuleType:
-    """Import pycolmap, or say what is needed.
+    """Import pycolmap, or state what is needed.
 
     Raises:
         MissingLibraryError: pycolmap is not installed.
@@ -180,7 +180,7 @@ def load_pycolmap() -> ModuleType:
 
 @contextmanager
 def quiet(pycolmap: ModuleType) -> Iterator[None]:
-    """Keep the log of COLMAP and Ceres out of the terminal, and give it back as it was."""
+    """Suppress the log of COLMAP and Ceres in the terminal, and restore its levels afterwards."""
     log = pycolmap.logging
     before = log.minloglevel, log.stderrthreshold
     log.minloglevel = log.stderrthreshold = int(log.Level.FATAL)
@@ -193,7 +193,7 @@ def quiet(pycolmap: ModuleType) -> Iterator[None]:
 def ceres_options(
     pycolmap: ModuleType, refine: tuple[bool, bool, bool], images: int, threads: int, max_iterations: int
 ) -> Any:
-    """Ceres run to the end of double precision, with nearly undamped steps."""
+    """Return options for a Ceres run to the end of double precision, with nearly undamped steps."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_principal_point, options.refine_extra_params = refine
     options.print_summary = False
@@ -212,7 +212,7 @@ def ceres_options(
 
 
 def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
-    """Which photographs take part and what is held.
+    """Return the configuration: which photographs take part, and what is held.
 
     Raises:
         BackendError: an unknown gauge, or control with standard deviations.
@@ -242,9 +242,9 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
 
 
 def reason_of(error: BaseException) -> str:
-    """Return COLMAP's text of an error, without the places in its source and its words for them.
+    """Return COLMAP's error text without the locations in its source code, in plain words.
 
-    It repeats the content of files, whatever that is and however long.
+    The text may repeat any content of a file at any length, so it is cleaned and shortened.
     """
     text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
     text = re.sub(r"^Check failed: *", "COLMAP expected ", text)
@@ -253,37 +253,37 @@ def reason_of(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class ColmapCovariance:
-    """Covariances as COLMAP estimates them, for image coordinates of standard deviation 1 px."""
+    """Covariances estimated by COLMAP, for image coordinates of standard deviation 1 px."""
 
-    interior: tuple[FloatArray, ...]  # marginal, of the free parameters of each camera, in order, (f, f)
+    interior: tuple[FloatArray, ...]  # marginal, of the free parameters of each camera in order, (f, f)
     points: FloatArray  # with cameras and photographs held fixed (conditional), object unit^2, (n, 3, 3)
 
 
 def covariance_with_colmap(
     network: Network, estimate: Estimate, *, gauge: str = "two_cameras"
 ) -> ColmapCovariance | None:
-    """Return COLMAP's covariances at a solution, None of rigs and where COLMAP finds it singular.
+    """Return COLMAP's covariances at a solution; None for rigs, or if COLMAP finds the problem singular.
 
-    What COLMAP calls the covariance of a point is conditional on all photographs and cameras, too small
-    by the share that these contribute. That of the interior orientation is marginal and does not depend
-    on the gauge.
+    COLMAP's covariance of a point is conditional on all photographs and cameras, and therefore too small by
+    their contribution. Its covariance of the interior orientation is marginal and does not depend on the
+    gauge.
 
     Args:
         network: photographs, points and image points.
-        estimate: the solution, cameras in a model that COLMAP has.
-        gauge: two_cameras | control; COLMAP has no covariance without a gauge.
+        estimate: the solution, with cameras in a model that COLMAP has.
+        gauge: two_cameras | control; COLMAP computes no covariance without a gauge.
 
     Raises:
         BackendError: as for `adjust_with_colmap`.
     """
     pycolmap = load_pycolmap()
-    if estimate.mounts is not None:  # COLMAP 4.2 refuses photographs that are not of reference cameras
+    if estimate.mounts is not None:  # COLMAP 4.2 refuses photographs by cameras other than reference cameras
         return None
     options = ceres_options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
     with quiet(pycolmap):
         scene = reconstruction(pycolmap, network, estimate)
         config = adjustment_config(pycolmap, network, estimate, gauge)
-        # estimate_ba_covariance wants this adjuster and no other; it need not have been run
+        # estimate_ba_covariance requires this adjuster and no other; it need not have been run.
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
         wanted = pycolmap.BACovarianceOptions()
         wanted.damping = 0.0
@@ -303,7 +303,7 @@ def covariance_with_colmap(
 
 
 def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 1) -> ColmapAdjustment:
-    """Adjust with COLMAP in a free datum, and have its covariances of points at the solution.
+    """Adjust with COLMAP in a free datum, with its covariances of the points at the solution.
 
     Args, Raises: as `adjust_with_colmap`.
     """
@@ -319,7 +319,7 @@ class ColmapBackend:
     name: str = "colmap"
 
     def adjust(self, network: Network, start: Estimate, *, control: bool) -> ColmapAdjustment:
-        """Adjust with control points held or the datum free."""
+        """Adjust with the control points held, or with a free datum."""
         return adjust_with_colmap(network, start, gauge="control" if control else "free")
 
     def covariance(self, network: Network, estimate: Estimate, *, control: bool) -> ColmapCovariance | None:

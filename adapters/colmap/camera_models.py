@@ -1,7 +1,7 @@
-"""COLMAP's models, binary and text, and kolinear.json beside them, written and read.
+"""COLMAP models, binary and text, and kolinear.json beside them, written and read.
 
-COLMAP cannot hold names of cameras and points, the size of a pixel, and which parameters are free; they lie
-beside a model in kolinear.json.
+COLMAP cannot store the names of cameras and points, the size of a pixel, and which parameters are free.
+kolinear.json stores them beside a model.
 
 Source: COLMAP 4.2 documentation, "Output Format".
 """
@@ -43,17 +43,17 @@ def write_model(
 ) -> None:
     """Write a network and its solution as a COLMAP model: cameras, rigs, frames, images and points.
 
-    Image points keep their order in each photograph; rejected ones are written without a point.
+    Image points keep their order within each photograph; rejected ones are written without a point.
 
     Args:
-        folder: made if it is not there.
-        network: what was measured.
+        folder: created if it does not exist.
+        network: the measured network.
         estimate: cameras in a model that COLMAP has; photographs without orientation are left out.
-        rejected: image points that no point shall claim, (k,).
-        text: text files instead of binary ones.
+        rejected: image points that are not linked to their point, (k,).
+        text: whether to write text files instead of binary ones.
 
     Raises:
-        BackendError: pycolmap is missing, or a camera is in a model that COLMAP does not know.
+        BackendError: pycolmap is missing, or COLMAP does not have the model of a camera.
         OutputError: the folder cannot be written.
     """
     pycolmap = load_pycolmap()
@@ -66,7 +66,7 @@ def write_model(
 
 
 def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
-    """Write a pycolmap.Reconstruction, and read it back to see that it is whole.
+    """Write a pycolmap.Reconstruction, and read it back to check that it is complete.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -89,7 +89,7 @@ def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
 
 
 def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
-    """Raise OSError unless a model can be read back as it was written: COLMAP ignores that a disk is full."""
+    """Raise OSError unless a model can be read back complete: COLMAP ignores a full disk."""
     try:
         written = _opened(pycolmap, folder, text=text)
         whole = all(
@@ -104,7 +104,7 @@ def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool)
 
 
 def _opened(pycolmap: ModuleType, folder: Path, *, text: bool) -> Any:
-    """Return the model in the text or the binary files of a folder, which may hold both."""
+    """Return the model in the text or binary files of a folder, which may contain both."""
     scene = pycolmap.Reconstruction()
     (scene.read_text if text else scene.read_binary)(str(folder))
     return scene
@@ -113,17 +113,17 @@ def _opened(pycolmap: ModuleType, folder: Path, *, text: bool) -> Any:
 def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Estimate]:
     """Read a COLMAP model, binary or text, as a network and its solution.
 
-    Cameras in COLMAP's pinhole and radial models become `opencv` ones, others keep their model. Points are
-    named by their number in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by
-    `write_model`. The covariance of every image point is 1 px^2, since COLMAP keeps none.
+    Cameras in COLMAP's pinhole and radial models become `opencv` cameras; others keep their model. Unless
+    `write_model` wrote the model, points and cameras are named by their numbers in COLMAP, and a pixel is
+    1 mm. The covariance of every image point is 1 px^2, since COLMAP stores none.
 
     Args:
-        folder: of the model.
-        text: whether its text files are read or the binary ones; binary ones if there are any if not given.
+        folder: folder of the model.
+        text: whether to read text or binary files; None prefers binary files.
 
     Raises:
-        SurveyFileError: no model in the folder, or one that cannot be read.
-        BackendError: pycolmap is missing, or a camera model that Kolinear has no equal of.
+        SurveyFileError: the folder contains no model, or one that cannot be read.
+        BackendError: pycolmap is missing, or Kolinear has no equivalent of a camera model.
     """
     return named_network(folder, read_scene(folder, text=text))
 
@@ -155,7 +155,7 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
 
 
 def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:
-    """Return a scene as a network and its solution, with the names that lie beside it in its folder."""
+    """Return a scene as a network and its solution, with the names from kolinear.json in its folder."""
     side = read_side_file(folder / SIDE_FILE)
     try:
         network, estimate = network_of_scene(scene, side)
@@ -190,17 +190,17 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
 
     Args:
         scene: the reconstruction.
-        side: names that COLMAP cannot hold; none if not given.
+        side: names that COLMAP cannot store; None for none.
 
     Returns:
-        The network, with a covariance of 1 px^2 of every image point, since COLMAP keeps none, and what was
-        solved; photographs without a pose are NaN.
+        The network, with a covariance of 1 px^2 for every image point, since COLMAP stores none, and the
+        solution; photographs without a pose are NaN.
 
     Raises:
-        BackendError: a camera model that Kolinear has no equal of.
-        SurveyFileError: the name of a photograph has control or invisible characters or is that of another,
-            an image point is of a point that is missing, the pose of a camera in its rig is not known, or a
-            frame has two photographs of one camera.
+        BackendError: Kolinear has no equivalent of a camera model.
+        SurveyFileError: the name of a photograph has control or invisible characters or is a duplicate, an
+            image point belongs to a missing point, the pose of a camera in its rig is not known, or a frame
+            has two photographs by one camera.
     """
     side = side or Names()
     camera_ids = sorted(scene.cameras)
@@ -211,7 +211,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     point_ids = sorted(scene.point3D_ids())
     names = side.points
     index = {j: k for k, j in enumerate(point_ids)}
-    seen = [np.zeros((0, 4))]  # an array for each photograph, which takes less than lists of all
+    seen = [np.zeros((0, 4))]  # an array for each photograph takes less memory than lists of all
     for i, image in enumerate(images):
         try:
             rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
@@ -226,7 +226,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     ]
     M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
-    # COLMAP's text format loses what follows a space in the name of a photograph.
+    # COLMAP's text format loses the part of a photograph's name after a space.
     full = {i: side.images.get(str(i), "") for i in image_ids}
     short = [image.name for image in images]
     labels = tuple(
@@ -266,9 +266,9 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
 
 
 def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
-    """Return the mounts of the cameras of a scene; None where each is alone.
+    """Return the mounts of the cameras of a scene; None if every camera is single.
 
-    The reference is that of COLMAP, or the first camera of a rig whose reference is none.
+    The reference is COLMAP's, or the first camera of a rig whose reference sensor is not a camera.
     """
     pycolmap = load_pycolmap()
     count, index = len(camera_ids), {number: a for a, number in enumerate(camera_ids)}
@@ -297,29 +297,29 @@ def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
 
 
 class NamedCamera(Content):
-    """What COLMAP does not know of a camera."""
+    """Properties of a camera that COLMAP does not know."""
 
     name: Name
     pixel_mm: tuple[Pixel, Pixel]  # width and height of a pixel, mm
-    free: tuple[bool, ...]  # to be adjusted, of each parameter
+    free: tuple[bool, ...]  # whether each parameter is to be adjusted
     size_px: tuple[Side, Side] | None = None  # width and height of its photographs, px
-    rig: Name | None = None  # what its rig is called
-    mount_free: tuple[bool, bool, bool, bool, bool, bool] | None = None  # which of X, Y, Z, rotations
+    rig: Name | None = None  # name of its rig
+    mount_free: tuple[bool, bool, bool, bool, bool, bool] | None = None  # free ones of X, Y, Z and rotations
 
 
 class Names(Content):
     """Content of kolinear.json."""
 
-    cameras: tuple[NamedCamera, ...] = ()  # in the order of their numbers
+    cameras: tuple[NamedCamera, ...] = ()  # in the order of COLMAP's numbers
     images: dict[str, Name] = Field(default_factory=dict)  # names by COLMAP's number of the photograph
     points: dict[str, Name] = Field(default_factory=dict)  # names by COLMAP's number of the point
 
 
 def read_side_file(path: Path) -> Names:
-    """Read what Kolinear adds to a model; nothing where the file is missing.
+    """Read kolinear.json; the content is empty if the file is missing.
 
     Raises:
-        SurveyFileError: what is wrong in it.
+        SurveyFileError: the file is not valid.
     """
     if not path.is_file():
         return Names()
@@ -327,7 +327,7 @@ def read_side_file(path: Path) -> Names:
 
 
 def write_side_file(path: Path, network: Network, estimate: Estimate) -> None:
-    """Write what COLMAP cannot hold."""
+    """Write what COLMAP cannot store to kolinear.json."""
     mounts = estimate.mounts
     side = {
         "cameras": [

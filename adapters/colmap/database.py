@@ -1,12 +1,11 @@
-"""COLMAP databases with our image points: cameras, photographs, keypoints and matches.
+"""COLMAP databases with Kolinear's image points: cameras, photographs, keypoints and matches.
 
-A database has no object points. Which keypoints show the same point is stated by matches of pairs of
-photographs, so points are written as matches between all photographs they were measured in and read back as
-the connected parts of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
+A database has no object points. Matches between pairs of photographs state which keypoints show the same
+point. A point is therefore written as matches between all photographs that show it, and read back as a
+connected component of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
-The file is not trusted. It is opened read-only and immutable, so that nothing is written to it or
-beside it, and only its own tables are read: no views, virtual tables or computed columns, whose expressions
-could run for ever.
+The file is not trusted. It is opened read-only and immutable, so nothing is written to it or beside it. Only
+its own tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.
 
 Source: COLMAP 4.2 documentation, "Database Format"; sqlite.org/fileformat.html, sec. 1.3, for the header, and
 sqlite.org/security.html.
@@ -39,30 +38,30 @@ from sfm.network import ImagePoints, Network, rows_of
 
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100
-PAIRS = 2**31 - 1  # the number of a pair is PAIRS times that of its first photograph, plus that of its second
-MAX_STEPS, STEPS = 1000, 300_000  # of SQLite's machine in one query, counted in so many at a time
-MAX_PLACES = 100_000_000  # photographs times points, of which a table is kept
+PAIRS = 2**31 - 1  # the number of a pair is PAIRS times the number of its first photograph plus its second's
+MAX_STEPS, STEPS = 1000, 300_000  # SQLite instructions in one query: at most MAX_STEPS blocks of STEPS
+MAX_PLACES = 100_000_000  # photographs times points, the size of a table in memory
 
 
 def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) -> None:
     """Write photographs, image points and their matches as a COLMAP database, ready for its mapper.
 
     Args:
-        path: file to write; it must not be there yet.
-        network: what was measured; names of points are lost.
+        path: file to write; it must not exist yet.
+        network: the measured network; names of points are lost.
         cameras: interior orientations, in an opencv model.
 
     Raises:
-        BackendError: pycolmap is missing, or a camera is in a model that COLMAP does not know.
-        OutputError: the file is there already or cannot be written.
+        BackendError: pycolmap is missing, or COLMAP does not have the model of a camera.
+        OutputError: the file exists or cannot be written.
     """
     pycolmap = load_pycolmap()
     if Path(path).exists():
-        raise OutputError(f"{path}: there already is a file of this name")
+        raise OutputError(f"{path}: a file of this name already exists")
     if len(network.images) * len(network.points) > MAX_PLACES:
         raise OutputError(
-            f"{path}: {len(network.images)} photographs of {len(network.points)} points, databases are "
-            f"written of at most {MAX_PLACES} of both multiplied"
+            f"{path}: {len(network.images)} photographs of {len(network.points)} points; a database is "
+            f"written only if their product is at most {MAX_PLACES}"
         )
     with quiet(pycolmap), whole_file(path, "the database") as part:
         try:
@@ -75,14 +74,15 @@ def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) ->
 
 
 def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
-    """Read photographs and image points of a COLMAP database, points from its matches.
+    """Read photographs and image points of a COLMAP database, with points from its matches.
 
-    Verified matches are used where there are some, else the raw ones. Keypoints without a match and points
-    that would be twice in one photograph are left out.
+    Verified matches are used if there are any, otherwise the raw ones. Keypoints without a match are left
+    out,
+    and so are points that would appear twice in one photograph.
 
     Raises:
-        BackendError: a camera model that Kolinear has no equal of.
-        SurveyFileError: not a readable database.
+        BackendError: Kolinear has no equivalent of a camera model.
+        SurveyFileError: the file is not a readable database.
     """
     rows = read_rows(path)
     first = np.concatenate([[0], np.cumsum([len(points) for points in rows.keypoints])]).astype(np.int64)
@@ -108,7 +108,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:
-    """Write everything; cameras and photographs are numbered from 1, each photograph has a frame."""
+    """Fill a database; cameras and photographs are numbered from 1, and each photograph has a frame."""
     for k, camera in enumerate(cameras):
         written = colmap_camera(pycolmap, camera, k + 1)
         database.write_camera(written, True)
@@ -143,7 +143,7 @@ def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera,
 
 
 def _tracks(edges: list[tuple[IntArray, IntArray]], image: IntArray) -> IntArray:
-    """Number of the point that each keypoint shows, -1 for none, (k,)."""
+    """Return the number of the point that each keypoint shows, -1 for none, (k,)."""
     count = len(image)
     if not edges:
         return np.full(count, -1)
@@ -157,7 +157,7 @@ def _tracks(edges: list[tuple[IntArray, IntArray]], image: IntArray) -> IntArray
     same = (part[order][1:] == part[order][:-1]) & (image[order][1:] == image[order][:-1])
     twice[part[order][1:][same]] = True
     good = (size[part] >= 2) & ~twice[part]
-    # Points are counted in the order in which they first appear.
+    # Points are numbered in the order in which they first appear.
     names, where = np.unique(part[good], return_index=True)
     rank = np.empty(len(size), dtype=np.int64)
     rank[names[np.argsort(where)]] = np.arange(len(names))
@@ -177,20 +177,20 @@ class DatabaseCamera:
 
 @dataclass(frozen=True)
 class DatabaseRows:
-    """Everything that is read of a database."""
+    """Everything that is read from a database."""
 
     cameras: tuple[DatabaseCamera, ...]  # by number
-    images: tuple[str, ...]  # names, by number, (m,)
-    camera: IntArray  # index of the camera of each, (m,)
+    images: tuple[str, ...]  # names by number, (m,)
+    camera: IntArray  # index of the camera of each photograph, (m,)
     keypoints: tuple[FloatArray, ...]  # of each photograph, COLMAP's pixel frame, px, (k_i, 2)
-    pairs: tuple[tuple[int, int, IntArray], ...]  # of two photographs the matching keypoints, (n, 2)
+    pairs: tuple[tuple[int, int, IntArray], ...]  # two photographs and their matching keypoints, (n, 2)
 
 
 def read_rows(path: Path) -> DatabaseRows:
     """Read a database.
 
     Raises:
-        SurveyFileError: not a whole COLMAP database, or a row of it is none that COLMAP writes.
+        SurveyFileError: not a complete COLMAP database, or a row that COLMAP does not write.
     """
     with _opened(path) as database:
         reader = _Reader(path, database)
@@ -206,7 +206,7 @@ def read_rows(path: Path) -> DatabaseRows:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open what is a whole SQLite file with COLMAP's tables."""
+    """Open a complete SQLite file with COLMAP's tables."""
     size = _refuse_other_files(path)
     try:
         database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
@@ -229,7 +229,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _refuse_other_files(path: Path) -> int:
-    """Refuse what is no whole SQLite file; return its size."""
+    """Refuse a file that is not a complete SQLite file, and return its size."""
     try:
         if not path.is_file():
             raise SurveyFileError(f"{path}: there is no such file")
@@ -241,7 +241,7 @@ def _refuse_other_files(path: Path) -> int:
         for beside in (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal")):
             if beside.exists() and beside.stat().st_size:
                 raise SurveyFileError(
-                    f"{path}: changes of it still lie in {beside.name}; close the program that writes it"
+                    f"{path}: changes to it are still in {beside.name}; close the program that writes it"
                 )
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
@@ -251,13 +251,13 @@ def _refuse_other_files(path: Path) -> int:
     whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
     if size < whole:
         raise SurveyFileError(
-            f"{path}: the file is cut off, it has {size} of the {whole} bytes that its header says"
+            f"{path}: the file is cut off, it has {size} of the {whole} bytes stated in its header"
         )
     return size
 
 
 def _refuse_other_tables(path: Path, database: sqlite3.Connection) -> None:
-    """Refuse a file without COLMAP's tables, or with others in their place."""
+    """Refuse a file without COLMAP's tables, or with views or virtual tables in their place."""
     kinds = dict(database.execute("SELECT name, type = 'table' AND rootpage > 0 FROM sqlite_master"))
     for name in TABLES:
         if name not in kinds:
@@ -270,7 +270,7 @@ def _refuse_other_tables(path: Path, database: sqlite3.Connection) -> None:
 
 
 class _Reader:
-    """Reads the tables of an open database; whatever is wrong is named with table and row."""
+    """Reads the tables of an open database; an error names its table and row."""
 
     def __init__(self, path: Path, database: sqlite3.Connection) -> None:
         self.path, self.database = path, database
@@ -279,7 +279,7 @@ class _Reader:
         """Return the cameras by number.
 
         Raises:
-            SurveyFileError: a size or parameters that no camera has.
+            SurveyFileError: an impossible size, or impossible parameters.
         """
         found, names = [], tuple(MODELS)
         for where, row in self._rows("cameras", "camera_id, model, width, height, params"):
@@ -317,7 +317,7 @@ class _Reader:
         return numbers, tuple(names), np.array(owners, dtype=np.int64)
 
     def keypoints(self, images: tuple[str, ...], index: dict[int, int]) -> tuple[FloatArray, ...]:
-        """Return the keypoints of every photograph, none where it has no row.
+        """Return the keypoints of every photograph, empty for one without a row.
 
         Raises:
             SurveyFileError: keypoints of an unknown photograph, too many, or not finite.
@@ -347,7 +347,7 @@ class _Reader:
         """Return the matches of every pair of photographs.
 
         Raises:
-            SurveyFileError: a pair of unknown photographs, a keypoint that is not there, or too many.
+            SurveyFileError: a pair of unknown photographs, a missing keypoint, or too many matches.
         """
         found, count = [], 0
         for where, (number, rows, columns, data) in self._rows(table, "pair_id, rows, cols, data"):
@@ -367,7 +367,7 @@ class _Reader:
         return tuple(found)
 
     def _rows(self, table: str, columns: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
-        """Yield the place and the content of each row, in the order of the first column."""
+        """Yield the location and the content of each row, in the order of the first column."""
         rows = self.database.execute(f"SELECT {columns} FROM {table} ORDER BY 1")
         for count, row in enumerate(rows, 1):
             where = f"{table}, {columns.split(',')[0]} {_shown(row[0])}"
@@ -384,18 +384,16 @@ class _Reader:
         return value
 
     def _array(self, where: str, data: object, kind: str, rows: object, columns: int) -> AnyArray:
-        """Return the numbers of a blob, whose size must be that of so many rows and columns."""
+        """Return the numbers of a blob, whose size must match the given rows and columns."""
         held = len(data) if isinstance(data, bytes) else 0
         due = rows * columns * np.dtype(kind).itemsize if isinstance(rows, int) and rows >= 0 else -1
         if held != due:
-            raise self._error(
-                where, f"{held} bytes of numbers in {_shown(rows)} rows, which do not go together"
-            )
+            raise self._error(where, f"{held} bytes of numbers do not match {_shown(rows)} rows")
         return np.frombuffer(data if isinstance(data, bytes) else b"", kind).reshape(-1, columns)
 
 
 def _shown(value: object) -> str:
-    """Return a value of a database as a message can show it."""
+    """Return a value of a database in a form for messages."""
     return as_plain(str(value)[:MAX_NAME]) if isinstance(value, str) else f"{value!r:.40}"
 
 

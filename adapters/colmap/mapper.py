@@ -1,10 +1,10 @@
 """COLMAP's pipeline on the photographs of a survey, and its list of sensor widths.
 
-The pipeline that people would use instead: no targets, no scale, no covariance. Its photographs and points
-are compared with the survey's by sfm.comparison.solutions.
+The pipeline is what users would run instead of a survey: without targets, scale and covariance.
+`sfm.comparison.solutions` compares its photographs and points with the survey's.
 
-Widths of camera sensors from COLMAP's list of cameras. pycolmap gives them only through the focal length that
-it infers for a photograph, so it is given a small one with the make, the model and a known focal length.
+Sensor widths come from COLMAP's list of cameras. pycolmap gives them only through the focal length that it
+infers for a photograph. It therefore gets a small picture with the make, the model and a known focal length.
 
 Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
 """
@@ -26,10 +26,10 @@ from sfm.errors import BackendError, one_line
 from sfm.files.user_cache import scratch_folder
 from sfm.network import Estimate, Network, rows_of
 
-SIDE_PX = (1000, 750)
-FOCAL_MM = 10
-MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does
-RANDOM_SEED = 0  # of RANSAC, so that a run repeats as far as threads allow
+SIDE_PX = (1000, 750)  # width and height of the small picture
+FOCAL_MM = 10  # its known focal length
+MODEL = "OPENCV"  # the COLMAP model that calibrates a lens as a survey does
+RANDOM_SEED = 0  # of RANSAC, so that runs repeat as far as threads allow
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class MapperBaseline:
 
     network: Network  # registered photographs and their SIFT points
     estimate: Estimate  # its orientations and points, in its own frame and scale
-    total: int  # photographs given
+    total: int  # photographs processed
     rms_px: float  # root mean square residual per coordinate of its points, px
     seconds: float  # from photographs to model, s
     name: str = "COLMAP mapper"
@@ -50,12 +50,12 @@ def map_photographs(
     """Run COLMAP's pipeline on photographs and return its largest model.
 
     Args:
-        folder: where the photographs are.
+        folder: folder of the photographs.
         cameras: for each camera the names of its photographs, relative to the folder.
-        threads: of COLMAP, all cores if -1.
+        threads: threads of COLMAP; -1 uses all cores.
 
     Raises:
-        BackendError: pycolmap is missing, a photograph is unreadable for it, or it finds no model.
+        BackendError: pycolmap is missing, cannot read a photograph, or finds no model.
     """
     pycolmap = load_pycolmap()
     begun = time.perf_counter()
@@ -109,11 +109,11 @@ def _rms(network: Network, estimate: Estimate) -> float:
 
 
 def sensor_width_mm(make: str, model: str) -> float | None:
-    """Return the width of a camera's sensor, mm, None if COLMAP does not know the camera.
+    """Return the width of a camera's sensor, mm; None if COLMAP does not know the camera.
 
     Args:
-        make: maker as EXIF data have it.
-        model: model as EXIF data have it.
+        make: maker as in the EXIF data.
+        model: model as in the EXIF data.
 
     Raises:
         BackendError: pycolmap is missing.

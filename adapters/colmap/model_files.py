@@ -1,7 +1,7 @@
-"""Files of a COLMAP model checked for their structure before COLMAP opens them.
+"""Structural checks of the files of a COLMAP model before COLMAP opens them.
 
-COLMAP reads a truncated cameras.bin without a word and fills in what is missing, and asks for all memory on
-an empty points3D.bin. Text files are checked line by line, binary ones record by record.
+COLMAP silently reads a truncated cameras.bin and fills in what is missing, and requests all memory for an
+empty points3D.bin. Text files are checked line by line, binary files record by record.
 
 Source: COLMAP 4.2 documentation, "Output Format"; layout of rigs and frames as written by pycolmap 4.2.1.
 """
@@ -23,8 +23,8 @@ from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_SIDE_PX
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
-OLDER = ("rigs", "frames")  # models of COLMAP before version 3.12 have neither
-# Number of parameters by the name of COLMAP's models, in the order of their numbers
+OLDER = ("rigs", "frames")  # missing in models by COLMAP before version 3.12
+# Number of parameters by the name of COLMAP's models, in the order of the model numbers
 MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -48,18 +48,18 @@ MODELS = {
 PARAMETERS = tuple(MODELS.values())
 POSE = "7d"  # quaternion and translation
 MAX_ID = 2**32 - 1  # of cameras, rigs and photographs
-MAX_POINT_ID = 2**64 - 1  # of points, frames and data; the largest stands for none
+MAX_POINT_ID = 2**64 - 1  # of points, frames and data; the largest means none
 
 
 def check_model_files(folder: Path, *, text: bool) -> None:
-    """Refuse a COLMAP model whose files are truncated, out of order, or hold impossible values.
+    """Refuse a COLMAP model whose files are truncated or out of order, or contain impossible values.
 
     Args:
-        folder: of the model.
-        text: whether its text files are checked or the binary ones.
+        folder: folder of the model.
+        text: whether to check the text files or the binary ones.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line, or byte for binary files.
+        SurveyFileError: with the file and the line, or the byte of a binary file.
     """
     kind = "txt" if text else "bin"
     older = not any((folder / f"{name}.{kind}").is_file() for name in OLDER)
@@ -76,9 +76,9 @@ def check_model_files(folder: Path, *, text: bool) -> None:
 
 
 def names_with_blanks(folder: Path) -> dict[int, str]:
-    """Return the names of photographs with blanks by their IDs, from text files that are in order.
+    """Return the names of photographs with blanks by their IDs, from valid text files.
 
-    COLMAP writes them in full and reads them up to the first blank.
+    COLMAP writes these names in full, but reads them only up to the first blank.
     """
     text = Lines.of(folder / "images.txt")
     names = {}
@@ -89,12 +89,12 @@ def names_with_blanks(folder: Path) -> dict[int, str]:
         name = words[9].rstrip()
         if " " in name:
             names[int(words[0])] = name
-        text.line()  # of its image points
+        text.line()  # the line of its image points
     return names
 
 
 def _check_text(name: str, path: Path) -> array[int]:
-    """Return the IDs of the cameras, photographs, ... of a file whose lines are in order."""
+    """Check the lines of a file, and return the IDs of its cameras, photographs, ..."""
     text = Lines.of(path)
     ids, due = array("Q"), None
     while (line := text.maybe_line()) is not None:
@@ -113,12 +113,12 @@ def _check_text(name: str, path: Path) -> array[int]:
         text.number = 1
         raise text.error("the file is empty")
     if due is not None and count != due:
-        raise text.error(f"the file ends after {count} {name}, its header says {due}")
+        raise text.error(f"the file ends after {count} {name}, its header states {due}")
     return ids
 
 
 def _check_row(name: str, text: Lines, words: list[str]) -> None:
-    """Check one line of data, and for photographs the line of image points that follows it."""
+    """Check one data line, and for a photograph the line of image points after it."""
     if name == "cameras":
         if len(words) < 4 or words[1] not in MODELS:
             raise text.error("a camera is CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
@@ -168,7 +168,7 @@ def _check_row(name: str, text: Lines, words: list[str]) -> None:
 
 
 def _check_rig(text: Lines, words: list[str]) -> None:
-    """Check a rig: ID, NUM_SENSORS, reference sensor, then type, number and, if known, pose of the others."""
+    """Check a rig: ID, NUM_SENSORS, reference sensor, then type, number and any pose of each other sensor."""
     form = "a rig is RIG_ID NUM_SENSORS REF_TYPE REF_ID (SENSOR_TYPE SENSOR_ID HAS_POSE [pose])..."
     if len(words) < 2:
         raise text.error(f"{len(words)} words, {form}")
@@ -199,7 +199,7 @@ def _pose(text: Lines, words: list[str]) -> None:
 
 
 def _check_binary(name: str, path: Path) -> array[int]:
-    """Return the IDs of the cameras, photographs, ... of a file whose records are in order."""
+    """Check the records of a file, and return the IDs of its cameras, photographs, ..."""
     data = _Bytes.of(path)
     (count,) = data.take("Q")
     ids = array("Q")
@@ -207,7 +207,7 @@ def _check_binary(name: str, path: Path) -> array[int]:
         if name == "cameras":
             number, model, width, height = data.take("IiQQ")
             if not 0 <= model < len(PARAMETERS):
-                raise data.error(f"camera model {model}, there are 0 to {len(PARAMETERS) - 1}")
+                raise data.error(f"camera model {model}, expected 0 to {len(PARAMETERS) - 1}")
             if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
                 raise data.error(
                     f"photographs of {width} x {height} px, needed 1 to {MAX_SIDE_PX} on each side"
@@ -246,7 +246,7 @@ def _check_binary(name: str, path: Path) -> array[int]:
 
 @dataclass
 class _Bytes:
-    """A binary file and how far it is read."""
+    """A binary file and the current position in it."""
 
     path: Path
     content: bytes
@@ -271,28 +271,28 @@ class _Bytes:
         return struct.unpack_from("<" + layout, self.content, start)
 
     def numbers(self, layout: str) -> tuple[float, ...]:
-        """Take numbers that must be finite and of bearable size.
+        """Read numbers that must be finite and of reasonable size.
 
         Raises:
-            SurveyFileError: a number that is not finite or too large.
+            SurveyFileError: a number is not finite or too large.
         """
         values = self.take(layout)
         for value in values:
             if not abs(value) <= MAX_NUMBER:
-                raise self.error(f"the number {value:g} before this place, needed at most {MAX_NUMBER:g}")
+                raise self.error(f"the number {value:g} before this position, needed at most {MAX_NUMBER:g}")
         return values
 
     def image_points(self, count: int) -> None:
-        """Pass image points, x y and the number of their object point, whose x and y must be sound.
+        """Skip image points (x, y and the number of their object point) after checking x and y.
 
         Raises:
-            SurveyFileError: a coordinate that is not finite or too large.
+            SurveyFileError: a coordinate is not finite or too large.
         """
         start = self.at
         self.skip(24 * count)
         xy = np.frombuffer(self.content, "<f8", 3 * count, start).reshape(-1, 3)[:, :2]
         if not (np.abs(xy) <= MAX_NUMBER).all():
-            raise self.error(f"image points before this place, needed numbers of at most {MAX_NUMBER:g}")
+            raise self.error(f"image points before this position, needed numbers of at most {MAX_NUMBER:g}")
 
     def skip(self, count: int) -> None:
         if self.at + count > len(self.content):

@@ -1,14 +1,14 @@
-"""Our networks as COLMAP's scenes and back.
+"""Conversion of Kolinear's networks to COLMAP's scenes and back.
 
-Differences are converted here and nowhere else:
+All differences are converted here and nowhere else:
 
     pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
     numbers        cameras, photographs and points are numbered from 1 in COLMAP
     rigs, frames   since COLMAP 4 a photograph belongs to a frame of a rig: a moment is a frame, and a
-                   photograph without a rig is alone in its frame
+                   photograph without a rig has a frame of its own
 
-pycolmap is handed in by adapters.colmap.adjuster, which alone imports it.
+The caller passes pycolmap, which only `adapters.colmap.adjuster` imports.
 
 Source: COLMAP 4.2 documentation, "Camera Models" and "Rigs and Frames".
 """
@@ -30,16 +30,16 @@ from sfm.network import Estimate, Mounts, Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
-# Its camera models by the names of ours, which have the same parameters in the same order
+# COLMAP's camera models by the names of Kolinear's, which have the same parameters in the same order
 COLMAP_NAMES = {name: name.upper() for name in MODELS if name.upper() in COLMAP_MODELS}
-OPENCV_NAMES = {"f": "fx", "k": "k1"}  # where a model has one focal length or coefficient
+OPENCV_NAMES = {"f": "fx", "k": "k1"}  # for models with one focal length or one coefficient
 PARTS_OF_OPENCV = ("simple_pinhole", "pinhole", "simple_radial", "radial")
 
 
 def reconstruction(
     pycolmap: ModuleType, network: Network, estimate: Estimate, *, rejected: BoolArray | None = None
 ) -> Any:
-    """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
+    """Return a network as a pycolmap.Reconstruction, with cameras, photographs and points numbered from 1."""
     scene = pycolmap.Reconstruction()
     rigged = _add_cameras(pycolmap, scene, estimate, None if network.moment is None else estimate.mounts)
     frames: dict[int, Any] = {}
@@ -47,7 +47,7 @@ def reconstruction(
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
     determined = estimate.determined
     claimed &= estimate.oriented[seen.image] & determined[seen.point]
-    slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
+    slot = np.zeros(len(seen), dtype=np.int64)  # index of each image point in its photograph
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         if not estimate.oriented[i]:
             continue
@@ -79,7 +79,7 @@ def reconstruction(
 def _add_cameras(
     pycolmap: ModuleType, scene: Any, estimate: Estimate, mounts: Mounts | None
 ) -> dict[int, tuple[int, Any]]:
-    """Add cameras and rigs to a scene; the rig of each camera in one, and the camera from the rig."""
+    """Add cameras and rigs to a scene; return the rig of each rigged camera, and the camera from the rig."""
     names = ("",) * len(estimate.cameras) if mounts is None else mounts.rig
     found: dict[int, tuple[int, Any]] = {}
     for k, camera in enumerate(estimate.cameras):
@@ -106,7 +106,7 @@ def _add_cameras(
 def _add_frame(
     pycolmap: ModuleType, scene: Any, images: list[tuple[Any, Any, int]], rigged: dict[int, tuple[int, Any]]
 ) -> None:
-    """Add the photographs of one moment to a scene: image, its pose and its camera."""
+    """Add the photographs of one moment (image, pose and camera) to a scene."""
     _, pose, camera = images[0]
     rig, from_rig = rigged[camera]
     frame = pycolmap.Frame(frame_id=images[0][0].image_id, rig_id=rig)
@@ -121,12 +121,12 @@ def _add_frame(
 
 
 def sensor_of(pycolmap: ModuleType, camera: int) -> Any:
-    """Return what COLMAP calls the camera of an index, as a sensor."""
+    """Return COLMAP's sensor for the camera of an index."""
     return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera + 1)
 
 
 def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
-    """Return a camera as a pycolmap.Camera of that number.
+    """Return a camera as a pycolmap.Camera with a given number.
 
     Raises:
         BackendError: a camera model that COLMAP does not have.
@@ -146,20 +146,20 @@ def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
 
 
 def colmap_parameters(camera: Camera) -> FloatArray:
-    """Return the parameters of a camera as COLMAP counts them, (n,)."""
+    """Return the parameters of a camera in COLMAP's pixel frame, (n,)."""
     return camera.parameters + HALF_PIXEL * camera.plays(Role.X0, Role.Y0)
 
 
 def with_colmap_parameters(camera: Camera, params: Any) -> Camera:
-    """Return a camera with other parameters, as COLMAP counts them."""
+    """Return a camera with other parameters, given in COLMAP's pixel frame."""
     return camera.with_parameters(np.array(params) - HALF_PIXEL * camera.plays(Role.X0, Role.Y0))
 
 
 def camera_of(found: Any) -> Camera:
-    """Return a COLMAP camera as ours in the same model, pixel size 1.
+    """Return a COLMAP camera as a Kolinear camera in the same model, with pixel size 1.
 
     Raises:
-        BackendError: a model of COLMAP that is not read.
+        BackendError: a COLMAP model that Kolinear does not read.
     """
     model = str(found.model_name).lower()
     if model not in COLMAP_NAMES:
@@ -173,7 +173,7 @@ def camera_of(found: Any) -> Camera:
 
 
 def as_opencv(camera: Camera) -> Camera:
-    """Return a camera in `opencv` if its model is one with fewer parameters of that; else as it is."""
+    """Return a camera as `opencv` if its model is a special case of that model; otherwise unchanged."""
     if camera.model not in PARTS_OF_OPENCV:
         return camera
     of = {OPENCV_NAMES.get(name, name): s for s, name in enumerate(camera.names)}
@@ -185,7 +185,7 @@ def as_opencv(camera: Camera) -> Camera:
 
 
 def estimate_of(scene: Any, start: Estimate) -> Estimate:
-    """Read the adjusted values back, counted as in the start values."""
+    """Return the adjusted values of a scene, in the order of the start values."""
     cameras = [
         with_colmap_parameters(camera, scene.camera(k + 1).params) for k, camera in enumerate(start.cameras)
     ]
@@ -197,7 +197,7 @@ def estimate_of(scene: Any, start: Estimate) -> Estimate:
 
 
 def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
-    """Read the adjusted mounts back."""
+    """Return the adjusted mounts of a scene."""
     if start is None:
         return None
     position, rotation = start.position.copy(), start.rotation.copy()
@@ -208,7 +208,7 @@ def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
 
 
 def camera_from_rig(pycolmap: ModuleType, mounts: Mounts, camera: int) -> Any:
-    """Return COLMAP's pose of a camera in its rig, for one with COLMAP's axes of the reference camera."""
+    """Return COLMAP's pose of a camera in its rig, whose axes are COLMAP's axes of the reference camera."""
     R = AXES @ mounts.rotation[camera].T
     return pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[camera])
 
@@ -221,7 +221,7 @@ def mount_of(from_rig: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def residuals_of(scene: Any, network: Network) -> FloatArray:
-    """Computed minus measured by COLMAP's projection, (k, 2), px."""
+    """Return computed minus measured image points by COLMAP's projection, px, (k, 2)."""
     seen = network.image_points
     xy = np.empty((len(seen), 2))
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):

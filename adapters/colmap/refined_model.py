@@ -1,7 +1,8 @@
-"""A COLMAP model opened to be changed in place: what is solved anew is put in, all else stays as it is.
+"""A COLMAP model that is opened, updated with a new solution, and otherwise left unchanged.
 
-Numbers, colours, key points that no point claims, points of two photographs, camera models and rigs are
-those of the model that was opened.
+Numbers, colours, key points without a point, points of two photographs, camera models and rigs remain those
+of
+the model that was opened.
 
 Source: COLMAP 4.2 documentation, "Camera Models" and "Rigs and Frames".
 """
@@ -24,7 +25,7 @@ from sfm.similarity import Similarity
 
 @dataclass(frozen=True)
 class OpenModel:
-    """A COLMAP model, and how its image points are counted."""
+    """A COLMAP model, and the numbering of its image points."""
 
     scene: Any  # pycolmap.Reconstruction
     network: Network
@@ -32,7 +33,7 @@ class OpenModel:
     camera_ids: tuple[int, ...]  # COLMAP's numbers
     image_ids: tuple[int, ...]
     point_ids: tuple[int, ...]
-    slot: IntArray  # number of each image point among the key points of its photograph, (k,)
+    slot: IntArray  # index of each image point among the key points of its photograph, (k,)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -41,16 +42,16 @@ class OpenModel:
 
     @property
     def rigs(self) -> int:
-        """Rigs of more than one camera."""
+        """Number of rigs with more than one camera."""
         return sum(rig.num_sensors() > 1 for rig in self.scene.rigs.values())
 
 
 def open_model(folder: Path) -> OpenModel:
-    """Read a COLMAP model, binary or text, to be changed.
+    """Read a COLMAP model, binary or text, to update it.
 
     Raises:
         SurveyFileError: as `adapters.colmap.camera_models.read_model`.
-        BackendError: likewise, such as a panorama.
+        BackendError: likewise, for example for a panorama.
     """
     scene = read_scene(folder)
     network, estimate = named_network(folder, scene)
@@ -76,7 +77,7 @@ def open_model(folder: Path) -> OpenModel:
 
 
 def place_model(model: OpenModel, object_from_model: Similarity) -> OpenModel:
-    """Return a model in another frame and scale, rigs with it; its scene is changed."""
+    """Return a model in another frame and scale, including its rigs; its scene is changed in place."""
     pycolmap = load_pycolmap()
     model.scene.transform(_sim3d(pycolmap, object_from_model))
     return replace(model, estimate=object_from_model.apply_estimate(model.estimate))
@@ -91,13 +92,13 @@ def update_model(
     images: BoolArray,
     points: BoolArray,
 ) -> None:
-    """Put a solution into a model: cameras, mounts, poses, points and image points.
+    """Update a model with a solution: cameras, mounts, poses, points and image points.
 
     Args:
-        model: is changed.
-        estimate: of the same photographs and points.
+        model: the model, which is changed in place.
+        estimate: solution for the same photographs and points.
         xy: image points, px, used where measured, (k, 2).
-        measured: image points measured anew; the others of adjusted points claim none any more, (k,).
+        measured: image points measured anew; the others are detached from their points if adjusted, (k,).
         images: photographs that were adjusted, (m,).
         points: points that were adjusted, (n,).
     """
@@ -130,7 +131,7 @@ def update_model(
 
 
 def key_points_of(model: OpenModel) -> tuple[int, float]:
-    """Return how many key points of a model have a point, and their RMS per coordinate by COLMAP, px."""
+    """Return the number of key points with a point, and their RMS per coordinate by COLMAP, px."""
     scene, count, squares = model.scene, 0, 0.0
     for i in scene.reg_image_ids():
         image = scene.image(i)
@@ -139,7 +140,7 @@ def key_points_of(model: OpenModel) -> tuple[int, float]:
             pose = image.cam_from_world().matrix()
             xyz = np.array([scene.point3D(p.point3D_id).xyz for p in used]) @ pose[:, :3].T + pose[:, 3]
             v = scene.camera(image.camera_id).img_from_cam(xyz) - np.array([p.xy for p in used])
-            squares += float(np.nansum(v**2))  # COLMAP projects nothing that is behind a photograph
+            squares += float(np.nansum(v**2))  # COLMAP does not project points behind a photograph
             count += len(used)
     return count, float(np.sqrt(squares / (2 * max(count, 1))))
 
@@ -147,13 +148,13 @@ def key_points_of(model: OpenModel) -> tuple[int, float]:
 def interior_rows(
     model: OpenModel, before: Estimate, after: Estimate, covariance: tuple[FloatArray, ...]
 ) -> tuple[tuple[object, ...], ...]:
-    """Return camera, model, parameter, value before and after and sigma (NaN if held), as COLMAP counts.
+    """Return camera, model, parameter, values before and after, and sigma (NaN if held), in COLMAP's terms.
 
     Args:
-        model: of the cameras.
-        before: as it came.
-        after: adjusted.
-        covariance: of the free parameters of each camera, (f, f).
+        model: model of the cameras.
+        before: estimate as it was read.
+        after: adjusted estimate.
+        covariance: covariance of the free parameters of each camera, (f, f).
     """
     rows: list[tuple[object, ...]] = []
     for k, number in enumerate(model.camera_ids):
@@ -169,5 +170,5 @@ def interior_rows(
 
 
 def _sim3d(pycolmap: Any, similarity: Similarity) -> Any:
-    """Return a similarity as COLMAP has it."""
+    """Return a similarity as a pycolmap.Sim3d."""
     return pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)

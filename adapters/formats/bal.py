@@ -5,9 +5,9 @@
     <camera values>                     per camera 9 lines: rotation vector, translation, f, k1, k2
     <point values>                      per point 3 lines: X, Y, Z
 
-P = R X + t, p = -P / P_z, p' = f (1 + k1 |p|^2 + k2 |p|^4) p, in px, origin at the centre of the photograph,
-x right, y up: the camera looks along -z as Kolinear's does, R is our M, and p are our tangents. BAL gives
-neither names nor sizes of photographs; every photograph has a separate camera.
+P = R X + t, p = -P / P_z, p' = f (1 + k1 |p|^2 + k2 |p|^4) p, in px, with the origin at the centre of the
+photograph, x right, y up. The camera looks along -z like Kolinear's, R is Kolinear's M, and p are its
+tangents. BAL states neither names nor sizes of photographs; every photograph has a separate camera.
 
 Source: Agarwal, Snavely, Seitz, Szeliski (2010), Bundle adjustment in the large, ECCV; and the page
 https://grail.cs.washington.edu/projects/bal/.
@@ -29,10 +29,10 @@ from sfm.files.csv_tables import MAX_ROWS
 from sfm.network import Estimate, ImagePoints, Network
 
 CAMERA_VALUES = 9
-MODELS = ("opencv", "radial")  # that its cameras may be in
-FOCAL = 6  # place of the focal length among them
-OBSERVATION_BYTES, VALUE_BYTES = 7, 1  # of the shortest lines, the last without an end
-FREE = ("f", "k1", "k2")  # what BAL adjusts
+MODELS = ("opencv", "radial")  # permitted camera models
+FOCAL = 6  # index of the focal length among the camera values
+OBSERVATION_BYTES, VALUE_BYTES = 7, 1  # of the shortest lines; the last value may lack a line end
+FREE = ("f", "k1", "k2")  # adjusted by BAL
 
 
 def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Network, Estimate]:
@@ -40,11 +40,11 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
 
     Args:
         path: the problem.
-        size_px: width and height of the photographs; the smallest that contains all image points if not
-            given.
+        size_px: width and height of the photographs; None chooses the smallest that contains all image
+            points.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     text = Lines.of(path)
     head = text.due_row("the number of cameras, points and observations")
@@ -58,7 +58,7 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
     )
     due = OBSERVATION_BYTES * k + VALUE_BYTES * (CAMERA_VALUES * m + 3 * n)
     if due > text.size:
-        raise text.error(f"{text.size} bytes in the file, at least {due} are due by these numbers")
+        raise text.error(f"{text.size} bytes in the file, these numbers need at least {due}")
     image, point = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
     xy = np.empty((k, 2))
     for row in range(k):
@@ -105,20 +105,20 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
 
     Args:
         path: file to write.
-        network: what was measured.
+        network: the measured network.
         estimate: complete; cameras in model radial, or in opencv with one focal length and no decentring.
 
     Raises:
-        OutputError: what BAL cannot hold, or the file cannot be written.
+        OutputError: BAL cannot store the network, or the file cannot be written.
     """
     for camera in estimate.cameras:
         focal, further = camera.parameters[camera.plays(Role.FOCAL)], camera.plays(Role.DECENTRING)
         if camera.model not in MODELS or np.ptp(focal) or camera.parameters[further].any():
             raise OutputError(
-                f"camera {camera.name}: BAL knows one focal length with k1, k2 and nothing else"
+                f"camera {camera.name}: BAL has one focal length with k1 and k2, and no other parameters"
             )
     if not (estimate.oriented.all() and estimate.determined.all()):
-        raise OutputError("BAL wants start values of all photographs and points, some have none")
+        raise OutputError("BAL requires start values of all photographs and points, some have none")
     seen = network.image_points
     m, n = len(network.images), len(network.points)
     lines = [f"{m} {n} {len(seen)}"]

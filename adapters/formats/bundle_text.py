@@ -1,6 +1,6 @@
 """The text files of two bundle adjustment programs of a thesis, read and written.
 
-MATLAB program, three files (that of its cameras and points are modelled on those of the sba package):
+MATLAB program, three files (those of cameras and points are modelled on the files of the sba package):
 
     cameras   id omega phi kappa XL YL ZL             a photograph per line, deg
     points    X Y Z frames (frame x y)*               a point per line; frames from 0, mm in the image frame
@@ -14,10 +14,11 @@ C# program, one file:
     id X Y Z (x y)*                                   per point, one pair for every photograph
     id (sx sy)*                                       per point
 
-The MATLAB program asks for c, x0, y0 (mm); in a folder of its files they are in interior.txt.
+The MATLAB program asks for c, x0, y0 (mm); a folder of its files has them in interior.txt.
 
-Both keep angles in degrees with M = R_kappa R_phi R_omega, as Kolinear does. Neither knows distortion,
-pixels or the size of the photographs: coordinates in mm become pixels of a nominal size.
+Both use angles in degrees with M = R_kappa R_phi R_omega, like Kolinear. Neither has distortion, pixels or
+the
+size of the photographs: coordinates in mm become pixels of a nominal size.
 
 Source: the thesis "Bundle adjustment for close-range photogrammetry" (fly-over bridge pier), sec. 4.2.1 and
 app. B for the C# file, app. C for the MATLAB files.
@@ -45,8 +46,8 @@ from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
-OF_SIGMAS = "re"  # ending of their file in the thesis
-PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
+OF_SIGMAS = "re"  # end of the name of their file in the thesis
+PIXEL_MM = 0.005  # nominal size of a pixel, since the files state none
 BORDER = 1.1  # sensor over the extent of the image points
 
 
@@ -66,18 +67,18 @@ def read_bundle_matlab(
         points: file of the object points and their image points.
         sigmas: file of the standard deviations; without it they are one pixel.
         c_mm: principal distance, which the program asks for, mm.
-        x0_mm: principal point, mm.
-        y0_mm: principal point, mm.
+        x0_mm: x of the principal point, mm.
+        y0_mm: y of the principal point, mm.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     text = Lines.of(cameras)
     names, exterior = _exterior(text, None)
     m = len(names)
     text = Lines.of(points)
     image, point, xy, xyz = array("q"), array("q"), array("d"), array("d")
-    ends = array("q", [0])  # image points up to each point
+    ends = array("q", [0])  # number of image points up to and including each point
     while (words := text.row()) is not None:
         if len(words) < 4:
             raise text.error(f"{len(words)} words, a point is X Y Z frames (frame x y)...")
@@ -115,12 +116,12 @@ def write_bundle_matlab(
     Args:
         cameras: file of the photographs.
         points: file of the object points and their image points.
-        sigmas: file of the standard deviations; None where none are stated.
-        network: what was measured.
+        sigmas: file of the standard deviations; None if none are stated.
+        network: the measured network.
         estimate: complete.
 
     Raises:
-        OutputError: what the files have no place for, or they cannot be written.
+        OutputError: the files cannot store the network, or they cannot be written.
     """
     xy, sigma = _millimetres(network, estimate)
     lines = ["# id omega phi kappa XL YL ZL (deg)", *_exterior_lines(network, estimate)]
@@ -157,10 +158,11 @@ def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
 
 
 def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
-    """Return the files of cameras, points, standard deviations (None without) and interior orientation.
+    """Return the files of cameras, points, standard deviations (None if missing) and interior orientation.
 
-    They are cams.txt, pts.txt, sigmas.txt and interior.txt, or the first three have the names of the thesis,
-    by the numbers of photographs and points: utara1_2.txt, utara1_8.txt and utara1_8re.txt.
+    They are cams.txt, pts.txt, sigmas.txt and interior.txt. Alternatively the first three have the names in
+    the thesis, which contain the numbers of photographs and points: utara1_2.txt, utara1_8.txt and
+    utara1_8re.txt.
 
     Raises:
         SurveyFileError: one is missing.
@@ -176,7 +178,7 @@ def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
     missing = [file.name for file in due if not file.is_file()]
     if missing:
         raise SurveyFileError(
-            f"{folder}: {' and '.join(missing)} not there; the MATLAB program has cams.txt, pts.txt, "
+            f"{folder}: {' and '.join(missing)} missing; the MATLAB program has cams.txt, pts.txt, "
             f"{INTERIOR} (c x0 y0, mm), maybe sigmas.txt; or as in the thesis NAME_2.txt, NAME_8.txt and "
             "NAME_8re.txt"
         )
@@ -184,12 +186,12 @@ def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
 
 
 def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimate) -> None:
-    """Write cams.txt, pts.txt, interior.txt and, where standard deviations are stated, sigmas.txt.
+    """Write cams.txt, pts.txt, interior.txt and, if standard deviations are stated, sigmas.txt.
 
     Raises:
-        OutputError: what the files have no place for, or they cannot be written.
+        OutputError: the files cannot store the network, or they cannot be written.
     """
-    _millimetres(network, estimate)  # refuses what cannot be held, before a folder is made
+    _millimetres(network, estimate)  # refuses a network that cannot be stored before a folder is made
     folder.mkdir(parents=True, exist_ok=True)
     cameras, points = folder / "cams.txt", folder / "pts.txt"
     stated = np.isfinite(network.image_points.stated_sigma).any()
@@ -203,13 +205,13 @@ def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimat
 def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
     """Read the file of the C# program as a network and its start values.
 
-    The program reads two photographs only; here there may be more.
+    The program reads only two photographs; this function accepts more.
 
     Args:
         path: the file.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     text = Lines.of(path)
     words = text.due_row("photographs, c, x0 and y0")
@@ -240,7 +242,7 @@ def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
         xyz.extend(values[:3])
         xy.extend(values[3:])
     words = text.due_row("the sigmas of the first point")
-    if len(words) == 1:  # the program's reader allows their number to stand before them
+    if len(words) == 1:  # the program's reader allows their number before them
         words = text.due_row("the sigmas of the first point")
     for j, label in enumerate(labels):
         if j:
@@ -255,10 +257,10 @@ def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
 
 
 def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> None:
-    """Write a network as the file of the C# program, which wants every point in every photograph.
+    """Write a network as the file of the C# program, which requires every point in every photograph.
 
     Raises:
-        OutputError: what the file cannot hold, or it cannot be written.
+        OutputError: the file cannot store the network, or cannot be written.
     """
     xy, sigma = _millimetres(network, estimate)
     seen = network.image_points
@@ -268,8 +270,8 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
     if (row < 0).any():
         j, i = np.argwhere(row < 0)[0]
         raise OutputError(
-            f"{path}: point {network.points[j]} is not measured in {network.images[i]}; the file wants every "
-            "point in every photograph"
+            f"{path}: point {network.points[j]} is not measured in {network.images[i]}; the file requires "
+            "every point in every photograph"
         )
     camera = estimate.cameras[0]
     lines = [
@@ -285,7 +287,7 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
 
 
 def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[float]]]:
-    """Ids and omega, phi, kappa (deg), XL, YL, ZL of so many photographs, or of all to the end."""
+    """Return ids and omega, phi, kappa (deg), XL, YL, ZL of `count` photographs, or of all if None."""
     names: list[str] = []
     known: set[str] = set()
     exterior = []
@@ -307,7 +309,7 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
 
 
 def _frames(text: Lines, words: list[str], m: int) -> tuple[list[int], list[float]]:
-    """Frames and both of the pairs of numbers of "count (frame a b)*"."""
+    """Return the frames and all pairs of numbers of "count (frame a b)*"."""
     count = text.count_of(words[0], "frames")
     if len(words) != 1 + 3 * count:
         raise text.error(f"{len(words) - 1} words after {count} frames, needed {3 * count}")
@@ -361,16 +363,16 @@ def _network(
 
 
 def _millimetres(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Image points and their sigmas in mm, or why the files cannot hold the network."""
+    """Return image points and their sigmas in mm; refuse a network that the files cannot store."""
     if len(estimate.cameras) != 1 or estimate.cameras[0].model != "brown":
-        raise OutputError("the files of the bundle programs know one camera, in model brown")
+        raise OutputError("the files of the bundle programs have one camera, in model brown")
     camera = estimate.cameras[0]
     if camera.parameters[3:].any():
         raise OutputError(
             f"camera {camera.name}: the files of the bundle programs have no place for distortion"
         )
     if not (estimate.oriented.all() and estimate.determined.all()):
-        raise OutputError("the files of the bundle programs want start values of all photographs and points")
+        raise OutputError("the files of the bundle programs need start values of all photographs and points")
     seen = network.image_points
     sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)) * camera.pixel_mm
     return image_from_pixel(seen.xy, camera.size_px, camera.pixel_mm), sigma
@@ -390,5 +392,5 @@ def _word(name: str) -> str:
 
 
 def _text(*values: float) -> str:
-    """Numbers with twelve digits, so that mm that went through pixels come back as they were written."""
+    """Write numbers with twelve digits, so that mm converted to pixels and back are unchanged."""
     return " ".join(f"{value:.12g}" for value in values)

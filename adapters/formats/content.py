@@ -1,6 +1,6 @@
-"""All that a file of a program says of a survey, by kind, for whoever writes it in another format.
+"""The full content of a survey file, by kind, for conversion to another format.
 
-A format lists the kinds that it keeps; the rest of a survey is named when it is written.
+A format lists the kinds that it keeps. Kinds that it loses are reported when a survey is written.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, Ob
 from sfm.reduced_network import reduce_network
 from sfm.solution import NO_SCALE, Solution
 
-PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ, cYZ
+PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ and cYZ
 
 
 def _no_image_points() -> ImagePoints:
@@ -33,17 +33,17 @@ class Content:
     result: Solution
     rejected: ImagePoints = field(default_factory=_no_image_points)  # measured, but left out as gross errors
     checks: ObjectPoints = field(default_factory=ObjectPoints)  # known points that only check the result
-    sigma0: float | None = None  # of unit weight, by which the covariances are scaled
-    sigma0_px: float | None = None  # a posteriori of an image coordinate
-    notes: tuple[str, ...] = ()  # lines about what was read and is not used as it stands
+    sigma0: float | None = None  # of unit weight, the scale of the covariances
+    sigma0_px: float | None = None  # a posteriori, of an image coordinate, px
+    notes: tuple[str, ...] = ()  # remarks on content that is read but not used unchanged
 
 
 class Kind(NamedTuple):
-    """Something that a survey may have and a format may lack."""
+    """Content that a survey may have and a format may lack."""
 
-    name: str  # as formats say that they hold it
+    name: str  # as in the list of a format
     words: str  # for people, in the plural
-    rows: Callable[[Content], FloatArray]  # numbers that say all of it, a row for each, (n, d)
+    rows: Callable[[Content], FloatArray]  # all of its numbers, a row for each item, (n, d)
 
 
 def _points_of(known: ObjectPoints) -> FloatArray:
@@ -88,7 +88,7 @@ def _exterior_correlations(content: Content) -> FloatArray:
 
 
 def _correlations(C: FloatArray) -> FloatArray:
-    """Return number of matrix, row, column and value of what is not 0 above the diagonals, (n, 4)."""
+    """Return matrix number, row, column and value of the nonzero elements above the diagonals, (n, 4)."""
     e, r, c = np.nonzero(np.triu(np.nan_to_num(C), 1))
     return np.stack([e, r, c, C[e, r, c]], axis=1)
 
@@ -162,7 +162,7 @@ def _rigs(content: Content) -> FloatArray:
 
 
 def _moments(content: Content) -> FloatArray:
-    """Return photographs of one moment and their first one, (n, 2)."""
+    """Return photographs taken at one moment, and the first photograph of that moment, (n, 2)."""
     moment = content.result.network.moment
     if moment is None or content.result.estimate.mounts is None:
         return np.zeros((0, 2))
@@ -307,7 +307,7 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
 
 
 def placed(content: Content) -> Content:
-    """Return what has coordinates in the object, photographs and points without gone."""
+    """Return the part of a survey that has coordinates in the object."""
     result = content.result
     network, estimate = result.network, result.estimate
     images, points = estimate.oriented, estimate.determined
@@ -338,10 +338,10 @@ def placed(content: Content) -> Content:
 
 
 def losses(content: Content, held: frozenset[str]) -> tuple[tuple[Kind, int], ...]:
-    """Return the kinds that there are and that a format does not hold, and how many of each.
+    """Return the kinds of content that a format cannot store, and their number of items.
 
     Args:
-        content: of a survey.
+        content: content of a survey.
         held: names of the kinds that the format keeps.
     """
     counts = ((kind, len(kind.rows(content))) for kind in KINDS if kind.name not in held)

@@ -1,6 +1,6 @@
-r"""Points, lines and circles as DXF for CAD programs, with names as text, a layer for each group.
+r"""Points, lines and circles as DXF for CAD programs, with names as text and a layer for each group.
 
-Written in the text form of release 12, which every program reads.
+The files use the text form of release 12, which every program reads.
 
 Source: Autodesk, DXF Reference (release 12), group codes of POINT, LINE, CIRCLE and TEXT; characters beyond
 ASCII as \U+XXXX; arbitrary axis algorithm.
@@ -18,9 +18,9 @@ import numpy as np
 from adapters.reading.text_lines import write_lines
 from sfm.conventions import FloatArray
 
-LAYER_CHARACTERS = 31  # of a name in release 12
+LAYER_CHARACTERS = 31  # maximum length of a name in release 12
 TEXT_HEIGHT = 0.01  # of the size of the drawing
-COLOURS = 7  # of AutoCAD's index, by turns
+COLOURS = 7  # of AutoCAD's index, used in turn
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ def write_dxf(
     """Write a drawing.
 
     Args:
-        path: of the file.
-        names: of the points.
-        xyz: their coordinates, (n, 3).
-        layers: of each point.
-        lines: to draw.
-        circles: to draw.
-        texts: layer, text and place of further texts.
+        path: path of the file.
+        names: names of the points.
+        xyz: coordinates of the points, (n, 3).
+        layers: layer of each point.
+        lines: lines to draw.
+        circles: circles to draw.
+        texts: layer, text and position of further texts.
 
     Raises:
         OutputError: the file cannot be written.
@@ -105,7 +105,7 @@ def write_dxf(
 
 
 def _axes(n: FloatArray) -> FloatArray:
-    """Return the axes of an entity with this normal as columns: the arbitrary axis algorithm."""
+    """Return the axes of an entity with normal n as columns, by the arbitrary axis algorithm."""
     flat = abs(n[0]) < 1 / 64 and abs(n[1]) < 1 / 64
     x = np.cross([0.0, 1.0, 0.0] if flat else [0.0, 0.0, 1.0], n)
     x /= np.linalg.norm(x)
@@ -113,10 +113,10 @@ def _axes(n: FloatArray) -> FloatArray:
 
 
 def _layer(name: str) -> str:
-    """Return a name as release 12 allows it for layers."""
+    """Return a name in the form that release 12 allows for layers."""
     return re.sub(r"[^A-Za-z0-9$_-]", "_", name)[:LAYER_CHARACTERS] or "0"
 
 
 def _text(text: str) -> str:
-    """Return a text with what is not ASCII written out."""
+    """Return a text with non-ASCII characters as escapes."""
     return "".join(c if 32 <= ord(c) < 127 else f"\\U+{ord(c):04X}" for c in text)

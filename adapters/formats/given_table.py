@@ -1,4 +1,4 @@
-"""Given values, control and check points of a result, read from and written to tables.
+"""Given values, control points and check points of a result, read from and written to tables.
 
     control.csv         of converted tables: id,X,Y,Z,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ], or empty
     control_points.csv  of a survey: a row for each coordinate
@@ -32,7 +32,7 @@ COVARIANCE_PAIRS = ("XY", "XZ", "YZ")  # of correlated coordinates
 
 
 class Statistics(Content):
-    """Unit of weight as summary.json states it."""
+    """Unit of weight as stated in summary.json."""
 
     sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
     sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
@@ -40,14 +40,14 @@ class Statistics(Content):
 
 @dataclass(frozen=True)
 class GivenValues:
-    """Given values of a survey with standard deviations, and those that took part."""
+    """Given values of a survey that took part, with standard deviations."""
 
     bars: ScaleBars
     control: ObjectPoints
     interior: tuple[tuple[str, str, float, float], ...]  # camera, parameter, value, sigma
     exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
-    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
-    sigma0_px: float | None = None  # a posteriori of an image coordinate, the median; None where not known
+    sigma0: float = 1.0  # of unit weight, the scale of the covariance of the result
+    sigma0_px: float | None = None  # a posteriori of an image coordinate, the median, px; None if not known
 
 
 def read_given(folder: Path, network: Network) -> GivenValues:
@@ -112,7 +112,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
 
 
 def object_points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:
-    """Return points of their coordinates (3,) and covariances (3, 3), by their places in a network."""
+    """Return points from their coordinates (3,) and covariances (3, 3), by their index in a network."""
     return ObjectPoints(
         np.array(list(found), dtype=np.int64),
         np.array([xyz for xyz, _ in found.values()]).reshape(-1, 3),
@@ -121,7 +121,7 @@ def object_points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoin
 
 
 def write_given(folder: Path, network: Network, estimate: Estimate, unit: str) -> None:
-    """Write what a network was given with a standard deviation, without tests; no file of nothing."""
+    """Write the given values of a network with standard deviations, without tests; no file without any."""
     kinds = [kind for _, kind in given_residuals(network, estimate, unit)]
     rows = list(given_rows(kinds, network, unit))
     if rows:
@@ -129,7 +129,7 @@ def write_given(folder: Path, network: Network, estimate: Estimate, unit: str) -
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:
-    """Return the points of the bar `A - B`, whose names may hold dashes; None where one is not there."""
+    """Return the points of the bar `A - B`, whose names may contain dashes; None if one is missing."""
     words = name.split(" - ")
     for k in range(1, len(words)):
         first, second = " - ".join(words[:k]), " - ".join(words[k:])
@@ -144,9 +144,9 @@ def read_known_points(
     """Return control and check points of a result.
 
     Args:
-        folder: of the result.
-        network: what `read_result` has read of it.
-        control: what given.csv says took part.
+        folder: folder of the result.
+        network: network of the result from `read_result`.
+        control: control that took part, from given.csv.
 
     Raises:
         SurveyFileError: a table is damaged.
@@ -166,13 +166,13 @@ def read_known_points(
             xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else 0.0
     points = object_points(found["control"])
     covariance = points.covariance.copy()
-    for j, C in zip(control.point, control.covariance, strict=True):  # of what took part
+    for j, C in zip(control.point, control.covariance, strict=True):  # correlations of what took part
         covariance[points.point == j] += np.where(np.eye(3, dtype=bool), 0.0, C)
     return replace(points, covariance=covariance), object_points(found["check"])
 
 
 def _of_control(path: Path, network: Network) -> tuple[ObjectPoints, ObjectPoints]:
-    """Return control and check points of the table of a survey."""
+    """Return control and check points from the table of a survey."""
     header = read_header(path)
     covariances = COVARIANCES if COVARIANCES[0] in header else ()
     checks = CHECKS if CHECKS[0] in header else ()
@@ -201,7 +201,7 @@ def _of_control(path: Path, network: Network) -> tuple[ObjectPoints, ObjectPoint
 def write_known_points(
     path: Path, points: tuple[str, ...], control: ObjectPoints, checks: ObjectPoints
 ) -> None:
-    """Write the table of control and check points, empty cells where a coordinate is not known."""
+    """Write the table of control and check points, with empty cells for unknown coordinates."""
     found: dict[int, tuple[FloatArray, FloatArray, BoolArray]] = {}
     for one, flag in ((control, False), (checks, True)):
         for j, xyz, C in zip(one.point.tolist(), one.xyz, one.covariance, strict=True):

@@ -1,7 +1,7 @@
-"""Meshes of triangles as STL and PLY (binary and text), read as untrusted.
+"""Triangle meshes in STL and PLY (binary and text), read as untrusted files.
 
-Polygons of PLY are cut into triangles from their first corner. The size that a file states is checked
-against its actual size before memory is taken.
+Polygons in PLY are split into triangles from their first corner. The size stated in a file is checked against
+its actual size before memory is allocated.
 
 Source: 3D Systems (1989), StereoLithography Interface Specification; Turk (1994), The PLY polygon file
 format.
@@ -38,7 +38,7 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
         Vertices (v, 3) and the indices of the vertices of each triangle (t, 3).
 
     Raises:
-        SurveyFileError: what is wrong, with the file.
+        SurveyFileError: the file is not a valid mesh.
     """
     try:
         if not path.is_file():
@@ -61,7 +61,7 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
     if not len(triangles):
         raise SurveyFileError(f"{path}: no triangles, at least one is needed")
     if not (np.abs(vertices) <= MAX_NUMBER).all():
-        raise SurveyFileError(f"{path}: a coordinate is no finite number of at most {MAX_NUMBER:g}")
+        raise SurveyFileError(f"{path}: a coordinate is not a finite number of at most {MAX_NUMBER:g}")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise SurveyFileError(
             f"{path}: vertex {triangles.max()} of a triangle, the mesh has {len(vertices)} (counted from 0)"
@@ -85,7 +85,7 @@ def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
     if first[:1] != ["solid"]:
         text.number = 1
         raise text.error(
-            "neither a binary STL file of the size that it states, nor a text that begins 'solid'"
+            "neither a binary STL file of the size that it states, nor a text that begins with 'solid'"
         )
     corners: list[float] = []
     while (line := text.maybe_line()) is not None:
@@ -95,7 +95,7 @@ def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
                 raise text.error(f"'{shown(line)}', needed 'vertex X Y Z'")
             corners += [text.number_of(word) for word in words[1:]]
     if len(corners) % 9:
-        raise text.error(f"{len(corners) // 3} vertices, three for each triangle are needed")
+        raise text.error(f"{len(corners) // 3} vertices, each triangle needs three")
     return _soup(np.array(corners).reshape(-1, 3, 3))
 
 
@@ -138,7 +138,7 @@ def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
 
 
 class _Values:
-    """The values of a PLY file one after the other."""
+    """Reads the values of a PLY file one after another."""
 
     def __init__(self, path: Path, data: bytes, form: str) -> None:
         self.path, self.form, self.at = path, form, 0
@@ -147,14 +147,14 @@ class _Values:
         self.data = data
 
     def table(self, count: int, properties: list[tuple[str, ...]]) -> FloatArray:
-        """Read the vertices, which have no lists; return their coordinates.
+        """Read the vertices, which have no lists, and return their coordinates.
 
         Raises:
             SurveyFileError: vertices without x, y and z.
         """
         names = [one[-1] for one in properties]
         if not {"x", "y", "z"} <= set(names) or any(one[0] == "list" for one in properties):
-            raise SurveyFileError(f"{self.path}: the vertices have no x, y and z, or lists")
+            raise SurveyFileError(f"{self.path}: the vertices lack x, y and z, or have lists")
         if self.form == "ascii":
             rows = self._words(count * len(names)).reshape(count, len(names))
             return rows[:, [names.index(axis) for axis in "xyz"]]
@@ -163,10 +163,10 @@ class _Values:
         return np.stack([packed[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
 
     def faces(self, count: int, properties: list[tuple[str, ...]], keep: bool = True) -> IntArray:
-        """Read an element with lists row by row; return the polygons of the first list as triangles.
+        """Read an element with lists row by row, and return the polygons of the first list as triangles.
 
         Raises:
-            SurveyFileError: a polygon of too few or too many corners, or more elements than bytes.
+            SurveyFileError: a polygon has too few or too many corners, or elements outnumber bytes.
         """
         found: list[tuple[int, int, int]] = []
         if count * max(len(properties), 1) > len(self.data):
@@ -195,16 +195,16 @@ class _Values:
     def _bytes(self, count: int) -> bytes:
         part = self.data[self.at : self.at + count]
         if len(part) < count:
-            raise SurveyFileError(f"{self.path}: ends before its last value, as the header counts them")
+            raise SurveyFileError(f"{self.path}: ends before the last value that its header announces")
         self.at += count
         return part
 
     def _words(self, count: int) -> FloatArray:
         part = self.words[self.at : self.at + count]
         if len(part) < count:
-            raise SurveyFileError(f"{self.path}: ends before its last value, as the header counts them")
+            raise SurveyFileError(f"{self.path}: ends before the last value that its header announces")
         self.at += count
         try:
             return np.array([float(word) for word in part])
         except ValueError as error:
-            raise SurveyFileError(f"{self.path}: a value is no number") from error
+            raise SurveyFileError(f"{self.path}: a value is not a number") from error

@@ -6,15 +6,16 @@
     document/chunk/frames/frame/markers      location camera_id x y per marker
     document/chunk/transform                 rotation, translation, scale: object from chunk
 
-A camera's transform takes camera axes (x right, y down, z forward) into the chunk, so that
+A camera's transform takes camera axes (x right, y down, z forward) into the chunk, so
 R = (its rotation) diag(1, -1, -1). Image points count from the corner of the top-left pixel, 0.5 px more
-than Kolinear's. With x = X/Z, y = Y/Z of the camera axes and r2 = x2 + y2
+than Kolinear's. With x = X/Z, y = Y/Z in camera axes and r2 = x2 + y2
 
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y,   y' with p1, p2 exchanged
     u = w/2 + cx + x' f + x' b1 + y' b2,   v = h/2 + cy + y' f
 
-which is `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0), p1 and p2 exchanged, or with k4 or b2
-`brown_forward_affine`, all to the last digit.
+This is exactly `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0) with p1 and p2 exchanged; with k4
+or
+b2 it is exactly `brown_forward_affine`.
 
 Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models"; structure of the file as
 exported by versions 1.5 to 2.1.
@@ -37,23 +38,23 @@ from sfm.files.plain_text import MAX_PIXEL_MM, shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
-HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
+HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus Kolinear's, px
 MARKER_SIGMA_PX = 0.1  # Metashape's default for markers placed by hand
-MARKER = ["markers", "marker"]  # elements below the chunk
+MARKER = ["markers", "marker"]  # path of elements below the chunk
 LOCATION = ["frames", "frame", "markers", "marker", "location"]
 
-AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in ours
+AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in Kolinear's
 CALIBRATION = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read_metashape(path: Path) -> tuple[Network, Estimate]:
-    """Read an export as a network and its solution: cameras of one chunk, markers as object points.
+    """Read an export as a network and its solution: the cameras of one chunk, with markers as object points.
 
-    Markers with an enabled reference are control points; the reference of a marker is its start value.
-    Cameras without transform have no orientation.
+    A marker with an enabled reference is a control point; the reference of any marker is its start value.
+    Cameras without a transform have no orientation.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     markers = Markers(path)
     root = read_xml(path, markers.taken())
@@ -95,10 +96,10 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
 
 
 def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
-    """Write a network and its solution as an export of one chunk, points as markers.
+    """Write a network and its solution as an export of one chunk, with points as markers.
 
     Raises:
-        OutputError: a camera model that Metashape has no equal of, or the file cannot be written.
+        OutputError: Metashape has no equivalent of a camera model, or the file cannot be written.
     """
     sensors = [line for k, camera in enumerate(estimate.cameras) for line in _sensor_lines(k, camera)]
     cameras = []
@@ -159,7 +160,7 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
 
 
 def _camera(sensor: Node) -> Camera:
-    """Read a sensor in the model that says the same."""
+    """Return the camera of a sensor in the equivalent model."""
     if sensor.attributes.get("type", "frame") != "frame":
         raise sensor.error(
             f"sensor of type {shown(sensor.attributes['type'])}, only frame sensors can be read"
@@ -216,7 +217,7 @@ def _camera(sensor: Node) -> Camera:
 
 
 def _sensor_lines(number: int, camera: Camera) -> list[str]:
-    """Write a sensor, or say why Metashape has no equal of the camera."""
+    """Return the lines of a sensor; refuse a camera without an equivalent in Metashape."""
     width, height = camera.size_px
     centre = (np.array(camera.size_px) - 1) / 2
     p = dict.fromkeys(CALIBRATION, 0.0)
@@ -264,7 +265,7 @@ def _sensor_lines(number: int, camera: Camera) -> list[str]:
 
 
 def _chunk_transform(chunk: Node) -> Similarity:
-    """Object from chunk, of the chunk or of its only component; the identity if there is none."""
+    """Return object from chunk, of the chunk or its only component; the identity if there is none."""
     node = chunk.maybe("transform")
     if node is None:
         components = chunk.maybe("components")
@@ -290,24 +291,24 @@ def _reference(xyz: FloatArray, sigma: FloatArray | None) -> str:
 
 
 class Markers:
-    """Markers of the first chunk, with image points of its first frame, taken while the file is read."""
+    """Markers of the first chunk with image points of its first frame, collected while the file is read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.labels: list[str] = []
-        self._index: dict[str, int] = {}  # of each marker by its id
+        self._index: dict[str, int] = {}  # index of each marker by its id
         self._xyz = array("d")
         self._control, self._sigma = array("q"), array("d")
         self._seen = array("q")  # camera, marker and line of each image point, by the numbers below
         self._xy = array("d")
-        self._cameras: dict[str, int] = {}  # numbers of the ids that image points name
+        self._cameras: dict[str, int] = {}  # numbers of the ids in image points
         self._markers: dict[str, int] = {}
         self._chunk: Node | None = None
         self._frames: Node | None = None
-        self._frame: Node | None = None  # the first of them
+        self._frame: Node | None = None  # the first frame
 
     def taken(self) -> Taken:
-        """Return what is taken of a file."""
+        """Return the functions that receive the elements of a file."""
         return {("markers", "marker"): self._take_marker, ("marker", "location"): self._take_location}
 
     def control(self) -> ObjectPoints:
@@ -327,7 +328,7 @@ class Markers:
             images: index of each photograph by its id.
 
         Raises:
-            SurveyFileError: one of an unknown camera or marker, or two of a marker in a camera.
+            SurveyFileError: an image point of an unknown camera or marker, or two of a marker in one camera.
         """
         seen = np.array(self._seen, dtype=np.int64).reshape(-1, 3)
         found = []
@@ -387,7 +388,7 @@ class Markers:
             raise node.error(f"more than {MAX_IMAGE_POINTS} image points, no more are read")
 
     def _below_chunk(self, nodes: list[Node]) -> list[str]:
-        """Return the tags below the first chunk, none outside of it."""
+        """Return the tags below the first chunk; empty outside of it."""
         at = 0 if nodes[0].tag == "chunk" else 1
         if self._chunk is None:
             self._chunk = nodes[0] if at == 0 else nodes[0].maybe("chunk")
@@ -395,7 +396,7 @@ class Markers:
 
 
 def _number_of(node: Node, attribute: str, numbers: dict[str, int], most: int) -> int:
-    """Return the number of an id, a new one if it is new."""
+    """Return the number of an id, assigning a new number to a new id."""
     identifier = node.name(attribute)
     number = numbers.setdefault(identifier, len(numbers))
     if number == most:

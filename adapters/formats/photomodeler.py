@@ -1,6 +1,6 @@
 """PhotoModeler's text export of a project: camera, exterior orientation, control, points, image points.
 
-Blocks follow one another, each closed by an empty line:
+Blocks follow one another, and each ends with an empty line:
 
     title
     tolerance  most_iterations  [width_px height_px]
@@ -19,15 +19,17 @@ Blocks follow one another, each closed by an empty line:
     image points:    n id x y sx sy            (px)
     features, and which photograph shows them  (not read)
 
-Control points that were adjusted stand in both blocks with their adjusted coordinates and standard
-deviations; what was observed of them is not in the file. Standard deviations of cameras are the defaults of
-the program, whether it adjusted the camera or not: only the title of a calibration project says that it did.
+Control points that were adjusted appear in both blocks with their adjusted coordinates and standard
+deviations; the file does not contain their observed values. The standard deviations of cameras are the
+program's defaults, whether it adjusted the camera or not. Only the title of a calibration project says that
+it
+did.
 
-Pixel coordinates count from the corner of the top-left pixel, 0.5 px more than Kolinear's; the principal
-point (xp, yp) from the same corner in mm, right and down; xs, ys is the size of the sensor.
+Pixel coordinates count from the corner of the top-left pixel, 0.5 px more than Kolinear's. The principal
+point (xp, yp) counts from the same corner in mm, right and down; xs, ys is the size of the sensor.
 
-Source: the format as read by loadpm.m of DBAT and the use made of it in prague2016_pm.m (Borlin and
-Grussenmeyer), checked on its camcal and Strasbourg data.
+Source: the format as read by loadpm.m of DBAT and its use in prague2016_pm.m (Borlin and Grussenmeyer),
+checked on its camcal and Strasbourg data.
 """
 
 from __future__ import annotations
@@ -47,11 +49,11 @@ from sfm.files.plain_text import MAX_SIDE_PX, shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.solution import Solution
 
-MODELS = ("brown", "brown_dbat")  # that its cameras may be in; they differ in what is minimised
-HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus ours, px
+MODELS = ("brown", "brown_dbat")  # permitted camera models; they differ in what is minimised
+HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus Kolinear's, px
 INNER = 10  # c xp yp xs ys K1 K2 K3 P1 P2
-FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1")  # what a calibration adjusts
-ROUNDING = 1e-12  # of the ratio of two sides that are the same
+FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1")  # adjusted by a calibration project
+ROUNDING = 1e-12  # of the ratio of two equal sides
 CALIBRATION = "calibration project"  # in the title of a project that adjusts its camera
 
 
@@ -66,22 +68,23 @@ def read_photomodeler(
 def read_export(
     path: Path, *, control: Path | None = None, size_px: tuple[int, int] | None = None
 ) -> Content:
-    """Read all of a PhotoModeler text export.
+    """Read everything in a PhotoModeler text export.
 
     Photographs with the same interior orientation share a camera, in model `brown_dbat` with the affinity of
-    its pixels: calibrated, but with everything except the shear free in a calibration project. Control with a
-    negative standard deviation or 0 is fixed, control that was adjusted is no observation and becomes an
-    object point. The covariance of an image point is that of the file, 1 px^2 where it gives none. An image
-    point that is repeated stands once; one with two positions stands with both, for whoever adjusts it.
+    its pixels. The camera is held, except in a calibration project, where everything but the shear is free.
+    Control with a negative or zero standard deviation is fixed. Control that was adjusted is no observation
+    and becomes an object point. The covariance of an image point is that in the file, or 1 px^2 if it states
+    none. A repeated image point is read once; one with two positions is read with both, for the adjustment
+    to decide.
 
     Args:
         path: the export.
         control: text file with lines id,label,X,Y,Z[,sX,sY,sZ] (# starts a comment; no sigma = fixed) that
-            takes the place of the control points of the export.
-        size_px: width and height of the photographs where the export does not give them.
+            replaces the control points of the export.
+        size_px: width and height of the photographs if the export does not state them.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     text = Lines.of(path)
     calibrates = CALIBRATION in text.line().lower()
@@ -135,7 +138,7 @@ def read_export(
     for where, key, row in mark_rows:
         photograph, point_name = int(key), f"{row[0]:.0f}"
         if not 0 <= photograph < len(names):
-            raise SurveyFileError(f"{where}: photograph {key}, there are 0 to {len(names) - 1}")
+            raise SurveyFileError(f"{where}: photograph {key}, expected 0 to {len(names) - 1}")
         if (photograph, point_name, *row[1:3].tolist()) in measured:  # the same row again
             continue
         measured.add((photograph, point_name, *row[1:3].tolist()))
@@ -193,7 +196,7 @@ def read_export(
 
 
 def _covariance_of(sigma: FloatArray) -> FloatArray | None:
-    """Return diagonal covariances (n, 3, 3) of standard deviations (n, 3), None where none is positive."""
+    """Return diagonal covariances (n, 3, 3) from standard deviations (n, 3); None if none is positive."""
     sigma = np.where(sigma > 0, sigma, np.nan)
     return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
 
@@ -201,11 +204,11 @@ def _covariance_of(sigma: FloatArray) -> FloatArray | None:
 def _cameras(
     inner: FloatArray, default: FloatArray, size_px: tuple[int, int], free: tuple[str, ...]
 ) -> tuple[tuple[Camera, ...], np.ndarray]:
-    """One camera per interior orientation that occurs, and which photograph has which."""
+    """Return a camera for each different interior orientation, and the camera index of each photograph."""
     kinds, index = np.unique(inner, axis=0, return_inverse=True)
     cameras = []
     for k, values in enumerate(kinds):
-        # Photographs repeat the default camera with fewer digits: three of c, xp and yp.
+        # Photographs repeat the default camera with fewer digits: c, xp and yp have three.
         if np.allclose(values, default, rtol=0, atol=0.5e-3 + 1e-9):
             values = default
         c, xp, yp, xs, ys = values[:5]
@@ -236,7 +239,7 @@ def _cameras(
 
 
 def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
-    """Rows of a control file as (where, id, X Y Z sX sY sZ)."""
+    """Return the rows of a control file as (where, id, X Y Z sX sY sZ)."""
     rows: list[tuple[str, str, FloatArray]] = []
     text = Lines.of(path)
     while (line := text.maybe_line()) is not None:
@@ -259,19 +262,19 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
 def write_export(path: Path, content: Content) -> None:
     """Write a survey as a PhotoModeler text export, with the digits of double precision.
 
-    It is one of a calibration project where a parameter of a camera is free. PhotoModeler numbers its points:
-    names that are whole numbers are kept, uncoded points get others, any other name is refused. Photographs
-    without orientation are refused, points without coordinates have image points only.
+    It is a calibration project if a parameter of a camera is free. PhotoModeler numbers its points: names
+    that are whole numbers are kept, uncoded points get other numbers, and any other name is refused.
+    Photographs without orientation are refused; points without coordinates have only image points.
 
     Raises:
-        OutputError: what the export cannot hold, or the file cannot be written.
+        OutputError: the export cannot store the survey, or the file cannot be written.
     """
     result = content.result
     network, estimate, title = result.network, result.estimate, result.name
     for camera in estimate.cameras:
         if camera.model not in MODELS or camera.value("b1") or camera.value("b2"):
             raise OutputError(
-                f"camera {camera.name}: PhotoModeler cannot hold model {camera.model} with affinity; "
+                f"camera {camera.name}: PhotoModeler cannot store model {camera.model} with affinity; "
                 "convert it to brown with b1 in the pixel size"
             )
     sizes = {camera.size_px for camera in estimate.cameras}
@@ -279,7 +282,7 @@ def write_export(path: Path, content: Content) -> None:
         raise OutputError("photographs of different sizes: the export gives one for all")
     if not estimate.oriented.all():
         i = int(np.argmin(estimate.oriented))
-        raise OutputError(f"photograph {network.images[i]} has no orientation, the export wants one")
+        raise OutputError(f"photograph {network.images[i]} has no orientation, the export requires one")
     names = _numbered(network.points)
     if any(camera.free.any() for camera in estimate.cameras):
         title = f"{title} {CALIBRATION.title()}"
@@ -319,7 +322,7 @@ def write_export(path: Path, content: Content) -> None:
 
 
 def _numbered(points: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the numbers that are names of points, and numbers above them of uncoded points."""
+    """Return the names of points that are numbers, and higher numbers for uncoded points."""
     for name in points:
         if not UNCODED.fullmatch(name) and (not name.isdecimal() or str(int(name)) != name):
             raise OutputError(f"point '{name}': PhotoModeler numbers its points")
@@ -329,7 +332,7 @@ def _numbered(points: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _sigma_of(covariance: FloatArray | None, count: int) -> FloatArray:
-    """Return standard deviations, 0 where none is known, (count, 3)."""
+    """Return standard deviations, 0 if not known, (count, 3)."""
     if covariance is None:
         return np.zeros((count, 3))
     return np.nan_to_num(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))

@@ -1,7 +1,7 @@
-"""The formats of other programs by name: which file is which, what each can hold, who reads and writes it.
+"""The formats of other programs by name: how files are recognised, what formats store, who reads and writes.
 
-To add a format: write its module beside this one, with a reader, a writer or both, and give it a row in
-FORMATS; where its files can be distinguished from others by their looks, say so in `format_of`.
+To add a format, write its module beside this one, with a reader, a writer or both, and add a row to FORMATS.
+If its files can be recognised by their content, add that to `format_of`.
 
 Source: named in the module of each format.
 """
@@ -58,31 +58,31 @@ Writer = Callable[[Path, Network, Estimate], None]
 class FileFormat:
     """A file format: its properties, its reader and its writer."""
 
-    name: str  # as --from and --to say it
-    models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras
-    read: Reader | None  # of a file or folder; None: `read_all`, or the format is written only
+    name: str  # as for --from and --to
+    models: tuple[str, ...]  # camera models that it can store, most capable first; empty: no cameras
+    read: Reader | None  # of a file or folder; None: `read_all`, or the format is write-only
     write: Writer | None  # to a new file, or into an empty folder; None: `write_all`
-    keeps: frozenset[str]  # the kinds of `content` that are the same when it is read again
+    keeps: frozenset[str]  # the kinds of `content` that are unchanged when read again
     folder: bool = False  # whether it is a folder of files
-    placed: bool = False  # whether it leaves out what has no coordinates in the object
-    lacks: tuple[str, ...] = ()  # parameters of these models that it cannot hold, others can stand in
-    frees: tuple[str, ...] = ()  # parameters that are free when it is read, where it does not say which are
-    straight: tuple[str, ...] = ()  # parameters that it cannot hold and nothing can stand in
-    one_focal: bool = False  # whether fx and fy must be the same
-    names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
-    read_all: Callable[..., Content] | None = None  # of a format that has more than `read` returns
-    write_all: Callable[[Path, Content], None] | None = None  # likewise of `write`
-    control: bool = False  # whether `read_all` takes a file of control, as keyword
+    placed: bool = False  # whether it omits what has no coordinates in the object
+    lacks: tuple[str, ...] = ()  # parameters of these models that it cannot store, but can approximate
+    frees: tuple[str, ...] = ()  # parameters that become free when read, if it does not state which are
+    straight: tuple[str, ...] = ()  # parameters that it can neither store nor approximate
+    one_focal: bool = False  # whether fx and fy must be equal
+    names: tuple[bool, bool] = (True, True)  # whether it names points and photographs; else it numbers them
+    read_all: Callable[..., Content] | None = None  # for a format with more content than `read` returns
+    write_all: Callable[[Path, Content], None] | None = None  # likewise for `write`
+    control: bool = False  # whether `read_all` accepts a control file as keyword
 
     def held(self, content: Content) -> frozenset[str]:
-        """Return the kinds that are the same when a survey is read again."""
+        """Return the kinds of content that are unchanged when a survey is read again."""
         cameras = content.result.estimate.cameras
         frees = all(set(_free(one)) in (set(), set(one.names) & set(self.frees)) for one in cameras)
         return self.keeps | {"free"} if frees else self.keeps
 
     @property
     def readable(self) -> bool:
-        """Whether it has photographs, and can be read."""
+        """Whether it has photographs and can be read."""
         return self.read is not None or self.read_all is not None
 
 
@@ -128,7 +128,7 @@ _BROWN_DISTORTION = MODELS["brown"].names[3:]
 NUMBERS = (False, False)
 _SOLVED = frozenset({"exterior orientations", "object points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
-_SIDE = _NAMED | {"free", "rigs", "moments"}  # beside a model of COLMAP
+_SIDE = _NAMED | {"free", "rigs", "moments"}  # stored beside a COLMAP model
 FORMATS = (
     FileFormat(
         *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False), _SIDE),
@@ -225,10 +225,10 @@ def format_named(name: str) -> FileFormat:
 
 
 def format_of(path: Path) -> FileFormat:
-    """Return the format of a file or folder that is there, by its content.
+    """Return the format of an existing file or folder, by its content.
 
     Raises:
-        SurveyFileError: it is not there, or nothing in it is known.
+        SurveyFileError: it does not exist, or its format is not known.
     """
     if path.is_dir():
         for file, name in (
@@ -260,7 +260,7 @@ def format_of(path: Path) -> FileFormat:
     if counts[:2] == [4, 7]:
         return format_named("bundle-csharp")
     raise SurveyFileError(
-        f"{path}, line 1: this is no format that is known, name it with --from (compare: --from-a, --from-b)"
+        f"{path}, line 1: the format is not known, name it with --from (compare: --from-a, --from-b)"
     )
 
 
@@ -271,24 +271,24 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
 
 
 def read_content(path: Path, name: str | None = None, *, control: Path | None = None) -> Content:
-    """Read all that a file or folder says.
+    """Read everything in a file or folder.
 
-    Where a format only numbers points, their names are those of uncoded points, u and the number, which are
-    never taken for the names of others.
+    If a format only numbers its points, they are read as uncoded points, named u and the number. Such names
+    are never matched with the names of other points.
 
     Args:
         path: file or folder.
-        name: of the format; found from what is there if not given.
-        control: file of the control, in place of that of a PhotoModeler export.
+        name: name of the format; None detects it.
+        control: control file that replaces the control of a PhotoModeler export.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     form = format_of(path) if name is None else format_named(name)
     if not form.readable:
-        raise SurveyFileError(f"{path}: format {form.name} has no photographs, it is written only")
+        raise SurveyFileError(f"{path}: format {form.name} has no photographs, it can only be written")
     if control is not None and not form.control:
-        raise SurveyFileError(f"{path}: format {form.name} takes no file of control, photomodeler does")
+        raise SurveyFileError(f"{path}: format {form.name} takes no control file, photomodeler does")
     refuse_links_out(path)
     if form.read_all is not None:
         return form.read_all(path, control=control) if form.control else form.read_all(path)
@@ -304,22 +304,22 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
 
 
 def _names_points(form: FileFormat, path: Path) -> bool:
-    """Return whether names of points identify them; beside a model that Kolinear has written they lie."""
+    """Return whether point names identify points; for a COLMAP model only if Kolinear's names are there."""
     return (path / SIDE_FILE).is_file() if form.name in ("colmap", "colmap-text") else form.names[0]
 
 
 def read_comparable(path: Path, name: str | None = None) -> Solution:
-    """Read whatever can be compared: tables with standard deviations, any other format without.
+    """Read a result for comparison: tables with standard deviations, any other format without.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     form = format_of(path) if name is None else format_named(name)
     if form.name == "tables":
         return read_result(path)
     if not form.readable:
         raise SurveyFileError(
-            f"{path}: format {form.name} has points only, results with photographs are compared"
+            f"{path}: format {form.name} has only points, a comparison needs results with photographs"
         )
     result = read_content(path, form.name).result
     network, estimate = result.network, result.estimate
@@ -338,10 +338,10 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
 
 
 def write_content(path: Path, name: str, content: Content) -> None:
-    """Write all of a survey that a format keeps; cameras must be in a model that it has.
+    """Write everything that a format keeps of a survey; it must have the models of the cameras.
 
     Raises:
-        KolinearError: the format cannot hold it, or it cannot be written.
+        KolinearError: the format cannot store the survey, or it cannot be written.
     """
     form = format_named(name)
     estimate = content.result.estimate
@@ -369,19 +369,19 @@ def _write(form: FileFormat, path: Path, content: Content) -> None:
 
 
 def losses_in_words(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:
-    """Return what there is of a survey and a format does not hold, a line for each kind.
+    """Return the parts of a survey that a format cannot store, a line for each kind.
 
     Args:
-        name: of the format.
-        content: of the survey.
-        gone: kinds that went since they are of cameras that were converted.
+        name: name of the format.
+        content: content of the survey.
+        gone: kinds dropped because their cameras were converted.
     """
     form = format_named(name)
     return tuple(f"{count} {kind.words}" for kind, count in losses(content, form.held(content) - gone))
 
 
 def refuse_taken(path: Path, form: FileFormat) -> None:
-    """Raise OutputError where something is in the place of what a format writes, but an empty folder."""
+    """Raise OutputError if the path of an output exists and is not an empty folder for a folder format."""
     refuse_links(path)
     empty = form.folder and path.is_dir() and not any(path.iterdir())
     if os.path.lexists(path) and not empty:
@@ -390,7 +390,7 @@ def refuse_taken(path: Path, form: FileFormat) -> None:
 
 
 def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
-    """Raise KolinearError for the first camera that a format cannot hold."""
+    """Raise KolinearError for the first camera that a format cannot store."""
     for camera in cameras if form.models else ():
         if camera.model not in form.models:
             raise KolinearError(
@@ -405,13 +405,13 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
         if left:
             remedy = "; --undistort corrects the image points for it" if form.straight else ""
             raise KolinearError(
-                f"camera {camera.name}: format {form.name} cannot hold {', '.join(left)} of "
+                f"camera {camera.name}: format {form.name} cannot store {', '.join(left)} of "
                 f"{camera.model}{remedy}"
             )
 
 
 def written(name: str, network: Network, estimate: Estimate) -> str:
-    """Return in words what of a network a format keeps."""
+    """Return in words which part of a network a format keeps."""
     form = format_named(name)
     if not form.models:
         return counted(int(estimate.determined.sum()), "point")

@@ -1,7 +1,7 @@
-"""A survey's result as CSV tables, and the targets measured in its photographs.
+"""A survey result as CSV tables, and the targets measured in its photographs.
 
-These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are passed over.
-Sizes and pixels missing from a summary are taken from the COLMAP model in the folder `colmap`.
+These are the tables that `kolinear run` writes, see `sfm.files.result_tables`; other columns are ignored.
+Sizes and pixels missing in a summary are taken from the COLMAP model in the folder `colmap`.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
 def read_result(folder: Path) -> Solution:
-    """Read the tables of a result, rejected image points left out.
+    """Read the tables of a result, without rejected image points.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     refuse_links_out(folder, COLMAP_SIDE_FILE)
     summary = _summary(folder / "summary.json")
@@ -82,18 +82,18 @@ def read_result(folder: Path) -> Solution:
 
 
 def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, BoolArray, FloatArray]:
-    """Read all image points of a result, rejected ones included.
+    """Read all image points of a result, including rejected ones.
 
     Args:
-        folder: of the result.
-        network: what `read_result` has read of it.
+        folder: folder of the result.
+        network: network of the result from `read_result`.
 
     Returns:
-        The k image points, which of them were rejected, and Baarda's w of both coordinates (k, 2), NaN where
-        there is no reliability.csv.
+        The k image points, which of them were rejected, and Baarda's w of both coordinates (k, 2), NaN
+        without reliability.csv.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     seen, rejected = _image_points(folder, network.images, network.points)
     path = folder / tables.RELIABILITY.file
@@ -107,13 +107,13 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
 
 
 def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
-    """Read what gave a result its scale, from given.csv.
+    """Read which given values scaled a result, from given.csv.
 
     Args:
-        folder: of the result.
+        folder: folder of the result.
 
     Returns:
-        "start - end" of its scale bars, None without a given.csv, and the names of its control points.
+        "start - end" of its scale bars, None without given.csv, and the names of its control points.
 
     Raises:
         SurveyFileError: the table is damaged.
@@ -132,19 +132,19 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
 
 
 def write_tables(folder: Path, result: Solution) -> None:
-    """Write a result as `write_content` does."""
+    """Write a result like `write_content`."""
     write_content(folder, Content(result))
 
 
 def write_content(folder: Path, content: Content) -> None:
-    """Write a result as tables with named columns; standard deviations only where any is known.
+    """Write a result as tables with named columns; standard deviations only if any is known.
 
     Args:
-        folder: made if it is not there.
-        content: complete; whoever wants the folder whole or not at all gives one of `sfm.files.whole_files`.
+        folder: created if it does not exist.
+        content: complete; for a folder written whole or not at all, pass one of `sfm.files.whole_files`.
 
     Raises:
-        OutputError: a photograph or point has no place in the object, or the folder cannot be written.
+        OutputError: a photograph or point has no coordinates, or the folder cannot be written.
     """
     result = content.result
     network, estimate = result.network, result.estimate
@@ -153,7 +153,7 @@ def write_content(folder: Path, content: Content) -> None:
         (network.points, estimate.determined, "point"),
     ):
         for k in np.flatnonzero(~placed)[:1]:
-            raise OutputError(f"{folder}: {kind} {names[k]} has no coordinates, tables want them of all")
+            raise OutputError(f"{folder}: {kind} {names[k]} has no coordinates, which tables require of all")
     seen = joined_image_points(network.image_points, content.rejected)
     summary: dict[str, Any] = {
         "survey": result.name,
@@ -188,7 +188,7 @@ def write_content(folder: Path, content: Content) -> None:
 
 
 def joined_image_points(first: ImagePoints, second: ImagePoints) -> ImagePoints:
-    """Return the image points of both, those of the first before the others."""
+    """Return the image points of two sets, the first set first."""
     if not len(second):
         return first
     stated = [np.ones(len(one), dtype=bool) if one.stated is None else one.stated for one in (first, second)]
@@ -202,10 +202,10 @@ def joined_image_points(first: ImagePoints, second: ImagePoints) -> ImagePoints:
 
 
 def read_content(folder: Path) -> Content:
-    """Read the tables of a result with all that was given, rejected and estimated.
+    """Read the tables of a result, with everything given, rejected and estimated.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     result = read_result(folder)
     network = result.network
@@ -247,10 +247,10 @@ def _first_of(folder: Path, cameras: tuple[Camera, ...], owner: str, parameter: 
 
 
 def _with_shared(result: Solution) -> tuple[Camera, ...]:
-    """Return the cameras, those of single photographs with what they share with one another.
+    """Return the cameras, with the parameters shared by cameras of single photographs marked as shared.
 
-    They are called as a survey with `per_photograph` calls them, by camera and photograph, and what they
-    share has one value.
+    A survey with `per_photograph` names such cameras by camera and photograph, and their shared parameters
+    have equal values.
     """
     network, cameras = result.network, result.estimate.cameras
     base: dict[str, list[int]] = {}
@@ -274,17 +274,17 @@ def _with_shared(result: Solution) -> tuple[Camera, ...]:
 
 
 class _CameraEntry(Json):
-    """A camera as the summary names it."""
+    """A camera in the summary."""
 
     name: Name
     model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
     size_px: tuple[Side, Side] | None = None
     pixel_mm: tuple[Pixel, Pixel] | None = None
-    free: tuple[Name, ...] | None = None  # else those that have a sigma
+    free: tuple[Name, ...] | None = None  # None: the parameters with a sigma
 
 
 class _DatumEntry(Json):
-    """The datum as the summary names it."""
+    """The datum in the summary."""
 
     kind: Literal["free", "minimal", "control", ""]
 
@@ -300,7 +300,7 @@ class _Summary(Json):
 
 
 def _summary(path: Path) -> _Summary:
-    """Read the summary, in which no camera may occur twice."""
+    """Read the summary, which must not contain a camera twice."""
     summary = read_json(path, _Summary, "the summary of a result")
     names = [camera.name for camera in summary.cameras]
     for name, count in Counter(names).items():
@@ -310,7 +310,7 @@ def _summary(path: Path) -> _Summary:
 
 
 def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
-    """Cameras in the order of the summary, and the sigmas of their parameters."""
+    """Return the cameras in the order of the summary, and the sigmas of their parameters."""
     table = tables.CAMERAS.read(folder)
     values, sigma = table.values[:, 0], table.values[:, 1:]
     table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
@@ -342,7 +342,7 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
 def _size(
     folder: Path, entry: _CameraEntry, beside: tuple[NamedCamera, ...]
 ) -> tuple[tuple[int, int], FloatArray]:
-    """Size and pixel of a camera, from the summary or else from that of the COLMAP model beside it."""
+    """Return size and pixel of a camera, from the summary or else from the COLMAP model beside it."""
     size, pixel = entry.size_px, entry.pixel_mm
     if beside and (size is None or pixel is None):
         size, pixel = beside[0].size_px, beside[0].pixel_mm
@@ -377,20 +377,20 @@ def _image_points(
 
 
 def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:
-    """Diagonal covariances (n, 3, 3) of columns sX, sY, sZ; None where no row has any."""
+    """Return diagonal covariances (n, 3, 3) from columns sX, sY, sZ; None if all are empty."""
     table.refuse(sigma, sigma < 0, SIGMAS, "0 or more, or nothing")
     return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
 
 
 def read_targets(folder: Path, network: Network) -> SeenTargets | None:
-    """Read the targets and rejected candidates of a result; None where it has no such table.
+    """Read the targets and rejected candidates of a result; None if it has no such table.
 
     Args:
-        folder: of the result.
-        network: what `read_result` has read of it.
+        folder: folder of the result.
+        network: network of the result from `read_result`.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     path = folder / TARGETS.file
     if not path.is_file():

@@ -1,20 +1,20 @@
-"""Calibrated rigs as other programs read them: a folder with files of each, with rectification.
+"""Calibrated rigs for other programs: a folder with the files of each program, including rectification.
 
     opencv-LEFT-RIGHT.yml        of each camera with the reference of its rig, for cv2.FileStorage: width,
                                  height (px), K1, D1, K2, D2, R, T, E, F, rectification R1, R2, P1, P2, Q
     dice-LEFT-RIGHT.xml          the same pairs, camera system of DICe
-    matchid-LEFT-RIGHT.caldat    the same pairs for MatchID, in mm; where the unit of length is known
+    matchid-LEFT-RIGHT.caldat    the same pairs for MatchID, in mm; if the unit of length is known
     rig_config.json              COLMAP's rig configuration, of all rigs
     kalibr-RIG.yaml              camera chain of Kalibr
     ros-CAMERA.yaml              camera_info of ROS; of a rig of two cameras with rectification
-    mrcal-CAMERA.cameramodel     of mrcal
+    mrcal-CAMERA.cameramodel     camera model of mrcal
 
-Camera axes are x right, y down, z forward, pixels count from the centre of the top-left one (COLMAP: from its
-corner). Lengths are in the unit of the result; in metres, where it is known, for Kalibr, ROS and mrcal.
+Camera axes are x right, y down, z forward. Pixels count from the centre of the top-left pixel (COLMAP: from
+its corner). Lengths are in the unit of the result; for Kalibr, ROS and mrcal in metres if the unit is known.
 
-Rectification of a pair of cameras as OpenCV does it: a common image plane, rows as epipolar lines. Each
-camera is turned by half of their relative rotation and then so that the base is along rows (or columns);
-focal length and principal point, the same in both, show in both as much as is without empty borders.
+Rectification follows OpenCV: a common image plane with rows as epipolar lines. Each camera is rotated by half
+of their relative rotation, and then so that the base is along rows (or columns). Focal length and principal
+point are the same in both, and show as much as is possible without empty borders.
 
 Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
 documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; pyvale 2026.10, its
@@ -46,7 +46,7 @@ from sfm.errors import OutputError
 from sfm.files.open_folders import disk_errors
 from sfm.network import Mounts, Network
 
-GRID = 9  # points along each side of a photograph
+GRID = 9  # grid points along each side of a photograph
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,11 @@ class _Mounted:
 
     @property
     def pose(self) -> FloatArray:
-        """The same as one matrix, (4, 4)."""
+        """The pose as one matrix, (4, 4)."""
         return np.block([[self.R, self.T[:, None]], [np.array([[0.0, 0.0, 0.0, 1.0]])]])
 
     def scaled(self, factor: float) -> _Mounted:
-        """Return the same with lengths in another unit."""
+        """Return the camera with lengths in another unit."""
         return _Mounted(self.camera, self.R, factor * self.T)
 
 
@@ -71,12 +71,12 @@ def write_rig_files(folder: Path, content: Content) -> None:
     """Write the rigs of a result, with cameras in model opencv, into a folder.
 
     Raises:
-        OutputError: there are none, or two of their names make one name of a file.
+        OutputError: the result has no rigs, or two names give the same file name.
     """
     result = content.result
     network, mounts = result.network, result.estimate.mounts
     if mounts is None or not any(mounts.rig):
-        raise OutputError(f"{folder}: the result has no rigs, which format rig is of; see [[rig]]")
+        raise OutputError(f"{folder}: the result has no rigs, which format rig requires; see [[rig]]")
     unit, metres = result.unit or "unknown units", METRES.get(result.unit)
     in_metres = "m" if metres else unit
     configs, files = [], {}
@@ -90,7 +90,7 @@ def write_rig_files(folder: Path, content: Content) -> None:
     for rig, on in mounts.by_rig().items():
         cameras = [_mounted(result.estimate.cameras[a], mounts, a) for a in on]
         if len(on) < 2:
-            raise OutputError(f"{folder}: rig {rig} has one camera, needed 2 at least")
+            raise OutputError(f"{folder}: rig {rig} has one camera, needed at least 2")
         configs.append(_colmap(cameras, _prefixes(network, on, [one.camera.name for one in cameras])))
         for one in cameras[1:]:
             pair = f"{cameras[0].camera.name}-{one.camera.name}"
@@ -127,7 +127,7 @@ def _distortion(camera: Camera) -> list[float]:
 
 
 def _numbers(values: FloatArray | Sequence[float]) -> str:
-    """Return numbers with all digits, and a point in each: 1e-5 is a word in YAML 1.1."""
+    """Write numbers with all digits and a decimal point each, since 1e-5 is a word in YAML 1.1."""
     texts = [repr(float(value)) for value in np.ravel(values)]
     return ", ".join(text if "." in text else text.replace("e", ".0e") for text in texts)
 
@@ -147,7 +147,7 @@ def _opencv(first: Camera, one: _Mounted, unit: str) -> Iterator[str]:
     yield f"camera2: {json.dumps(second.name, ensure_ascii=False)}"
     yield from (f"width: {first.size_px[0]}", f"height: {first.size_px[1]}")
     if rectified is None:
-        yield "# no rectification: the cameras look in too different directions for a common image plane"
+        yield "# no rectification: the viewing directions differ too much for a common image plane"
     else:
         matrices |= rectified._asdict()
     for name, M in matrices.items():
@@ -157,7 +157,7 @@ def _opencv(first: Camera, one: _Mounted, unit: str) -> Iterator[str]:
 
 
 def _dice(pair: list[_Mounted], unit: str) -> Iterator[str]:
-    """Yield the lines of a system of two cameras, the second after the first."""
+    """Yield the lines of a system of two cameras, the second relative to the first."""
 
     def entry(name: str, kind: str, value: object) -> str:
         return f'<Parameter name="{name}" type="{kind}" value={quoteattr(str(value))} />'
@@ -198,7 +198,7 @@ def _matchid(pair: list[_Mounted]) -> Iterator[str]:
 
 
 def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict[str, Any]]]:
-    """Return a rig as COLMAP's configuration has it."""
+    """Return a rig in COLMAP's configuration."""
     entries: list[dict[str, Any]] = []
     for k, (one, prefix) in enumerate(zip(cameras, prefixes, strict=True)):
         entry: dict[str, Any] = {"image_prefix": prefix}
@@ -217,11 +217,11 @@ def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict
 
 
 def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
-    """Return how the names of the photographs of each camera begin, before what those of a moment share.
+    """Return the start of the photograph names of each camera, before the part shared within a moment.
 
-    Where names do not begin so, the photographs are expected in folders named like the cameras.
+    If the names have no such start, the photographs are expected in folders named like the cameras.
     """
-    folders = [re.sub(r"[^\w.\- ]+", "_", name) + "/" for name in names]  # blocks have globs in them
+    folders = [re.sub(r"[^\w.\- ]+", "_", name) + "/" for name in names]  # names may contain glob patterns
     if network.moment is None:
         return folders
     moments: dict[int, dict[int, str]] = defaultdict(dict)
@@ -233,7 +233,7 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
         if len(together) > 1:
             same = zip(*(name[::-1] for name in together.values()), strict=False)
             end = "".join(c[0] for c in takewhile(lambda c: len(set(c)) == 1, same))[::-1]
-            end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # after the word that it begins in
+            end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # from the end of the word in which it begins
             for a, name in together.items():
                 found[a].add(name.removesuffix(end))
     if any(len(one) != 1 for one in found.values()):
@@ -246,7 +246,7 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
 
 
 def _kalibr(cameras: list[_Mounted], unit: str) -> Iterator[str]:
-    """Yield the lines of a camera chain, each camera after the one before."""
+    """Yield the lines of a camera chain, each camera relative to the one before."""
     yield f"# translations are in {unit}"
     for k, one in enumerate(cameras):
         camera, K = one.camera, _matrix(one.camera)
@@ -265,7 +265,7 @@ def _kalibr(cameras: list[_Mounted], unit: str) -> Iterator[str]:
 
 
 def _ros(cameras: list[_Mounted], k: int, unit: str) -> Iterator[str]:
-    """Yield the lines of the camera_info of a camera; rectified where the rig is a stereo pair."""
+    """Yield the lines of the camera_info of a camera, rectified if the rig is a stereo pair."""
     camera, K = cameras[k].camera, _matrix(cameras[k].camera)
     R, P = np.eye(3), np.hstack([K, np.zeros((3, 1))])
     pair = (
@@ -290,7 +290,7 @@ def _ros(cameras: list[_Mounted], k: int, unit: str) -> Iterator[str]:
 
 
 def _mrcal(one: _Mounted, unit: str) -> Iterator[str]:
-    """Yield the lines of a camera model; the reference coordinates are those of the reference camera."""
+    """Yield the lines of a camera model, in the coordinates of the reference camera."""
     K, pose = _matrix(one.camera), _numbers([*Rotation.from_matrix(one.R).as_rotvec(), *one.T])
     intrinsics = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_distortion(one.camera)])
     yield f"# {json.dumps(one.camera.name)}, translations are in {unit}"
@@ -301,7 +301,7 @@ def _mrcal(one: _Mounted, unit: str) -> Iterator[str]:
 
 
 class Rectification(NamedTuple):
-    """Rotations into the rectified cameras, their projections (px) and disparity to depth, as in OpenCV."""
+    """Rotations to the rectified cameras, their projections (px), and disparity to depth, as in OpenCV."""
 
     R1: FloatArray  # (3, 3)
     R2: FloatArray
@@ -314,13 +314,13 @@ def rectify(first: Camera, second: Camera, R: FloatArray, T: FloatArray) -> Rect
     """Return the rectification of two cameras to the size of the first one.
 
     Args:
-        first: the first camera, with x1 in its axes.
-        second: the other, with x2.
+        first: the first camera, whose axes are those of x1.
+        second: the second camera, whose axes are those of x2.
         R: rotation of x2 = R x1 + T, axes x right, y down, z forward, (3, 3).
         T: its translation, any unit, (3,).
 
     Returns:
-        The rectification, None where a photograph would reach behind the common image plane.
+        The rectification; None if a photograph would reach behind the common image plane.
     """
     half = rotation_from_vector(-0.5 * np.asarray(Rotation.from_matrix(R).as_rotvec()))
     t = half @ T
@@ -349,7 +349,7 @@ def rectify(first: Camera, second: Camera, R: FloatArray, T: FloatArray) -> Rect
         grid = _rectified(camera, rotation, GRID)
         if grid is None:
             return None
-        least = f * np.array([grid[:, 0, 0].max(), grid[0, :, 1].max()])  # of the largest box inside, from c
+        least = f * np.array([grid[:, 0, 0].max(), grid[0, :, 1].max()])  # of the largest inner box, from c
         most = f * np.array([grid[:, -1, 0].min(), grid[-1, :, 1].min()])
         if not ((least < 0) & (most > 0)).all():
             return None
@@ -365,7 +365,7 @@ def rectify(first: Camera, second: Camera, R: FloatArray, T: FloatArray) -> Rect
 
 
 def _rectified(camera: Camera, rotation: FloatArray, count: int) -> FloatArray | None:
-    """Return x/z and y/z of a grid over a photograph after a rotation, None if one is behind, (n, n, 2)."""
+    """Return x/z and y/z of a grid on a photograph after a rotation, (n, n, 2); None if any is behind."""
     x, y = (np.linspace(0.0, side - 1.0, count) for side in camera.size_px)
     uv = tangents_from_pixel(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     rays = np.column_stack([uv[:, 0], -uv[:, 1], np.ones(len(uv))]) @ rotation.T

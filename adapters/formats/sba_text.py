@@ -2,11 +2,11 @@
 
     cameras   one a line: [fu u0 v0 ar s] qw qx qy qz tx ty tz, x = K [R|t] X, y down
     points    one a line: X Y Z n (frame x y [covariance, 4 numbers])*n, frames from 0
-    calib     the 3 x 3 matrix K; not needed where the cameras have the five parameters
+    calib     the 3 x 3 matrix K; not needed if the cameras have the five parameters
     sigmas    optional: sigma_x sigma_y (px) of each projection, in the order of the points file
 
-They lie side by side and are found by their names: *cams*.txt, *pts*.txt, calib.txt, *sigmas*.txt.
-sba says nothing of where a pixel has its origin; its coordinates are taken as they are.
+The files are in one folder and found by their names: *cams*.txt, *pts*.txt, calib.txt, *sigmas*.txt. sba does
+not state the origin of its pixel coordinates; they are used unchanged.
 
 Source: M. Lourakis and A. Argyros (2009), ACM TOMS 36(1), and the README of sba 1.6.
 """
@@ -26,11 +26,11 @@ from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 
-AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ours
+AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in Kolinear's
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
 PLAIN, WITH_COVARIANCE = 3, 7  # numbers of a projection
-MIN_QUATERNION = 1e-6  # length; unit quaternions are due
-SIGMA_PX = 1.0  # of projections that come without
+MIN_QUATERNION = 1e-6  # minimum length; quaternions should have unit length
+SIGMA_PX = 1.0  # of projections without a standard deviation
 
 
 def read_sba_text(
@@ -38,12 +38,12 @@ def read_sba_text(
 ) -> tuple[Network, Estimate]:
     """Read a bundle adjustment problem of sba as a network and its start values.
 
-    All cameras are calibrated (nothing of their interior orientation is free); those with the same five
-    parameters are one camera, in model `opencv` without distortion. Without sigmas or covariances an
+    All cameras are calibrated: nothing of their interior orientation is free. Lines with the same five
+    parameters become one camera, in model `opencv` without distortion. Without sigmas or covariances an
     image coordinate has a standard deviation of 1 px.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: with file and line number.
     """
     rows = list(_rows(cameras, MAX_PHOTOGRAPHS))
     for number, values in rows:
@@ -86,18 +86,18 @@ def read_sba_text(
 
 
 def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Estimate) -> None:
-    """Write a network as sba's two files, cameras with their parameters, projections with covariances.
+    """Write a network as sba's two files: cameras with their parameters, projections with covariances.
 
     Names of photographs and points are lost.
 
     Raises:
-        OutputError: what the files have no place for, or they cannot be written.
+        OutputError: the files cannot store the network, or they cannot be written.
     """
     for camera in estimate.cameras:
         if camera.model != "opencv" or camera.parameters[4:].any():
             raise OutputError(f"camera {camera.name}: sba's files have no place for distortion")
     if not (estimate.oriented.all() and estimate.determined.all()):
-        raise OutputError("sba's files want start values of all photographs and points")
+        raise OutputError("sba's files require start values of all photographs and points")
     rotation = AXES @ np.swapaxes(estimate.rotation, 1, 2)
     translation = -np.einsum("mab,mb->ma", rotation, estimate.position)
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
@@ -120,20 +120,20 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
 
 
 def sba_files(path: Path) -> tuple[Path, Path, Path | None, Path | None]:
-    """Return the files of cameras, points, calibration and sigmas, the last two None where there are none.
+    """Return the files of cameras, points, calibration and sigmas; the last two are None if missing.
 
     Args:
-        path: the file of the cameras, or the folder of a single problem.
+        path: file of the cameras, or folder of a single problem.
 
     Raises:
-        SurveyFileError: none or several problems are there, or the points are missing.
+        SurveyFileError: the folder has no problem or several, or the points are missing.
     """
     cameras = path
     if path.is_dir():
         found = sorted(path.glob("*cams*.txt"))
         if len(found) != 1:
             names = ", ".join(file.name for file in found) or "none"
-            raise SurveyFileError(f"{path}: one file *cams*.txt is needed, there are: {names}")
+            raise SurveyFileError(f"{path}: needed one file *cams*.txt, found: {names}")
         cameras = found[0]
     points = cameras.with_name(cameras.name.replace("cams", "pts"))
     if "cams" not in cameras.name or not points.is_file():
@@ -144,7 +144,7 @@ def sba_files(path: Path) -> tuple[Path, Path, Path | None, Path | None]:
 
 
 def _numbers(*values: float) -> str:
-    """Write numbers so that they are read back to the last bit."""
+    """Write numbers that are read back to the last bit."""
     return " ".join(repr(float(value)) for value in values)
 
 
@@ -246,7 +246,7 @@ def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
 
 
 def _rows(path: Path, most: int = MAX_LINES) -> Iterator[tuple[int, list[float]]]:
-    """Yield line number and numbers of each line that has any, one at least; # starts a comment."""
+    """Yield line number and numbers of each nonempty line, of which there must be one; # starts a comment."""
     text, count = Lines.of(path), 0
     while (words := text.row()) is not None:
         count += 1

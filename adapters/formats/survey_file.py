@@ -1,4 +1,4 @@
-"""The survey file of a converted network: its tables adjusted again as they are, with its control.
+"""The survey file of a converted network, with which its tables and control can be adjusted again.
 
     survey.toml     unit, cameras, rigs, image points, approximate values, scale bars, datum
     control.csv     control and check points, see `given_table`
@@ -30,11 +30,11 @@ EXTERIOR_SIGMAS = ("sX", "sY", "sZ", "somega_deg", "sphi_deg", "skappa_deg")
 
 
 def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
-    """Write the survey file of tables that are in a folder, and what was given beside it.
+    """Write the survey file for the tables in a folder, and the tables of given values.
 
     Args:
-        folder: that the tables are in.
-        content: of the survey; its control defines the datum where it is enough for that and no other datum
+        folder: folder of the tables.
+        content: content of the survey; its control defines the datum if it is sufficient and no other datum
             is known.
         title: name of the survey.
     """
@@ -66,7 +66,7 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
         ends = [_text(network.points[j]) for j in (start, end)]
         lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
         lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}", ""]
-    if len(content.rejected):  # they stand among the image points, and are found again
+    if len(content.rejected):  # they are among the image points, and will be detected again
         lines += ["[adjust]", 'reject = "tau"', ""]
     kind = result.datum or ("control" if len(control.complete) >= MIN_CONTROL else "free")
     lines += ["[datum]", f'kind = "{kind}"']
@@ -74,7 +74,7 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
 
 
 def _rigs(folder: Path, network: Network, estimate: Estimate) -> list[str]:
-    """Return the sections of rigs; writes the mounts that are held fixed. Moments are in moments.csv."""
+    """Return the sections of rigs, and write the mounts that are held fixed; moments are in moments.csv."""
     mounts, lines = estimate.mounts, list[str]()
     if mounts is None or network.moment is None:
         return []
@@ -97,9 +97,9 @@ def _rigs(folder: Path, network: Network, estimate: Estimate) -> list[str]:
 
 
 def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, list[str], tuple[str, ...]]]:
-    """Yield cameras, their photographs and the parameters that vary from photograph to photograph.
+    """Yield cameras, their photographs, and the parameters that vary between photographs.
 
-    Cameras that share parameters and are of one photograph each are one camera.
+    Cameras that share parameters and took one photograph each become one camera.
     """
     images = [
         [name for name, a in zip(network.images, network.camera, strict=True) if a == k]
@@ -133,7 +133,7 @@ def _weighted(network: Network, estimate: Estimate, camera: Camera) -> dict[str,
 
 
 def _exterior(network: Network) -> str:
-    """Return the table of observed exterior orientations, empty cells where nothing was observed."""
+    """Return the table of observed exterior orientations, with empty cells for unobserved values."""
     seen, rows = network.exterior, []
     factor = np.repeat([1.0, np.degrees(1.0)], 3)
     for i, position, angles, C in zip(seen.image, seen.position, seen.angles, seen.covariance, strict=True):
@@ -175,5 +175,5 @@ def _camera(
 
 
 def _text(value: str) -> str:
-    """Return a string as TOML writes it, which is as JSON does."""
+    """Return a string in TOML syntax, which for strings is that of JSON."""
     return json.dumps(value)

@@ -1,1 +1,1 @@
-"""Reading text, JSON and XML as untrusted: line by line, bounded, whatever is wrong named with its place."""
+"""Reading of untrusted text and XML: line by line, within limits, with the location of every error."""

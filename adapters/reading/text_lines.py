@@ -1,4 +1,4 @@
-"""Reading text files line by line, so that whatever is wrong is named with file and line."""
+"""Reading of text files line by line, so that every error names file and line."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import whole_file
 
-MAX_LINES = 2 * MAX_ROWS  # as of tables
-MAX_LINE = 10_000_000  # characters; the image points of a photograph can be on one
-MAX_DIGITS = 20  # of a whole number; COLMAP's largest have as many
+MAX_LINES = 2 * MAX_ROWS  # as for tables
+MAX_LINE = 10_000_000  # characters; the image points of a photograph can be on one line
+MAX_DIGITS = 20  # of a whole number, as many as COLMAP's largest
 MAX_PHOTOGRAPHS = 100_000
-MAX_POINTS = 5_000_000  # of which a name is kept
-MAX_IMAGE_POINTS = 20_000_000  # some 100 to 200 bytes each
-MAX_BLOCK_LINES = 2_000_000  # that are kept one by one, some 0.5 GB
+MAX_POINTS = 5_000_000  # points whose names are kept
+MAX_IMAGE_POINTS = 20_000_000  # about 100 to 200 bytes each
+MAX_BLOCK_LINES = 2_000_000  # lines kept one by one, about 0.5 GB
 
 
 @dataclass
 class Lines:
-    """The lines of a file, read one after the other."""
+    """The lines of a file, read one after another."""
 
     path: Path
     size: int  # bytes
     source: Iterator[str]
-    number: int = 0  # of the line read last, from 1
-    current: str = ""  # the line read last
-    ended: bool = True  # whether that line has its end
-    again: bool = False  # whether that line is the next one, too
+    number: int = 0  # of the last line read, from 1
+    current: str = ""  # the last line read
+    ended: bool = True  # whether that line has a line end
+    again: bool = False  # whether that line is also the next one
 
     @classmethod
     def of(cls, path: Path) -> Lines:
-        """Open a file of bearable size.
+        """Open a file of permitted size.
 
         Raises:
-            SurveyFileError: it is none.
+            SurveyFileError: the file cannot be read or is too large.
         """
         try:
             if path.exists() and not path.is_file():  # reading a pipe would never end
@@ -56,15 +56,15 @@ class Lines:
 
     @property
     def where(self) -> str:
-        """File and number of the line read last."""
+        """File and number of the last line read."""
         return f"{self.path}, line {self.number}"
 
     def error(self, message: str) -> SurveyFileError:
-        """Return the error of the line read last."""
+        """Return an error at the last line read."""
         return SurveyFileError(f"{self.where}: {message}")
 
     def maybe_line(self) -> str | None:
-        """Return the next line, None at the end."""
+        """Return the next line; None at the end."""
         if self.again:
             self.again = False
         else:
@@ -77,7 +77,7 @@ class Lines:
         return self.current
 
     def line(self) -> str:
-        """Return the next line, which must be there.
+        """Return the next line, which must exist.
 
         Raises:
             SurveyFileError: the file ends here.
@@ -89,11 +89,11 @@ class Lines:
         return line
 
     def read_again(self) -> None:
-        """Make the line read last the next one."""
+        """Make the last line read the next one."""
         self.number, self.again = self.number - 1, True
 
     def row(self) -> list[str] | None:
-        """Return the words of the next line that is neither empty nor a # comment, None at the end."""
+        """Return the words of the next line that is not empty or a # comment; None at the end."""
         while (line := self.maybe_line()) is not None:
             words = line.split("#")[0].split()
             if words:
@@ -101,7 +101,7 @@ class Lines:
         return None
 
     def due_row(self, what: str) -> list[str]:
-        """Return the words of the next row, which must be there.
+        """Return the words of the next row, which must exist.
 
         Raises:
             SurveyFileError: the file ends here.
@@ -123,10 +123,10 @@ class Lines:
             raise self.error(f"'{shown(' '.join(words))}' after the end of the data")
 
     def number_of(self, text: str) -> float:
-        """Return a finite number of bearable size.
+        """Return a finite number of permitted size.
 
         Raises:
-            SurveyFileError: no number, not finite or too large.
+            SurveyFileError: not a number, not finite or too large.
         """
         try:
             value = float(text) if text.isascii() and "_" not in text else np.nan
@@ -142,7 +142,7 @@ class Lines:
         """Return a whole number within bounds.
 
         Raises:
-            SurveyFileError: no whole number within the bounds.
+            SurveyFileError: not a whole number within the bounds.
         """
         digits = text.removeprefix("-")
         sound = digits.isascii() and digits.isdecimal() and len(digits) <= MAX_DIGITS
@@ -165,23 +165,23 @@ class Lines:
         return self.whole_of(text, 0, count - 1, what)
 
     def count_of(self, text: str, what: str, most: int = MAX_LINES) -> int:
-        """Return a number of things, 1 or more, that a file can have room for."""
+        """Return a count of at least 1, limited by what a file can contain."""
         return self.whole_of(text, 1, most, f"the number of {what}")
 
     def refuse_more(self, count: int, most: int, what: str) -> None:
-        """Raise the error of the line read last if there are more of something than are read.
+        """Raise an error at the last line read if a count exceeds its limit.
 
         Raises:
-            SurveyFileError: there are more.
+            SurveyFileError: the count is too large.
         """
         if count > most:
             raise self.error(f"more than {most} {what}, no more are read")
 
     def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
-        """Return a line of numbers, the first of which is that of the photograph if given.
+        """Return a line of numbers, the first of which must be the number of the photograph if given.
 
         Raises:
-            SurveyFileError: another number of numbers, or of another photograph.
+            SurveyFileError: a wrong count of numbers, or a line of another photograph.
         """
         parts = self.line().split()
         if not fewest <= len(parts) <= most:
@@ -194,7 +194,7 @@ class Lines:
         return np.array([self.number_of(part) for part in parts])
 
     def block(self, count: int) -> list[tuple[str, str, FloatArray]]:
-        """Return lines of so many numbers up to an empty one, as (where, first, others)."""
+        """Return lines of `count` numbers up to an empty line, as (where, first, others)."""
         rows: list[tuple[str, str, FloatArray]] = []
         while self.line().strip():
             self.read_again()
@@ -205,7 +205,7 @@ class Lines:
 
 
 def _lines_of(path: Path) -> Iterator[str]:
-    """Yield the lines of a file with their ends, none longer and not more than are read."""
+    """Yield the lines of a file with their ends, within the limits of length and number."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             for number in range(1, MAX_LINES + 2):

@@ -1,7 +1,7 @@
-"""XML read into nodes that remember their line, so that whatever is wrong is named with file and line.
+"""XML read into nodes that know their line, so that every error names file and line.
 
-Elements that come in millions are handed over one by one while the file is read, and are not kept; the rest
-is kept as long as it needs no more memory than a limit.
+Elements that occur in millions are passed on one by one while the file is read, and are not kept. All others
+are kept within a limit of memory.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shown
 
 MAX_XML_BYTES = 4_000_000_000
-MAX_KEPT_BYTES = 1_000_000_000  # of memory; 100,000 cameras with all that is exported of them take half of it
-NODE_BYTES, ATTRIBUTE_BYTES = 400, 60  # of memory, without letters
+MAX_KEPT_BYTES = 1_000_000_000  # of memory; an export with 100,000 cameras takes half of it
+NODE_BYTES, ATTRIBUTE_BYTES = 400, 60  # of memory, without characters
 MAX_TEXT = 10_000_000  # characters of an element
-MAX_DEPTH = 100  # of elements in one another; exports have about ten
+MAX_DEPTH = 100  # of nested elements; exports have about ten
 MAX_ATTRIBUTES = 100  # of an element
-MAX_TAG_BYTES = 1_000_000  # of what expat can only read whole
+MAX_TAG_BYTES = 1_000_000  # of a tag or comment, which expat must hold whole
 PIECE_BYTES = 2**18
 
 
@@ -41,19 +41,19 @@ class Node:
     children: list[Node] = field(default_factory=list)
 
     def error(self, message: str) -> SurveyFileError:
-        """Return the error of this element."""
+        """Return an error at this element."""
         return SurveyFileError(f"{self.path}, line {self.line}: {message}")
 
     def all(self, tag: str) -> list[Node]:
-        """Return the children of that name."""
+        """Return the children with a tag."""
         return [child for child in self.children if child.tag == tag]
 
     def maybe(self, tag: str) -> Node | None:
-        """Return the first child of that name, None if there is none."""
+        """Return the first child with a tag; None if there is none."""
         return next(iter(self.all(tag)), None)
 
     def one(self, tag: str) -> Node:
-        """Return the first child of that name, which must be there.
+        """Return the first child with a tag, which must exist.
 
         Raises:
             SurveyFileError: there is none.
@@ -64,7 +64,7 @@ class Node:
         return found
 
     def attribute(self, name: str) -> str:
-        """Return an attribute, which must be there.
+        """Return an attribute, which must exist.
 
         Raises:
             SurveyFileError: there is none.
@@ -89,10 +89,10 @@ class Node:
         return self._number(self.attribute(name))
 
     def numbers(self, count: int) -> FloatArray:
-        """Return the text, which must be so many finite numbers.
+        """Return the text, which must consist of a given count of finite numbers.
 
         Raises:
-            SurveyFileError: another number of them, or not finite.
+            SurveyFileError: another count of numbers, or a number that is not finite.
         """
         words = self.text.split(maxsplit=count)
         if len(words) != count:
@@ -115,7 +115,7 @@ class Node:
         """Return an attribute that is the side of a photograph, px.
 
         Raises:
-            SurveyFileError: not a whole number of pixels that a photograph can have.
+            SurveyFileError: not a possible number of pixels.
         """
         value = self.number(name)
         if not (1 <= value <= MAX_SIDE_PX and value == int(value)):
@@ -131,12 +131,11 @@ def read_xml(path: Path, taken: Taken | None = None) -> Node:
 
     Args:
         path: the file.
-        taken: by the tags of a parent and its child: what is called when such a child has ended, with the
-            open elements from the root to it; it is not kept then.
+        taken: functions by the tags of a parent and its child. When such a child ends, its function is called
+            with the open elements from the root to the child, and the child is not kept.
 
     Raises:
-        SurveyFileError: the file cannot be read, is larger in any way than exports are, or is not
-            well-formed, with its line.
+        SurveyFileError: the file cannot be read, exceeds a limit, or is not well-formed; with the line.
     """
     try:
         size = path.stat().st_size
@@ -149,28 +148,28 @@ def read_xml(path: Path, taken: Taken | None = None) -> Node:
 
 
 class _Reader:
-    """Makes nodes of the events of expat."""
+    """Builds nodes from the events of expat."""
 
     def __init__(self, path: Path, taken: Taken) -> None:
         self.path, self.taken = path, taken
         self.top = Node(path, 0, "", {})
         self.open_nodes: list[Node] = []  # from the root
-        self.texts: list[str] = []  # of the innermost element, as long as it has no children
-        self.characters = 0  # of them
+        self.texts: list[str] = []  # of the innermost element, while it has no children
+        self.characters = 0  # in these texts
         self.kept = 0  # bytes of memory
-        self.kept_before: list[int] = []  # each of the open elements
+        self.kept_before: list[int] = []  # value of `kept` before each open element
         self.parser = expat.ParserCreate()
-        self.parser.buffer_text = True  # else every line is a separate piece
+        self.parser.buffer_text = True  # otherwise every line is a separate piece
         self.parser.StartElementHandler = self.start
         self.parser.EndElementHandler = self.end
         self.parser.CharacterDataHandler = self.text
         self.parser.StartDoctypeDeclHandler = self.refuse_doctype
 
     def read(self, file: BinaryIO) -> Node:
-        """Read a file in pieces, so that nothing in it that is too large is held whole.
+        """Read a file in pieces, so that nothing too large is held in memory.
 
         Raises:
-            SurveyFileError: not well-formed XML, or larger than what is read.
+            SurveyFileError: not well-formed XML, or a limit is exceeded.
         """
         given = 0
         try:
@@ -184,14 +183,14 @@ class _Reader:
             raise SurveyFileError(
                 f"{self.path}, line {error.lineno}: not well-formed XML ({expat.ErrorString(error.code)})"
             ) from error
-        except (LookupError, ValueError) as error:  # of encodings that Python or expat do not know
+        except (LookupError, ValueError) as error:  # an encoding that Python or expat do not know
             raise SurveyFileError(
-                f"{self.path}, line 1: the encoding is none that can be read ({one_line(error):.100})"
+                f"{self.path}, line 1: the encoding cannot be read ({one_line(error):.100})"
             ) from error
         return self.top.children[0]
 
     def error(self, message: str) -> SurveyFileError:
-        """Return the error of the line that is read."""
+        """Return an error at the current line."""
         return SurveyFileError(f"{self.path}, line {self.parser.CurrentLineNumber}: {message}")
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
@@ -201,7 +200,7 @@ class _Reader:
             SurveyFileError: too many attributes or too deep.
         """
         if len(self.open_nodes) >= MAX_DEPTH:
-            raise self.error(f"elements more than {MAX_DEPTH} deep in one another")
+            raise self.error(f"elements nested more than {MAX_DEPTH} deep")
         if len(attributes) > MAX_ATTRIBUTES:
             raise self.error(f"{len(attributes)} attributes of an element, at most {MAX_ATTRIBUTES} are read")
         node = Node(self.path, self.parser.CurrentLineNumber, tag, attributes)
@@ -243,14 +242,14 @@ class _Reader:
         """Count bytes of memory.
 
         Raises:
-            SurveyFileError: more memory than is allowed.
+            SurveyFileError: the limit is exceeded.
         """
         self.kept += count
         if self.kept > MAX_KEPT_BYTES:
-            raise self.error(f"what stands up to here takes more than {MAX_KEPT_BYTES} bytes of memory")
+            raise self.error(f"the file up to here takes more than {MAX_KEPT_BYTES} bytes of memory")
 
     def refuse_doctype(self, *_: object) -> None:
-        """Refuse entities, which can blow a small file up to gigabytes; no exporter writes any.
+        """Refuse entities, which can expand a small file to gigabytes; no exporter writes any.
 
         Raises:
             SurveyFileError: always.

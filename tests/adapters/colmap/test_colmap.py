@@ -190,7 +190,7 @@ def test_fixed_cameras_stay_and_partly_free_groups_are_refused() -> None:
     np.testing.assert_allclose(found.estimate.cameras[0].parameters, first.parameters, atol=1e-12)
     assert np.abs(found.estimate.cameras[1].parameters - second.parameters).max() > 1e-6
     part = replace(first, free=np.array([1, 1, 1, 1, 1, 0, 1, 1], dtype=bool))
-    with pytest.raises(BackendError, match="camera 1: its distortion is free in part"):
+    with pytest.raises(BackendError, match="camera 1: its distortion is partly free"):
         adjust_with_colmap(network, replace(truth, cameras=(part, second)))
     other = replace(first, free=np.array([1, 1, 0, 0, 0, 0, 0, 0], dtype=bool))
     with pytest.raises(BackendError, match="different free parameters"):

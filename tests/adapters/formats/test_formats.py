@@ -362,8 +362,8 @@ def test_metashape_chunk_transform_and_missing_orientation(tmp_path: Path) -> No
         ('camera_id="4"', f'camera_id="{"#" * 12_000}"', "camera_id is '#{40}', needed plain text"),
         ('<camera id="4"', f'<camera id="{"#" * 12_000}"', "id is '#{40}', needed plain text"),
         ("</cameras>", "</camera>", "not well-formed XML"),
-        ('encoding="UTF-8"', 'encoding="UTF-99"', "line 1: the encoding is none that can be read"),
-        ('encoding="UTF-8"', 'encoding="GBK"', "line 1: the encoding is none that can be read"),
+        ('encoding="UTF-8"', 'encoding="UTF-99"', "line 1: the encoding cannot be read"),
+        ('encoding="UTF-8"', 'encoding="GBK"', "line 1: the encoding cannot be read"),
         ('width="2000"', 'width="-5"', "line 6: width is -5 px, needed a whole number from 1 to"),
         ("<f>", "<f>1e300", "line 11: '1e300.*' in <f> is not a"),
         ('<document version="2.0.0">', '<!DOCTYPE x><document version="2.0.0">', "line 2: a document type"),
@@ -385,9 +385,9 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "file"
     with pytest.raises(OutputError, match="Metashape has no k4-k6"):
         write_metashape(path, network, truth)
-    with pytest.raises(OutputError, match="BAL knows one focal length"):
+    with pytest.raises(OutputError, match="BAL has one focal length"):
         write_bal(path, network, truth)
-    with pytest.raises(OutputError, match="PhotoModeler cannot hold model full_opencv"):
+    with pytest.raises(OutputError, match="PhotoModeler cannot store model full_opencv"):
         write_photomodeler(path, network, truth)
     with pytest.raises(OutputError, match="one camera, in model brown"):
         write_bundle_csharp(path, network, truth)
@@ -395,7 +395,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="no place for distortion"):
         write_bundle_csharp(path, brown, estimate)
     plain, estimate = network_in("brown", values=())
-    with pytest.raises(OutputError, match="the file wants every point in every photograph"):
+    with pytest.raises(OutputError, match="the file requires every point in every photograph"):
         write_bundle_csharp(path, spaceless(plain), estimate)
     named = replace(plain, points=("A", *plain.points[1:]))
     with pytest.raises(OutputError, match="point 'A': PhotoModeler numbers its points"):
@@ -446,7 +446,7 @@ def test_image_points_are_corrected_for_formats_without_distortion(name: str, tm
     network = spaceless(network)
     form = format_named(name)
     bent, _ = convert_cameras(truth, form.models, held=form.lacks)
-    with pytest.raises(KolinearError, match=f"format {name} cannot hold .*; --undistort corrects"):
+    with pytest.raises(KolinearError, match=f"format {name} cannot store .*; --undistort corrects"):
         write_any(tmp_path / "out", name, network, bent)
     straight, ideal = undistort(network, truth, form.models)
     write_any(tmp_path / "out", name, straight, ideal)
@@ -483,7 +483,7 @@ def test_what_was_written_is_reported(tmp_path: Path) -> None:
     ):
         read_comparable(tmp_path / "c.db")
     write_any(tmp_path / "c.ply", "ply", network, truth)
-    with pytest.raises(SurveyFileError, match=r"c\.ply: format ply has points only"):
+    with pytest.raises(SurveyFileError, match=r"c\.ply: format ply has only points"):
         read_comparable(tmp_path / "c.ply")
     bare = read_any(tmp_path / "c.db")
     for name in ("tables", "colmap", "ply"):
@@ -531,7 +531,7 @@ def test_formats_refuse_by_name(tmp_path: Path) -> None:
     with pytest.raises(KolinearError, match="format bal has models opencv, radial, not brown"):
         write_any(tmp_path / "x", "bal", network, truth)
     (tmp_path / "note.txt").write_text("hello\n")
-    with pytest.raises(SurveyFileError, match=r"note\.txt, line 1: this is no format that is known"):
+    with pytest.raises(SurveyFileError, match=r"note\.txt, line 1: the format is not known"):
         format_of(tmp_path / "note.txt")
     with pytest.raises(SurveyFileError, match="neither a COLMAP model, nor tables"):
         format_of(tmp_path)

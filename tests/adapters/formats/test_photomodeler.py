@@ -117,7 +117,7 @@ def test_control_file_takes_the_place_of_the_control_block(tmp_path: Path) -> No
         ),
         ("   0    0.100    0.200", "   1    0.100    0.200", "line 7: '1' at the start, needed the number 0"),
         ("   0        8 1300.0000", "   0        8 13OO.0000", "line 26: '13OO.0000' is not a number"),
-        ("   1       12", "   5       12", "line 28: photograph 5, there are 0 to 1"),
+        ("   1       12", "   5       12", "line 28: photograph 5, expected 0 to 1"),
         ("       9    0.00000", "       8    0.00000", "line 23: point 8 is a duplicate"),
         ("  0.10000  0.20000\n", "  0.10000\n", "line 25: 5 numbers, needed 6"),
     ],

@@ -106,7 +106,7 @@ def test_a_problem_is_found_by_its_cameras_or_its_folder(files: dict[str, Path],
     np.testing.assert_allclose(same.position, estimate.position, atol=1e-14)
     np.testing.assert_allclose(same.cameras[0].parameters, estimate.cameras[0].parameters, rtol=1e-15)
     (tmp_path / "54cams.txt").write_text(CAMERAS)
-    with pytest.raises(SurveyFileError, match=r"there are: 54cams\.txt, cams\.txt"):
+    with pytest.raises(SurveyFileError, match=r"found: 54cams\.txt, cams\.txt"):
         sba_files(tmp_path)
     with pytest.raises(SurveyFileError, match=r"54cams\.txt: .* beside one \*pts\*\.txt"):
         sba_files(tmp_path / "54cams.txt")
@@ -116,7 +116,7 @@ def test_what_sba_cannot_hold_is_refused(files: dict[str, Path], tmp_path: Path)
     network, estimate = read_any(tmp_path)
     camera = estimate.cameras[0]
     bent = camera.with_parameters(camera.parameters + np.array([0, 0, 0, 0, 0.1, 0, 0, 0]))
-    with pytest.raises(KolinearError, match=r"camera 1: format sba cannot hold k1 .* --undistort corrects"):
+    with pytest.raises(KolinearError, match=r"camera 1: format sba cannot store k1 .* --undistort corrects"):
         write_any(tmp_path / "x", "sba", network, replace(estimate, cameras=(bent,)))
     lost = replace(estimate, points=estimate.points * np.nan)
     with pytest.raises(OutputError, match="start values of all"):
