@@ -62,9 +62,8 @@ ONE_THREAD = dict.fromkeys(
     "1",
 )
 # Records that Dask keeps for its dashboard, which is not shown here. Call stacks are sampled 100 times a
-# second
-# in each worker and kept for 1000 s, which took 1.1 MiB a survey. Its logs grow for the first hundreds of
-# surveys.
+# second in each worker and kept for 1000 s, which took 1.1 MiB a survey. Its logs grow for the first hundreds
+# of surveys.
 NO_DIARY = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.low-level-log-length": 100,

@@ -77,8 +77,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
     """Read photographs and image points of a COLMAP database, with points from its matches.
 
     Verified matches are used if there are any, otherwise the raw ones. Keypoints without a match are left
-    out,
-    and so are points that would appear twice in one photograph.
+    out, and so are points that would appear twice in one photograph.
 
     Raises:
         BackendError: Kolinear has no equivalent of a camera model.

@@ -1,8 +1,7 @@
 """A COLMAP model that is opened, updated with a new solution, and otherwise left unchanged.
 
 Numbers, colours, key points without a point, points of two photographs, camera models and rigs remain those
-of
-the model that was opened.
+of the model that was opened.
 
 Source: COLMAP 4.2 documentation, "Camera Models" and "Rigs and Frames".
 """

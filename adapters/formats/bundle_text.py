@@ -17,8 +17,7 @@ C# program, one file:
 The MATLAB program asks for c, x0, y0 (mm); a folder of its files has them in interior.txt.
 
 Both use angles in degrees with M = R_kappa R_phi R_omega, like Kolinear. Neither has distortion, pixels or
-the
-size of the photographs: coordinates in mm become pixels of a nominal size.
+the size of the photographs: coordinates in mm become pixels of a nominal size.
 
 Source: the thesis "Bundle adjustment for close-range photogrammetry" (fly-over bridge pier), sec. 4.2.1 and
 app. B for the C# file, app. C for the MATLAB files.

@@ -14,8 +14,7 @@ than Kolinear's. With x = X/Z, y = Y/Z in camera axes and r2 = x2 + y2
     u = w/2 + cx + x' f + x' b1 + y' b2,   v = h/2 + cy + y' f
 
 This is exactly `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0) with p1 and p2 exchanged; with k4
-or
-b2 it is exactly `brown_forward_affine`.
+or b2 it is exactly `brown_forward_affine`.
 
 Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models"; structure of the file as
 exported by versions 1.5 to 2.1.

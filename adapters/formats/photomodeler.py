@@ -22,8 +22,7 @@ Blocks follow one another, and each ends with an empty line:
 Control points that were adjusted appear in both blocks with their adjusted coordinates and standard
 deviations; the file does not contain their observed values. The standard deviations of cameras are the
 program's defaults, whether it adjusted the camera or not. Only the title of a calibration project says that
-it
-did.
+it did.
 
 Pixel coordinates count from the corner of the top-left pixel, 0.5 px more than Kolinear's. The principal
 point (xp, yp) counts from the same corner in mm, right and down; xs, ys is the size of the sensor.
