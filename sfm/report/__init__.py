@@ -1,8 +1,8 @@
-"""Reports: what is found in a result (`findings/`), and what prints it.
+"""Reports: the findings of a result (`findings/`), and the pages, tables and figures that show them.
 
-`findings.survey_remarks.findings_of` computes every number once. A page is declared (`page`) by the module
-that `pages.PAGES` names for the type of a result; `pages` renders it as HTML and as plain text, and its
-tables write themselves as CSV and JSON. `survey_report` declares the report of a survey, and
-`output.write_result` writes its folder with tables (`tables/`), plots and overlays (`figures/`). `phrases` is
-how numbers and sentences are written everywhere.
+`findings.survey_remarks.findings_of` computes every number once. `pages.PAGES` names, for each type of
+result, the module that declares its page in the terms of `page`. `pages` renders a page as HTML and as plain
+text; its tables write themselves as CSV and JSON. `survey_report` declares the report of a survey, and
+`output.write_result` writes its folder with tables (`tables/`), plots and overlays (`figures/`). `phrases`
+fixes how numbers and sentences are written everywhere.
 """

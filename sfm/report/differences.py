@@ -1,4 +1,4 @@
-"""The pages of the comparison of two results and of a validation."""
+"""The pages of a comparison of two results, and of a validation of two adjusters against each other."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from sfm.report.page import (
 from sfm.report.phrases import finer_unit, fixed, general, length_of, significant
 
 TIME_CAPTION = (
-    "Seconds of adjustment on one thread. The other adjuster runs until its cost is constant, for the sake "
-    "of the comparison; in everyday use it stops earlier."
+    "Time of adjustment on one thread, in seconds. For this comparison the other adjuster runs until its "
+    "cost no longer changes; in everyday use it stops earlier."
 )
 TRIALS = (
     *(Column("network", "network"), Column("arrangement", "arrangement")),
@@ -61,14 +61,14 @@ TRIALS = (
     Column(None, "message"),
 )
 PICTURE = (
-    "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
-    "the dots is the difference out of the plane."
+    "Differences of the points. Arrows show the part in the object's main plane, red if significant; the "
+    "colour of the dots shows the part out of the plane."
 )
 VALUES = (Column(), Column("value", format=str), Column("unit"))
 
 
 def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
-    """Return the page: verdict, figures, picture and tables.
+    """Return the page of a comparison: verdict, key figures, picture and tables.
 
     Args:
         found: the comparison.
@@ -78,7 +78,8 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
     known = list(compress(found.names, found.has_sigma))
     tested = int(np.isfinite(found.statistic).sum())
     one_sided = len(known) == 1 and tested
-    note = Note("The other result has none, and counts as free of error in the test.") if one_sided else None
+    words = "The other result has no standard deviations; the test treats it as free of error."
+    note = Note(words) if one_sided else None
     picture = None
     if len(found.points) >= 3 and _longest(found.point_difference) > 0:
         figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
@@ -114,7 +115,7 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
 
 
 def _figures(found: ResultComparison, known: list[str]) -> Table:
-    """Return how the results were brought together, and how far they are apart."""
+    """Return how the two results were aligned, and how far apart they are."""
 
     def length(name: str, value: float) -> tuple[str, str, str]:
         factor, unit = finer_unit(found.unit, value)
@@ -124,7 +125,7 @@ def _figures(found: ResultComparison, known: list[str]) -> Table:
         "points": counted(len(found.points), "common point"),
         "cameras": counted(len(found.images), "projection centre"),
         "control": "control points",
-        "none": "nothing: both as they are",
+        "none": "nothing: both are compared as they are",
     }[found.alignment]
     rows = (
         ("aligned by", aligned, ""),
@@ -133,9 +134,9 @@ def _figures(found: ResultComparison, known: list[str]) -> Table:
         length("RMS difference of a point coordinate", _rms(found.point_difference)),
         length("largest difference of a point", _longest(found.point_difference)),
         ("common photographs", len(found.images), ""),
-        length("RMS difference of a projection centre's coordinate", _rms(found.position_difference)),
+        length("RMS difference of a projection centre coordinate", _rms(found.position_difference)),
         ("largest difference of a rotation", significant(_largest(found.rotation_deg)), "deg"),
-        ("standard deviations known of", " and ".join(known) or "neither", ""),
+        ("standard deviations known for", " and ".join(known) or "neither", ""),
     )
     return Table(VALUES, rows)
 
@@ -154,11 +155,12 @@ def _test(found: ResultComparison, tested: int) -> tuple[Part, ...]:
     datum = "the points that did not move" if found.majority else "all common points"
     words = (
         "T = d' (Qa + Qb)^-1 d / 3 of a difference d, with the covariance of each point alone"
+        "T = d' (Qa + Qb)^-1 d / 3 for a difference d, with the covariance of each point alone"
         if found.approximate
-        else f"Both results in one datum, that of {datum}. T of such a point is what the weighted square sum "
-        "of all differences drops by without it, over 3"
+        else f"Both results refer to the datum of {datum}. T of a point is a third of the decrease in the "
+        "weighted square sum of all differences when that point is left out"
     )
-    return Table(columns, rows), Note(f"{words}: 1 is what chance gives.")
+    return Table(columns, rows), Note(f"{words}; chance alone gives about 1.")
 
 
 def _camera(one: InteriorDifference, second: str) -> tuple[Part | None, ...]:
@@ -222,24 +224,24 @@ def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
 
 
 def describe_pairing(found: ResultComparison) -> str:
-    """Return in words how many points are common and by what they were recognised."""
+    """Return in words how many points are common and how they were matched."""
     pairing = found.pairing
     ways = [
         (pairing.points_by_name, "by name"),
         (pairing.points_by_image_points, "by their image points"),
-        (pairing.points_by_place, "by their place"),
+        (pairing.points_by_place, "by position"),
     ]
     said = ", ".join(f"{count} {way}" for count, way in ways if count)
     return f"{counted(len(found.points), 'common point')}{f' ({said})' if said else ''}"
 
 
 def describe_scale(found: ResultComparison) -> str:
-    """Return in words what became of the scale in the alignment."""
+    """Return in words how the alignment treated the scale."""
     if found.alignment == "none":
         return "not aligned"
     if not found.scale_estimated:
-        return "scale kept: both results have one"
-    return f"scale estimated, {found.a_from_b.scale:.9g}: not both results have one"
+        return "scale kept: both results are scaled"
+    return f"scale estimated, {found.a_from_b.scale:.9g}: not both results are scaled"
 
 
 def largest_difference(found: ResultComparison) -> str:
@@ -261,7 +263,7 @@ def _longest(vectors: FloatArray) -> float:
 
 
 def validation_page(found: Validation) -> Page:
-    """Return the page: how the adjusters ended, largest differences, time, and every network."""
+    """Return the page of a validation: optima reached, largest differences, time, and every network."""
     other = program_name(found.backend)
     optima = [(ended(kind), count) for kind, count in found.counts()]
     differences = [(name, in_words(value, unit)) for name, value, unit in largest(found)]
@@ -279,16 +281,17 @@ def validation_page(found: Validation) -> Page:
                 "Optima",
                 Table((Column(), Column("networks", format=str)), optima),
                 Note(
-                    f"Same optimum: the costs differ by no more than a difference of "
-                    f"{general(SAME_SIGMAS, 6)} standard deviations in one direction."
+                    f"Same optimum: the costs differ by no more than a shift of {general(SAME_SIGMAS, 6)} "
+                    "standard deviations in one direction would cause."
                 ),
             ),
             Section(
                 "Largest differences",
                 Table((Column(), Column("largest difference")), differences),
                 Paragraph(
-                    "A point's sigma counts all that is uncertain (marginal); with photographs and "
-                    f"cameras held, as {other} gives it, it is smaller: by {ratio} in the median."
+                    "A point's sigma includes the uncertainty of all unknowns (marginal). With "
+                    f"photographs and cameras held fixed, as {other} computes it, it is smaller: the median "
+                    f"ratio is {ratio}."
                 ),
             ),
             Section("Time", plot("time", TIME_CAPTION, time_figure(found))),
@@ -324,7 +327,7 @@ def trial_row(trial: Trial) -> tuple[object, ...]:
 
 
 def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
-    """Return what was compared, its largest difference over all networks (NaN: none), and its unit."""
+    """Return each compared quantity, its largest difference over all networks (NaN: none), and its unit."""
     trials = validation.trials
     solved = [t for t in trials if t.remark.kind == "same_optimum"]
     costs = [abs(t.cost[1] - t.cost[0]) / min(t.cost) for t in solved if min(t.cost) > 0]
@@ -348,12 +351,12 @@ def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
 
 
 def in_words(value: float, unit: str) -> str:
-    """Write a largest difference with its unit, or that there is none."""
+    """Write a largest difference with its unit, or state that there is none."""
     return f"{value:.1e} {unit}" if math.isfinite(value) else "nothing to compare"
 
 
 def verdict_of_validation(validation: Validation) -> Verdict:
-    """Return the verdict, by the networks in which the adjusters do not end at the same optimum."""
+    """Return the verdict, based on the networks where the adjusters do not reach the same optimum."""
     remarks = [trial.remark for trial in validation.trials if trial.remark.severity != "note"]
     count = len(validation.trials)
     headline = f"{count - len(remarks)} of {count} networks: both adjusters end at the same optimum."
@@ -366,7 +369,7 @@ def ended(kind: str) -> str:
 
 
 def messages_of(trial: Trial) -> tuple[str, ...]:
-    """Return what the programs that failed report: in words, or names of what is not determined."""
+    """Return the messages of programs that failed, or the names of unknowns that are not determined."""
     return (*trial.remark.names("message"), *trial.remark.names("their_message"))
 
 

@@ -1,4 +1,4 @@
-"""The page of an analysis of epochs, with the points of the first and their displacements in its scene."""
+"""The page of a deformation analysis; its viewer shows the points of the first epoch and their motion."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from sfm.report.viewer.embedded import displacements_viewer
 
 MAX_NAMED = 12  # points in a sentence
 PICTURE = (
-    "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
-    "the displacement out of the plane."
+    "Displacements. Arrows show the part in the object's main plane, red for points that moved; the colour "
+    "of the dots shows the part out of the plane."
 )
 STEPS = (
     Column("points", "points", format=str),
@@ -101,12 +101,12 @@ def _columns(factor: float = 1.0, unit: str = "") -> tuple[Column, ...]:
         Column("T", "T", format=significant),
         Column("critical", "critical", format=significant),
         *(Column(), Column(None, "stable", flag=YES), Column(None, "moved", flag=YES)),
-        Column("found from", "detectable", unit, significant, factor),
+        Column("detectable", "detectable", unit, significant, factor),
     )
 
 
 def _rows(found: Displacements) -> list[tuple[Any, ...]]:
-    """Return the rows of displacements, in the object unit."""
+    """Return a row for each displacement, in the object unit."""
     states = ["moved" if m else "stable" if s else "" for m, s in zip(found.moved, found.stable, strict=True)]
     length = np.linalg.norm(found.displacement, axis=1)
     return [
@@ -134,35 +134,35 @@ def _steps(found: Displacements) -> Table:
 
 
 def _section(pair: EpochPair, number: int) -> Section:
-    """Return what is shown of two epochs."""
+    """Return the section of a pair of epochs."""
     found = pair.displacements
     d = found.differences
     factor, unit = finer_unit(d.unit, _typical(found))
     unit = unit or "object units"
     kept = "translation and rotation" if d.motion == "rigid" else (
-        "translation, rotation and scale: not both have one"
+        "translation, rotation and scale: not both epochs are scaled"
     )  # fmt: skip
     common: list[tuple[str, object]] = [
         ("common points", len(d.points)),
-        ("of them recognised by their place", d.by_place),
+        ("of these, matched by position", d.by_place),
         (f"only in {d.names[0]}", _names(d.only_first)),
         (f"only in {d.names[1]}", _names(d.only_second)),
-        ("without the covariance among points", _names(d.untested)),
-        ("no change", kept),
+        ("not tested (fixed, or without covariance)", _names(d.untested)),
+        ("not counted as change", kept),
         ("given to both epochs", _names(d.shared) or "nothing"),
     ]
     shared = Note(
-        "What both were given makes both wrong alike: its part of the covariance is taken out of the "
-        "differences."
+        "An error in these values affects both epochs alike. Their part of the covariance is therefore "
+        "removed from the differences."
     )
     test = Note(
         "T is the weighted square sum of the differences over its degrees of freedom, after the "
-        "S-transformation to the points that are left; 1 is what chance gives. The level of "
+        "S-transformation to the remaining points; chance alone gives about 1. The level of "
         f"{general(100 * found.alpha, 2)} % is shared between this test and those of single points."
     )
     limits = Note(
-        "sd: standard deviations. Found from: the smallest displacement, in its worst direction, that would "
-        f"be found with {general(100 * POWER, 2)} %."
+        "sd: standard deviations. Detectable: the smallest displacement, in its worst direction, that would "
+        f"be detected with a probability of {general(100 * POWER, 2)} %."
     )
     points = (Table(_columns(factor, unit), _rows(found)), limits)
     return Section(
@@ -180,7 +180,7 @@ def _section(pair: EpochPair, number: int) -> Section:
 
 
 def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
-    """Return what is shown of a group of points."""
+    """Return heading, motion and tests of a group of points."""
     rows = []
     for name, value, sigma in zip(block.parameters, block.value, block.sigma, strict=True):
         scale, of = (factor, unit) if name[0] == "t" else (MICRO, "1e-6")
@@ -192,7 +192,7 @@ def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
             (part.name, part.statistic, part.critical, "significant" if part.significant else "")
             for part in block.parts
         ),
-        ("what is left", block.statistic, block.critical, "" if block.fits else "significant"),
+        ("remaining displacements", block.statistic, block.critical, "" if block.fits else "significant"),
     ]
     numbers = [Column(name, format=significant) for name in ("value", "sigma")]
     limits = [Column(name, format=significant, unknown="") for name in ("T", "critical value")]
@@ -205,7 +205,7 @@ def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
 
 
 def _mounts(pair: EpochPair, factor: float, unit: str) -> tuple[Part, ...]:
-    """Return how cameras of rigs were moved on them."""
+    """Return how the cameras of rigs moved on their mounts."""
     if not pair.mounts:
         return ()
     scale = np.repeat([factor, DEGREES], 3)
@@ -223,10 +223,10 @@ def _mounts(pair: EpochPair, factor: float, unit: str) -> tuple[Part, ...]:
 
 
 def describe_stable(found: Displacements) -> str:
-    """Return in words which points carry the datum, and how they were found."""
+    """Return in words which points define the datum, and how they were found."""
     if not found.agreed:
         return (
-            "No stable set is proposed; what is shown is in the datum of all points of reference. Name "
+            "No stable set is proposed; displacements refer to the datum of all reference points. Name "
             "stable ones with --reference."
         )
     removed = [
@@ -234,26 +234,30 @@ def describe_stable(found: Displacements) -> str:
     ]
     count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
     if count == all_of_them:
-        return f"All {counted(count, 'point')} of reference agree."
+        return f"All {counted(count, 'reference point')} agree."
     by = (
-        " by removing one after the other"
+        " by removing one point after another"
         if found.congruency.robust is None or _same(found)
         else " by a robust start"
     )
     undecided = list(compress(found.differences.points, found.undecided))
-    left = f" Left out, and not shown to have moved: {_names(undecided)}." if undecided else ""
+    left = f" Left out but not shown to have moved: {_names(undecided)}." if undecided else ""
     gone = f" ({_names(removed)} in this order)" if removed and " one " in by else ""
     return (
-        f"{count} of {all_of_them} points of reference are proposed as stable, found{by}{gone}.{left} Name "
+        f"{count} of {all_of_them} reference points are proposed as stable, found{by}{gone}.{left} Name "
         "others with --reference if you know better."
     )
 
 
 def describe_block(block: BlockMotion) -> str:
-    """Return in words how a group moved."""
+    """Return in words how a group of points moved."""
     parts = [part.name for part in block.parts if part.significant]
     how = " and ".join(parts) if parts else "nothing significant"
-    rest = "its points moved as one" if block.fits else "what is left is significant: it changed its shape"
+    rest = (
+        "its points moved as one"
+        if block.fits
+        else "the remaining displacements are significant: its shape changed"
+    )
     return f"{block.name} ({counted(len(block.points), 'point')}, {block.model}): {how}; {rest}"
 
 
@@ -306,7 +310,7 @@ def _typical(found: Displacements) -> float:
 
 
 def _same(found: Displacements) -> bool:
-    """Whether the proposed set is the one from the search through all points."""
+    """Return whether the proposed set equals that of the search through all points."""
     return bool((found.stable == found.congruency.search.stable).all())
 
 

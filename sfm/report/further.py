@@ -1,4 +1,4 @@
-"""The page of photographs to be added to a survey."""
+"""The page of photographs to add to a survey."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from sfm.report.viewer.embedded import scene_of_stored, viewer_of
 from sfm.report.viewer.pictures import Pictures
 from sfm.solution import Solution
 
-HIDDEN = Line("note", "What hides a point from a new station is not known: look before you photograph.")
+HIDDEN = Line("note", "Obstructions at a new station are not known: check the view before you photograph.")
 
 
 def page(found: Further, *, result: Solution) -> Page:
-    """Return the page: the photographs, and what they do for the weakest points.
+    """Return the page: the photographs, and how they improve the weakest points.
 
     Args:
-        found: the photographs.
-        result: of the survey.
+        found: the photographs to add.
+        result: result of the survey.
     """
     lines: tuple[Line, ...] = (HIDDEN,)
     if result.network.moment is not None:
-        single = f"They are single photographs by camera {found.camera}, without the others of its rig."
+        single = f"These are single photographs by camera {found.camera}, without the others of its rig."
         lines = (Line("note", single), HIDDEN)
     size = float(np.abs([one.position for one in found.shots]).max(initial=0.0))
     columns = shot_columns(result.unit or "object units", size, planned=False)
     scene = scene_of_stored(replace(found.adjustment.solution, name=result.name, unit=result.unit))
     stations = Note(
-        f"In the coordinates of the result, with camera {found.camera}. Azimuth from +X towards +Y and "
-        "elevation: where the camera looks. Roll: counter-clockwise about that direction. Keep the focus of "
-        "the survey: another one is another calibration."
+        f"In the coordinates of the result, with camera {found.camera}. Azimuth (from +X towards +Y) and "
+        "elevation give the viewing direction. Roll: counter-clockwise about that direction. Keep the focus "
+        "of the survey: another focus needs another calibration."
     )
     sigma = Note(
         "Sigma: RMS of the three coordinates, in a free datum. Predicted for image points as precise as "
@@ -44,7 +44,7 @@ def page(found: Further, *, result: Solution) -> Page:
     )
     weak = (Column("point"), Column("sigma now", format=str), Column("sigma with them", format=str))
     points = (Column(name="id"), Column(name="sigma"), Column(name="sigma_with_more"))
-    level = "bad" if found.adjustment.undetermined else "good"  # only what is determined with them is good
+    level = "bad" if found.adjustment.undetermined else "good"  # good only if everything is determined
     return Page(
         "more",
         "Photographs to add",
@@ -63,7 +63,7 @@ def page(found: Further, *, result: Solution) -> Page:
 
 
 def headline(found: Further, result: Solution) -> str:
-    """Return what the photographs give, in a sentence."""
+    """Return the improvement by the photographs, in a sentence."""
     known = np.isfinite(found.before)
     before, after = (length_of(float(s[known].max()), result.unit) for s in (found.before, found.after))
     count = len(found.stations)
@@ -71,7 +71,7 @@ def headline(found: Further, result: Solution) -> str:
 
 
 def weakest(found: Further, result: Solution) -> list[tuple[str, str, str]]:
-    """Return name and sigma before and after of the weakest points."""
+    """Return name, sigma before and sigma after of the weakest points."""
     return [
         (
             result.network.points[j],

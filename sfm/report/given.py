@@ -1,4 +1,4 @@
-"""Parts of pages on what was given beside the photographs: control, scale bars, orientation, further."""
+"""Parts of pages on given values: control, scale bars, orientation, equipment and further observations."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ HEADINGS = {
     ROTATION: "Observed exterior orientation: rotations",
 }
 R_AND_W = (
-    "r: redundancy number (0 no check, 1 full check). w: the difference over its standard deviation, that of "
-    "the given value times the root of r; by chance 1 of 1000 is beyond 3.3. Largest w first."
+    "r: redundancy number (0 no check, 1 full check). w: the difference over its standard deviation, "
+    "which is that of the given value times the root of r; by chance 1 of 1000 exceeds 3.3. Largest w first."
 )
-MAX_OPEN = 90  # values that are shown without a click
+MAX_OPEN = 90  # values shown without a click
 
 
 def given_parts(
@@ -57,14 +57,14 @@ def given_parts(
     check: ControlCheck | None = None,
     equipment: Sequence[PlacedEquipment] = (),
 ) -> tuple[Part, ...]:
-    """Return how the given values fit.
+    """Return the parts on how well the given values fit.
 
     Args:
-        given: their residuals.
-        adjustment: in which they took part.
+        given: residuals of the given values.
+        adjustment: adjustment in which they took part.
         unit: object unit.
-        check: control that took no part, if there is any.
-        equipment: that scale bars and frames are of.
+        check: control that took no part, if any.
+        equipment: calibrated equipment that provides scale bars and frames.
     """
     parts = list(_check(check, adjustment, unit)) if check is not None else []
     for kind in given.kinds:
@@ -83,7 +83,7 @@ def given_parts(
 
 
 def _equipment(placed: Sequence[PlacedEquipment]) -> tuple[Part, ...]:
-    """Return which calibrated bars and frames were used, and at what temperature."""
+    """Return which calibrated bars and frames were used, and at which temperature."""
     if not placed:
         return ()
     heads = (
@@ -103,25 +103,25 @@ def _equipment(placed: Sequence[PlacedEquipment]) -> tuple[Part, ...]:
         for one in placed
     ]
     note = Note(
-        "Lengths are corrected to the temperature of the survey. Their standard deviations contain "
-        "calibration, expansion and temperature; an error that N placements have in common is taken as "
-        "sqrt(N) times as large with each."
+        "Lengths are corrected to the temperature of the survey. Their standard deviations include "
+        "calibration, expansion and temperature. An error that N placements have in common is counted "
+        "sqrt(N) times as large for each."
     )
     return Heading("Equipment"), note, Table(heads, rows, all_in="summary.json")
 
 
 def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part, ...]:
-    """Return the differences at control that took no part."""
+    """Return the differences at control points that took no part."""
     factor, finer = finer_unit_of(unit, check.differences)
     placed = "shift, rotation and scale; the scale was taken from the control."
     if adjustment.network.scale_bars:
         placed = (
-            "shift and rotation, in the scale of the scale bars; by the control lengths are "
-            f"{general(check.scale, 9)} times those of the scale bars."
+            "shift and rotation, in the scale of the scale bars; lengths by the control are "
+            f"{general(check.scale, 9)} times those by the scale bars."
         )
     note = Note(
-        "The control took no part in the adjustment. The result was placed on it afterwards by "
-        f"{placed} Differences at each point, placed minus nominal [{finer}]:"
+        "The control took no part in the adjustment. The result was fitted to it afterwards by "
+        f"{placed} Differences at each point, fitted minus nominal [{finer}]:"
     )
     heads = (
         *(Column("control point"), *axes("d", "", signed, factor=factor)),
@@ -135,14 +135,14 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
 
 
 def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
-    """Yield the residuals of the values of a kind, that with the largest w first."""
+    """Yield the residuals of the values of a kind, largest w first."""
     rows = [_to_its_sigma(row) for row in found.table_rows]
     if not rows:
         return
     yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
     what = counted(len(found.names), _named(found))
     if not found.checked and found.kind == "control point":
-        yield Paragraph(f"{what} held fixed: adjusted coordinates are those given, without residuals.")
+        yield Paragraph(f"{what} held fixed: the adjusted coordinates are the given ones, without residuals.")
         return
     heads, factor, unit = _columns(found, length_unit)
     if len(found.names) > 1 and len(found.coordinates) > 1 and unit:  # not of one group of observations
@@ -153,7 +153,7 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
     table = Table(heads, rows, all_in="given.csv")
     yield table if len(rows) <= MAX_OPEN else FoldedParts(counted(len(rows), "value"), table, in_text=True)
     if found.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
-        yield Note("A single bar gives the scale and cannot be checked; two or more check one another.")
+        yield Note("A single bar gives the scale but cannot be checked; two or more check one another.")
 
 
 def _to_its_sigma(row: Sequence[Any]) -> tuple[Any, ...]:
@@ -165,12 +165,12 @@ def _to_its_sigma(row: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def _named(found: GivenResiduals) -> str:
-    """Return what the names of values are names of."""
+    """Return the noun for the names of the values."""
     return "photograph" if found.kind in (CENTRE, ROTATION) else found.kind
 
 
 def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
-    """Return the columns of given.csv; factor and unit of differences where all values have one unit."""
+    """Return the columns of given.csv, and factor and unit of differences if all values share a unit."""
     units = {unit for row in found.units for unit in row}
     unit = finer = "" if len(units) > 1 else units.pop()
     factor = 1.0

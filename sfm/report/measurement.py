@@ -1,4 +1,4 @@
-"""The pages of a measured result and of an acceptance test."""
+"""The pages of a measurement and of an acceptance test."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from sfm.report.viewer.embedded import measurement_viewer
 from sfm.solution import Solution
 
 PICTURE = (
-    "Error of length measurement over length: bars are the expanded uncertainty of the calibration, lines "
-    "the limit A + K L, at most B."
+    "Length measurement error over length. Bars are the expanded uncertainty of the calibration, lines the "
+    "limit A + K L, at most B."
 )
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}
 USED = ("no", "yes")
 
 
 def page(found: Measurement, *, result: Solution) -> Page:
-    """Return the page: verdict, tolerances, shapes, functions and points.
+    """Return the page of a measurement: verdict, tolerances, shapes, functions and points.
 
     Args:
-        found: what was measured.
-        result: that it was measured in, for the scene.
+        found: the measurement.
+        result: the result that was measured, for the scene.
     """
     points, u = found.points, found.unit
     groups = counted(len(found.groups), "group") if found.groups else ""
@@ -103,7 +103,7 @@ def write_point_covariance(found: Measurement, folder: Path) -> None:
 
 
 def _tolerances(found: Measurement) -> tuple[Part, ...]:
-    """Return how many deviations are decided in which way, and every deviation."""
+    """Return the number of deviations with each decision, and every deviation."""
     if not found.tolerances:
         return ()
     u = found.unit
@@ -117,12 +117,12 @@ def _tolerances(found: Measurement) -> tuple[Part, ...]:
         for one in found.tolerances
     ]
     note = Note(
-        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma where a tolerance states nothing else: in "
-        "and out are proven, undecided is what lies within U of a limit."
+        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma unless a tolerance states another factor. "
+        "In and out are proven; undecided means within U of a limit."
     )
     parts: list[Part] = [Table(columns, rows), note]
     for k, one in enumerate(found.tolerances):
-        caption = f"Deviations of {one.name} from {one.against}, with its limits."
+        caption = f"Deviations of {one.name} from {one.against}, with the limits."
         folded = FoldedParts(counted(len(one.points), "deviation"), _deviations(found, [one], file=""))
         parts += [Heading(one.name), plot(f"deviations {k}", caption, deviation_figure(one, u)), folded]
     return tuple(parts)
@@ -147,19 +147,19 @@ def _deviations(found: Measurement, those: Iterable[Deviations], *, file: str = 
 
 
 def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
-    """Return what is shown of a shape."""
+    """Return parameters, fit and points of a shape."""
     u, size = found.unit, len(fit.used)
     sigma0 = "not known" if np.isnan(fit.sigma0) else fixed(fit.sigma0, 3)
     if fit.weights != "network" and np.isfinite(fit.sigma0):
         sigma0 = f"{significant(fit.sigma0)} {u}"
     span = "twice the largest distance" if fit.distances.shape[1] == 2 else "largest minus smallest distance"
-    used = "" if fit.used.all() else f" of {size}, the others contradict them"
+    used = "" if fit.used.all() else f" of {size}; the others contradict them"
     rows = [
         ("Points", f"{fit.used.sum()}{used}"),
         ("RMS distance", f"{significant(fit.rms)} {u}"),
         ("Form error", f"{significant(fit.form_error)} {u}, {span}"),
     ]
-    network = f"covariance of the points{'' if found.points.correlated else ', each by itself'}"
+    network = f"covariance of the points{'' if found.points.correlated else ', each point alone'}"
     rows.append(("Weights", network if fit.weights == "network" else "equal"))
     rows.append(("Sigma0", f"{sigma0}, redundancy {fit.redundancy}"))
     if fit.weights == "network" and fit.fits is not None:
@@ -180,7 +180,7 @@ def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
 
 
 def _parameters(found: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shapes") -> Table:
-    """Return the parameters of shapes, angles in degrees."""
+    """Return a table of the parameters of shapes, angles in degrees."""
     columns = (
         *(Column(None, "shape"), Column(None, "kind"), Column("parameter"), Column(None, "parameter")),
         *(Column(None, "axis"), Column(None, "value"), Column(None, "sigma"), Column("value", format=str)),
@@ -215,7 +215,7 @@ def _shape_points(found: Measurement, shapes: Iterable[ShapeFit], *, file: str =
 
 
 def quantity_table(found: Measurement) -> Table:
-    """Return distances, angles and heights, angles in degrees."""
+    """Return a table of distances, angles and heights, angles in degrees."""
     columns = (
         *(Column("", "name"), Column("of", "what"), Column(None, "value"), Column(None, "sigma")),
         *(Column("value", format=str), Column("sigma", format=str), Column("unit", "unit")),
@@ -251,7 +251,7 @@ def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
 
 
 def point_sigma(found: Measurement) -> FloatArray:
-    """Return the standard deviations of the points, NaN where not known, object unit, (n, 3)."""
+    """Return the standard deviations of the points, NaN if not known, object unit, (n, 3)."""
     return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", found.points.blocks), 0.0)))
 
 
@@ -321,7 +321,7 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
 
 
 def describe_measured(found: Measurement) -> str:
-    """Return in one line how much was measured, and how many deviations are decided in which way."""
+    """Return in one line how much was measured, and the number of deviations with each decision."""
     if not found.tolerances:
         parts = [counted(len(found.points.names), "point")]
         if found.shapes:
@@ -339,7 +339,7 @@ def describe_measured(found: Measurement) -> str:
 
 
 def acceptance_page(found: Acceptance) -> Page:
-    """Return the page: limit, decisions, and every length."""
+    """Return the page of an acceptance test: limit, decisions, and every length."""
     a, lengths, u = found, found.lengths, found.unit
     most = f", at most B = {significant(a.b)} {u}" if np.isfinite(a.b) else ""
     limit = f"A + K L with A = {significant(a.a)} {u}, K = {general(a.k, 4)}{most}"
@@ -354,9 +354,9 @@ def acceptance_page(found: Acceptance) -> Page:
         ]
     )
     note = Note(
-        "Error of a length measurement: measured minus calibrated length. ISO 14253-1 with U = "
-        f"{general(a.coverage, 3)} sigma of the calibration: in and out are proven, undecided is what lies "
-        "within U of the limit. The scale of the result comes from other bars."
+        "Length measurement error: measured minus calibrated length. ISO 14253-1 with U = "
+        f"{general(a.coverage, 3)} sigma of the calibration: in and out are proven; undecided means within U "
+        "of the limit. The scale of the result comes from other bars."
     )
     columns = (
         *(Column(name, name) for name in ("line", "from", "to")),

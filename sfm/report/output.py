@@ -1,11 +1,10 @@
-"""The folder of a result: written beside its place, then renamed; its origin and its log.
+"""The folder of a result, with the origin and the log of the survey.
 
-The log of a survey for machines: one JSON object per line, written as things happen.
+The folder is written under a temporary name and then renamed. Its log is for programs: one JSON object per
+line, written as events happen. Every line has `time` (UTC) and `event`:
 
-Every line has `time` (UTC) and `event`:
-
-    start       survey, file, version; survey_at, images_at (paths from the folder of the result);
-                in a batch: inputs (fingerprint of all it reads)
+    start       survey, file, version; survey_at, images_at (paths relative to the folder of the result);
+                in a batch: inputs (fingerprint of all input files)
     photograph  image, targets, rejected, features, stored (measured in an earlier run), seconds; or failed
     stage       stage, seconds, steps
     warning     text
@@ -58,8 +57,8 @@ from sfm.result import StageTime
 from sfm.runtime.progress import SILENT, Progress, give_back_memory
 
 LOG = "log.jsonl"  # in the folder of a result
-MAX_LOG_BYTES = 50_000_000  # of a log that is read back
-MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
+MAX_LOG_BYTES = 50_000_000  # of a log to be read back
+MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; file systems allow 255, with suffixes
 
 
 def write_result(
@@ -73,23 +72,23 @@ def write_result(
     progress: Progress = SILENT,
     plot_process: PlotProcess | None = None,
 ) -> Path:
-    """Write everything that a survey gives into one folder, whole or not at all.
+    """Write all results of a survey into one folder, whole or not at all.
 
     Args:
         findings: the result and the remarks on it.
         out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
-        write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
-        finish: is given the folder when all else is in it, and may add log.jsonl.
+        write_colmap: fills the folder `colmap`, whose path it receives; None omits that folder.
+        finish: receives the folder when everything else is written, and may add log.jsonl.
         jobs: photographs drawn at the same time.
-        budget_mb: what the pictures inside report.html may take, 10^6 bytes.
+        budget_mb: maximum size of the pictures inside report.html, 10^6 bytes.
         progress: called for every photograph.
-        plot_process: draws the plots meanwhile; without it they are drawn here.
+        plot_process: draws the plots in parallel; without it they are drawn here.
 
     Returns:
         The path of report.html.
 
     Raises:
-        OutputError: the folder cannot be written, or contains something else than an earlier result.
+        OutputError: the folder cannot be written, or contains something other than an earlier result.
     """
     out = Path(out)
     refuse_foreign_folder(out)
@@ -105,7 +104,7 @@ def write_result(
             plot_process.begin(shown)
         scene = scene_of_result(findings)
         give_back_memory()
-        # one after another: beside Python at work threads of short calls wait for each turn
+        # One after another: while Python works, threads with short calls wait for their turn each time.
         overlays = draw_overlays(result, jobs=jobs, progress=progress)
         files = {one.image: one.path for one in result.photographs}
         pictures = cut_pictures(
@@ -145,13 +144,13 @@ def write_result(
 
 
 def folder_name(name: str) -> str:
-    """Return the name of the folder of a survey's result: that of the survey, as far as all disks take it."""
+    """Return the folder name for a survey's result: its name, as far as every file system accepts it."""
     kept = re.sub(r"[^\w.\-]+", "_", name).encode()[:MAX_FOLDER_BYTES].decode(errors="ignore")
     return kept.strip("._-") or "survey"
 
 
 def plot_data(findings: Findings) -> PlotData:
-    """Return what the plots of a report show."""
+    """Return the data of the plots of a report."""
     adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
     network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
     seen = network.image_points.select(used)
@@ -211,18 +210,18 @@ def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a result: the files that it was computed from."""
+    """Origin of a result: the files from which it was computed."""
 
     file: Path  # the survey file
     images: Path  # folder of the photographs
 
     def written(self, out: Path) -> dict[str, str]:
-        """Return the paths from the folder of the result, which stay true where all are moved together."""
+        """Return the paths relative to the folder of the result, which stay valid if all move together."""
         return {"survey_at": path_from(out, self.file), "images_at": path_from(out, self.images)}
 
 
 def read_origin(out: Path) -> Origin | None:
-    """Return of what the result in a folder is; None without a result that states it."""
+    """Return the origin of the result in a folder; None without a result that states it."""
     try:
         lines = read_log(out / LOG)
     except OSError:
@@ -241,16 +240,16 @@ class _Summary(Content):
 
 
 def refuse_other_origin(out: Path, origin: Origin, *, survey: str = "", photographs: bool = True) -> None:
-    """Raise OutputError where a folder has the result of another survey file or of other photographs.
+    """Raise OutputError if a folder contains the result of another survey file or of other photographs.
 
-    A result that does not state its origin, as one that a script wrote, is another's if it has another name,
-    or none of the photographs.
+    A result may not state its origin, for example if a script wrote it. It then counts as foreign if it has
+    another name, or if none of its photographs is present.
 
     Args:
         out: the folder.
-        origin: of what is to be written there.
-        survey: its name, where it is known.
-        photographs: whether it is of photographs.
+        origin: origin of the new result.
+        survey: name of the new survey, if known.
+        photographs: whether the new survey has photographs.
     """
     earlier = read_origin(out)
     if earlier is None:
@@ -284,7 +283,7 @@ def refuse_other_origin(out: Path, origin: Origin, *, survey: str = "", photogra
 
 
 def path_from(folder: Path, path: Path) -> str:
-    """Return a path from a folder, which stays true where both are moved together."""
+    """Return a path relative to a folder, which stays valid if both are moved together."""
     folder, path = Path(os.path.realpath(folder)), Path(os.path.realpath(path))
     try:
         return os.path.relpath(path, folder)
@@ -293,21 +292,21 @@ def path_from(folder: Path, path: Path) -> str:
 
 
 class SurveyLog:
-    """Progress that is written down; with a path every line goes to the file at once.
+    """Progress written to a log; with a path every line goes to the file at once.
 
-    Steps are counted from several threads, hence the lock.
+    Several threads count steps, hence the lock.
     """
 
     def __init__(self, path: Path | None = None, *, append: bool = False, watch: Progress = SILENT) -> None:
         """Begin a log.
 
         Args:
-            path: its file, if it is to have one; an earlier log there is replaced or appended to.
-            append: whether it is appended to.
-            watch: receives the same.
+            path: file of the log, if any; an earlier log there is replaced or appended to.
+            append: whether to append to an earlier log.
+            watch: receives the same progress.
 
         Raises:
-            OutputError: the file cannot be written, or is something else than a log.
+            OutputError: the file cannot be written, or is not a log.
         """
         self._lines: list[str] = []
         self._lock = threading.Lock()
@@ -323,7 +322,7 @@ class SurveyLog:
                 if append:
                     refuse_other_log(path)
                 else:
-                    remove_log(path)  # another run may have it open still
+                    remove_log(path)  # another run may still have it open
                 flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_EXCL)
                 self._file = os.fdopen(open_regular_file(path, flags), "a", encoding="utf-8")
 
@@ -334,7 +333,7 @@ class SurveyLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is not None:
-            with suppress(OSError):  # said when the line was written
+            with suppress(OSError):  # reported when the line was written
                 self._file.close()
 
     def start(self, survey: str, file: Path, **more: Any) -> None:
@@ -362,7 +361,7 @@ class SurveyLog:
                 self._file.flush()
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Write down the stage that ends with this one; a second call for a stage gives its total."""
+        """Log the stage that ends when this one begins; a second call for a stage gives its total."""
         self._watch.stage(name, total)
         if name == self._stage:
             return
@@ -376,11 +375,11 @@ class SurveyLog:
             self._steps += 1
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
-        """Pass on what the stage does; the log has the stages only."""
+        """Pass on a step within the stage; the log contains only stages."""
         self._watch.step(name, done, total)
 
     def end_stage(self) -> None:
-        """Write down the stage that is under way, if there is one."""
+        """Log the current stage, if there is one."""
         if self._stage is not None:
             seconds = round(time.perf_counter() - self._begun, 4)
             steps = {"steps": self._steps} if self._steps else {}
@@ -388,11 +387,11 @@ class SurveyLog:
             self._stage = None
 
     def close_into(self, folder: Path, findings: Findings, **more: Any) -> None:
-        """Write the end of a survey that worked, and all lines into the folder of the result.
+        """Log the end of a successful survey, and write all lines into the folder of the result.
 
         Args:
-            folder: the folder, before it appears in its place.
-            findings: what the survey ended with.
+            folder: the folder, before it is renamed.
+            findings: findings of the survey.
             more: further entries of the last line.
         """
         self.end_stage()
@@ -403,7 +402,7 @@ class SurveyLog:
 
 
 def result_entries(findings: Findings) -> dict[str, Any]:
-    """Return the figures of a result in a log or a table of surveys; None where unknown."""
+    """Return the key figures of a result for a log or a table of surveys; None if unknown."""
     result = findings.result
     a, both = result.adjustment, result.comparison
     return {
@@ -425,7 +424,7 @@ def result_entries(findings: Findings) -> dict[str, Any]:
 
 
 def refuse_other_log(path: Path) -> None:
-    """Raise OutputError where something stands that is no log, or a link on the way to it."""
+    """Raise OutputError if a file is not a log, or if the path leads through a link."""
     try:
         os.close(open_regular_file(path, os.O_RDONLY))
         if path.stat().st_size and not any({"time", "event"} <= entry.keys() for entry in read_log(path)):
@@ -437,10 +436,10 @@ def refuse_other_log(path: Path) -> None:
 
 
 def remove_log(path: Path) -> None:
-    """Remove a log, if it is there.
+    """Remove a log, if it exists.
 
     Raises:
-        OutputError: something else stands there, or it cannot be removed.
+        OutputError: the file is not a log, or cannot be removed.
     """
     refuse_other_log(path)
     with disk_errors(f"{path}: the log cannot be removed"):
@@ -448,7 +447,7 @@ def remove_log(path: Path) -> None:
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], ...]:
-    """Return the lines of a log; lines that are not whole, as a killed run leaves them, are passed over.
+    """Return the lines of a log, without incomplete lines such as a killed run leaves.
 
     Raises:
         OSError: the file cannot be read.

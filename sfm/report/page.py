@@ -1,8 +1,8 @@
-"""Declared pages: what a page shows, and its tables as text, CSV and JSON. `html` renders it as HTML.
+"""Declared pages: the content of a page, and its tables as text, CSV and JSON.
 
-A page is sections of tables, figures and words below a verdict. Its tables hold plain values; columns state
-how a value is named and written, so that the page, the terminal and the files beside the page share one
-table.
+A page consists of a verdict and sections of tables, figures and text. Its tables contain plain values.
+Columns define how a value is named and formatted, so the page, the terminal and the files beside the page
+share one table. `pages` renders a page as HTML.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from sfm.report.figures.plot_data import Plot
 from sfm.report.phrases import significant
 from sfm.report.viewer.embedded import Viewer
 
-MAX_ROWS = 2000  # of a table of a page; files have all
+MAX_ROWS = 2000  # rows of a table on a page; files contain all
 
-YES = ("", "yes")  # words of a flag
+YES = ("", "yes")  # words for a flag
 
 Format = str | Callable[[Any], str]
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A word of a table with the colour of a level."""
+    """A word in a table, coloured by a level."""
 
     text: str
     level: str  # good, fair or bad
@@ -49,10 +49,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Link:
-    """A word of a table that leads to a file beside the page."""
+    """A word in a table that links to a file beside the page."""
 
     text: str
-    path: str  # from the folder of the page, as the disk knows it
+    path: str  # from the folder of the page, as in the file system
 
     def __str__(self) -> str:
         return self.text
@@ -64,15 +64,15 @@ class Link:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: how its values are named and written."""
+    """A column of a table: how its values are named and formatted."""
 
     title: str | None = ""  # heading on the page; None: only in files
     name: str = ""  # heading in files; empty: only on the page
-    unit: str = ""  # on the page, in brackets behind the title
-    format: Format | None = None  # of numbers: a format specification or a function; None: a text
-    factor: float = 1.0  # from the unit of files to that of the page
-    flag: tuple[str, str] | None = None  # on the page for what is not true and what is, 0 and 1 in files
-    unknown: str | None = None  # in place of NaN on the page; None: what the format makes of it
+    unit: str = ""  # on the page, in brackets after the title
+    format: Format | None = None  # of numbers: a format specification or a function; None: text
+    factor: float = 1.0  # from the unit in files to the unit on the page
+    flag: tuple[str, str] | None = None  # words on the page for false and true, which are 0 and 1 in files
+    unknown: str | None = None  # replaces NaN on the page; None: the format writes NaN
 
     @property
     def heading(self) -> str:
@@ -98,41 +98,41 @@ class Column:
 def axes(
     prefix: str, unit: str = "", format: Format = significant, *, factor: float = 1.0, parts: str = "XYZ"
 ) -> tuple[Column, ...]:
-    """Return columns of a vector, with the same names on the page and in files."""
+    """Return the columns of a vector, with the same names on the page and in files."""
     return tuple(Column(prefix + one, prefix + one, unit, format, factor) for one in parts)
 
 
 def columns(*titles: str) -> tuple[Column, ...]:
-    """Return columns of the page by their titles, those of numbers with ">" before them."""
+    """Return columns that are only on the page; ">" before a title marks numbers."""
     return tuple(Column(one.removeprefix(">"), format=str if one[:1] == ">" else None) for one in titles)
 
 
 def columns_of(table: ResultTable, shown: Mapping[str, Column]) -> tuple[Column, ...]:
-    """Return the columns of a table of results, and how a page shows some of them, by their names there."""
+    """Return the columns of a result table; `shown` states, by name, those that a page shows."""
     return tuple(replace(shown.get(name, Column(None)), name=name) for name in table.names_of())
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values below columns; a page shows the first ones."""
+    """Rows of plain values under columns; a page shows the first rows."""
 
     columns: tuple[Column, ...]
     rows: Sequence[Sequence[Any]]
-    file: str = ""  # name of the CSV file without its ending; empty: it has none
+    file: str = ""  # name of the CSV file without suffix; empty: no file
     facts: bool = False  # names and words without a header
-    total: Sequence[Any] | None = None  # a last row, of sums or means, on the page
-    most: int = MAX_ROWS  # rows on the page
-    all_in: str = ""  # the file with all rows, where that is another one than `file`
+    total: Sequence[Any] | None = None  # last row with sums or means, only on the page
+    most: int = MAX_ROWS  # maximum number of rows on the page
+    all_in: str = ""  # file with all rows, if it is not `file`
     kind: ClassVar[str] = "table"
 
     @property
     def shown(self) -> tuple[tuple[int, Column], ...]:
-        """The columns on the page, with their places in the rows."""
+        """The columns on the page, with their indices in the rows."""
         return tuple((k, one) for k, one in enumerate(self.columns) if one.title is not None)
 
     @property
     def header(self) -> tuple[str, ...]:
-        """The headings on the page, those of numbers with ">" before them."""
+        """The headings on the page; ">" before a heading marks numbers."""
         return tuple(("" if one.format is None else ">") + one.heading for _, one in self.shown)
 
     @property
@@ -141,12 +141,12 @@ class Table:
         return self._cells(self.rows[: self.most])
 
     def first(self, count: int | None) -> Iterable[tuple[str | Mark | Link, ...]]:
-        """Return the first rows and the last one, of sums, as the page shows them."""
+        """Return the first rows and the row of sums, as the page shows them."""
         return (*self._cells(self.rows[:count]), *self.sums)
 
     @property
     def sums(self) -> Iterable[tuple[str | Mark | Link, ...]]:
-        """The last row as the page shows it, nothing without one."""
+        """The row of sums as the page shows it; empty without one."""
         return self._cells([] if self.total is None else [self.total])
 
     def _cells(self, rows: Iterable[Sequence[Any]]) -> Iterable[tuple[str | Mark | Link, ...]]:
@@ -155,7 +155,7 @@ class Table:
 
     @property
     def cut(self) -> str:
-        """How many of the rows the page shows; empty where all."""
+        """A sentence on how many rows the page shows; empty if all."""
         if len(self.rows) <= self.most:
             return ""
         where = f"; all are in {self.source}" if self.source else ""
@@ -163,7 +163,7 @@ class Table:
 
     @property
     def source(self) -> str:
-        """The file with all rows; empty without one."""
+        """The file with all rows; empty if there is none."""
         return self.all_in or (f"{self.file}.csv" if self.file else "")
 
     @property
@@ -184,16 +184,16 @@ class Table:
 
     @property
     def _named(self) -> list[tuple[int, Column]]:
-        """The columns in files, with their places in the rows."""
+        """The columns in files, with their indices in the rows."""
         return [(k, one) for k, one in enumerate(self.columns) if one.name]
 
     @property
     def text(self) -> str:
-        """All rows in columns of plain text, numbers at the right."""
+        """All rows as plain text in columns, numbers right-aligned."""
         return "\n".join((*self.lines(), ""))
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Return the first rows in columns of plain text, numbers at the right; all without a number."""
+        """Return the first rows as plain text in columns, numbers right-aligned; None returns all rows."""
         shown = [one for _, one in self.shown]
         rows = [[one_line(str(cell)) for cell in row] for row in self.first(most)]
         if not self.facts:
@@ -202,12 +202,12 @@ class Table:
 
 
 def one_line(words: str) -> str:
-    """Return a text without breaks of lines."""
+    """Return a text without line breaks."""
     return " ".join(words.splitlines())
 
 
 def facts(rows: Sequence[tuple[str | Link, str]]) -> Table:
-    """Return names and what is stated of each."""
+    """Return a table of names, each with a statement."""
     return Table((Column(), Column()), rows, facts=True)
 
 
@@ -220,7 +220,7 @@ class Paragraph:
 
 
 class Note(Paragraph):
-    """Sentences that explain what is beside them."""
+    """Sentences that explain the part beside them."""
 
     kind = "note"
 
@@ -247,9 +247,9 @@ class Statement(Paragraph):
 
 @dataclass(frozen=True)
 class Card:
-    """A small picture that leads to a large one beside the page."""
+    """A thumbnail that links to a large picture beside the page."""
 
-    path: str  # of the large one, from the folder of the page
+    path: str  # of the large picture, from the folder of the page
     jpeg: bytes
     title: str
     words: str
@@ -257,7 +257,7 @@ class Card:
 
 
 class FoldedParts:
-    """Parts that a click unfolds; a text has them where that is stated."""
+    """Parts that unfold at a click; plain text contains them only if `in_text`."""
 
     kind: ClassVar[str] = "folded"
 
@@ -266,7 +266,7 @@ class FoldedParts:
 
 
 class Cards:
-    """Cards beside one another."""
+    """Cards side by side."""
 
     kind: ClassVar[str] = "cards"
 
@@ -278,13 +278,13 @@ Part = Table | Plot | Paragraph | FoldedParts | Cards
 
 
 class Section:
-    """A part of a page with a title; parts that are None are left out, and a section without any.
+    """A part of a page with a title; parts that are None are dropped, and so is a section without parts.
 
     Args:
-        title: of the section.
-        parts: of the section.
-        key: by which addresses name the section; with one it is among the links at the head of the page.
-        in_text: whether a text has it.
+        title: title of the section.
+        parts: parts of the section.
+        key: anchor of the section; a section with a key is linked at the head of the page.
+        in_text: whether plain text contains the section.
     """
 
     def __init__(self, title: str, *parts: Part | None, key: str = "", in_text: bool = True) -> None:
@@ -294,7 +294,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Tile:
-    """A figure that a reader sees first."""
+    """A key figure at the top of a page."""
 
     name: str
     value: object
@@ -304,7 +304,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Banner:
-    """A verdict on what is not judged by remarks."""
+    """A verdict that is not based on remarks."""
 
     level: str
     headline: str
@@ -315,26 +315,26 @@ class Banner:
 class Page:
     """The content of a page, and the files beside it."""
 
-    name: str  # of its files, without their endings
+    name: str  # of its files, without suffix
     kind: str  # line above the title
     title: str
     verdict: Verdict | Banner
     sections: tuple[Section, ...]
     tiles: tuple[Tile, ...] = ()
     viewer: Viewer | None = None
-    pictures_beside: bool = False  # whether the scene shows pictures that lie beside the page
+    pictures_beside: bool = False  # whether the scene shows pictures that are files beside the page
     summary: Mapping[str, Any] | None = None  # for NAME.json; values that are not finite become null
-    files: tuple[Table, ...] = ()  # tables that are written beside those of the sections
-    file: str = ""  # of the page itself, without its ending; empty: its name
+    files: tuple[Table, ...] = ()  # further tables written to files
+    file: str = ""  # name of the page's file, without suffix; empty: `name`
 
     @property
     def path(self) -> str:
-        """Name of the file of the page."""
+        """File name of the page."""
         return f"{self.file or self.name}.html"
 
     @property
     def links(self) -> tuple[Section, ...]:
-        """The sections that the head of the page leads to."""
+        """The sections that the head of the page links to."""
         return tuple(one for one in self.sections if one.key and one.parts)
 
     @property
@@ -346,7 +346,7 @@ class Page:
 
     @property
     def text(self) -> str:
-        """The tables of the sections for the terminal, those left out that a click unfolds."""
+        """The tables of the sections for the terminal, without folded ones."""
         lines: list[str] = []
         for section in self.sections:
             tables = [part for part in section.parts if isinstance(part, Table)]
@@ -378,7 +378,7 @@ def plain(value: Any) -> Any:
 
 
 def values_of(one: object, names: str) -> dict[str, Any]:
-    """Return attributes by their names, for JSON."""
+    """Return attributes of an object by name, for JSON."""
     return {name: plain(getattr(one, name)) for name in names.split()}
 
 

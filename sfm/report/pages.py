@@ -1,12 +1,11 @@
 """The pages of the program: a row for each, rendered as HTML or as plain text.
 
-A declared page as HTML, with everything that it shows inside it, and its Content-Security-Policy.
+The HTML of a page contains everything that it shows, and a Content-Security-Policy. Names, reasons and
+remarks come from files of strangers. The template escapes them. Should that ever fail, a browser still
+refuses any script, style or address that is not in the policy.
 
-Names, reasons and remarks in a page come from files of strangers. The template escapes them; should that ever
-fail somewhere, a browser still refuses any script, style or address that is not in the policy.
-
-A declared page as plain text: tables in columns, facts and sentences in lines, the first rows of each.
-Figures, notes, and what a click unfolds on the page are left out, unless it is declared to be in texts.
+The plain text of a page contains the first rows of its tables in columns, and facts and sentences in lines.
+It omits figures, notes, and folded parts unless these are declared to be in texts.
 
 Source: W3C, Content Security Policy Level 3 (https://www.w3.org/TR/CSP3/), sections 2.3.1 and 6.7.
 """
@@ -56,20 +55,20 @@ PAGES: Mapping[str, str] = {
     "Validation": "sfm.report.differences:validation_page",
     "ViewerScene": "sfm.report.view_page:page",
 }
-"""The type of a result, and the module, imported when needed, with the function that declares its page."""
+"""For each type of result, the module (imported when needed) and the function that declares its page."""
 NO_SOURCE = "'none'"  # of a Content-Security-Policy
 WIDTH = 100  # of the text, columns
-MARGIN = "  "  # before its lines
-MAX_ROWS = 10  # of a table in it
-NAME_WIDTH = 36  # of what a fact is about, at most
+MARGIN = "  "  # before a line of text
+MAX_ROWS = 10  # rows of a table in the text
+NAME_WIDTH = 36  # maximum width of the name of a fact
 
 
 def page_of(found: Any, **beside: Any) -> Page:
     """Return the declared page of a result.
 
     Args:
-        found: a result of a type of `PAGES`.
-        beside: what its declaration needs besides.
+        found: a result of a type in `PAGES`.
+        beside: further arguments of the function that declares its page.
     """
     module, function = PAGES[type(found).__name__].split(":")
     return cast(Page, getattr(import_module(module), function)(found, **beside))
@@ -89,10 +88,10 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
     """Write the page of a result and its files into a folder, whole or not at all.
 
     Args:
-        found: a result of a type of `PAGES`.
+        found: a result of a type in `PAGES`.
         out: the folder: new, empty or an unchanged earlier one.
-        also: is given the folder to write further files into.
-        beside: what the declaration of the page needs besides.
+        also: receives the folder, to write further files into it.
+        beside: further arguments of the function that declares the page.
 
     Returns:
         Path of the page.
@@ -104,7 +103,7 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
 
 
 def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None = None) -> Path:
-    """Write a declared page and its files as `write_page` does."""
+    """Write a declared page and its files, like `write_page`."""
     with locked(out.parent / f".{out.name}.lock", out):
         remove_leftovers(out)
         with whole_folder(out, "the result", replaceable=True) as folder:
@@ -128,19 +127,19 @@ def html(page: Page) -> str:
 
 
 def data_url(data: bytes, kind: str) -> str:
-    """Return a picture as an address that contains it."""
+    """Return a picture as a data URL."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 @cache
 def source(name: str) -> str:
-    """Return the style sheet or the script of all pages."""
+    """Return the style sheet or the script shared by all pages."""
     return files("sfm.report").joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 
 @cache
 def _template() -> Template:
-    """Return the template of all pages: it escapes texts, and a name that is not defined is an error."""
+    """Return the template of all pages, which escapes texts and rejects undefined names."""
     made = Environment(
         loader=PackageLoader("sfm.report"),
         autoescape=True,
@@ -156,14 +155,14 @@ def _template() -> Template:
 def content_policy(
     styles: Sequence[str], scripts: Sequence[str] = (), *, pictures_beside: bool = False
 ) -> str:
-    """Return the policy of a page with these style sheets and scripts inside it, and pictures as data URLs.
+    """Return the policy of a page with inline style sheets and scripts, and pictures as data URLs.
 
     Attributes `style` and `on...` are allowed nowhere: they would need 'unsafe-inline'.
 
     Args:
-        styles: content of each style element, to the letter.
-        scripts: content of each script element that is run, to the letter.
-        pictures_beside: whether it shows pictures that lie beside it, which the policy calls 'self'.
+        styles: exact content of each style element.
+        scripts: exact content of each script element that is run.
+        pictures_beside: whether the page shows pictures from files beside it, which the policy calls 'self'.
     """
     allowed = {
         "default-src": [NO_SOURCE],
@@ -195,7 +194,7 @@ def text(page: Page) -> str:
 
 
 def _lines(parts: Iterable[Part]) -> Iterator[str]:
-    heading: list[str] = []  # written before what is below it
+    heading: list[str] = []  # written once a part below it has content
     for part in parts:
         found: list[str] = []
         match part:
@@ -227,7 +226,7 @@ def _facts(table: Table) -> list[str]:
 
 
 def _table(table: Table) -> list[str]:
-    """Return the first rows in columns; each as a sentence where the columns are too wide."""
+    """Return the first rows in columns, or each as a sentence if the columns are too wide."""
     lines = [MARGIN + line for line in table.lines(MAX_ROWS)]
     if max(map(len, lines)) > WIDTH:
         before = ["" if one.format is None else f"{one.heading} " for _, one in table.shown]
@@ -242,7 +241,7 @@ def _table(table: Table) -> list[str]:
 
 
 def wrapped(line: str, *, behind: int) -> list[str]:
-    """Return a line broken between words, not before a unit; the others begin behind so many spaces."""
+    """Return a line broken between words, but not before a unit; later lines are indented by `behind`."""
     lines, rest = [], bound(line.rstrip())
     while len(rest) > WIDTH:
         cut = rest.rfind(" ", behind + 1, WIDTH)

@@ -1,6 +1,6 @@
 """Sentences and numbers as several reports and the terminal print them.
 
-Numbers are written as people read them: significant digits, exponents, units of a readable size.
+Numbers are written for people: with significant digits, exponents, and units of a readable size.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from sfm.report.findings.checks import Precision, Sigma0
 from sfm.report.findings.survey_remarks import Findings
 from sfm.result import ControlCheck, SurveyResult
 
-MIN_PLAIN_VALUE = 1e-3  # below it parameters are written with an exponent
-ROUNDING = 1e-10  # standard deviation over the value that is none
-NOT_DETERMINED = "not determined"  # in place of an infinite standard deviation
-NORMAL_95 = float(normal_ppf(0.975))  # standard deviations of a coordinate that 95 % of its errors are within
+MIN_PLAIN_VALUE = 1e-3  # parameters below it are written with an exponent
+ROUNDING = 1e-10  # standard deviation over value below which it counts as zero
+NOT_DETERMINED = "not determined"  # replaces an infinite standard deviation
+NORMAL_95 = float(normal_ppf(0.975))  # standard deviations that contain 95 % of the errors of a coordinate
 
 
 def describe_sigma0(sigma0: Sigma0) -> tuple[str, str]:
-    """Return sigma0 and what it is to the stated one, with the image points where they show another."""
+    """Return sigma0 and its ratio to the stated one, with that of the image points if it differs."""
     times = f"{sigma0.px / sigma0.stated_px:.3f} times the {significant(sigma0.stated_px)} px expected"
-    alone = f"image points by themselves {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
+    alone = f"image points alone {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
     return f"{sigma0.px:.4f} px", f"{times}; {alone}" if sigma0.differs else times
 
 
 def describe_neighbours(a: Adjustment) -> str:
-    """Return how far the errors of neighbouring image points agree; empty where they are independent."""
+    """Return how far the errors of neighbouring image points agree; empty if they are independent."""
     found = a.error_correlation
     if found is None:
         return ""
     alone, common = (significant(sigma) for sigma in found.sigmas_px(a.sigma0_px))
     return (
-        f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e in "
-        f"{significant(found.length_px)} px; each has {alone} px alone; standard deviations contain both"
+        f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e within "
+        f"{significant(found.length_px)} px; each also has {alone} px alone; standard deviations include both"
     )
 
 
 def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
-    """Return the outcome of a global test, with what would fit where the stated values are too cautious.
+    """Return the outcome of a global test, and what would fit if the stated values are too cautious.
 
     Args:
-        test: of all observations, or of a kind.
-        adjustment: with its sigma_px; None to write a factor.
+        test: test of all observations, or of one kind.
+        adjustment: adjustment, to suggest its sigma_px; None to suggest a factor.
     """
     if test.passed is None:
         return f"{test.of}: not tested, {_why_untested(test)}"
@@ -69,15 +69,15 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
 
 def _why_untested(test: GlobalTest) -> str:
     if test.untested == "reweighted":
-        return "the weights come from the residuals, so that v'Pv is not chi-square distributed"
+        return "the weights come from the residuals, so v'Pv is not chi-square distributed"
     return f"its redundancy, {test.redundancy:.2g}, is too small"
 
 
 def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
-    """Return the stated standard deviations with which a test would pass, as sigma_px where that decides."""
+    """Return the stated standard deviations that would pass a test, as sigma_px if that determines them."""
     factor = float(np.sqrt(test.statistic / test.redundancy))
     if a is not None and a.observations == 2 * int((~a.rejected).sum()):
-        measured = a.stated_px**2 - a.sigma_px**2  # what targets state; sigma_px is added
+        measured = a.stated_px**2 - a.sigma_px**2  # part stated for targets; sigma_px is added to it
         left = (factor * a.stated_px) ** 2 - measured
         if 0 <= measured < 0.5 * a.stated_px**2 and left > 0:
             return f"sigma_px = {significant(float(np.sqrt(left)))}"
@@ -85,22 +85,22 @@ def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
 
 
 def describe_weights(result: SurveyResult) -> str:
-    """Return which weights the image points have, and what follows for the tests; empty if nothing chose."""
+    """Return the weights of the image points and the consequence for the tests; empty for plain weights."""
     factor = result.adjustment.weight_factor
     if result.weights == "stated":
-        return "Weights: those stated for all observations, with one sigma0 for all standard deviations."
+        return "Weights: as stated for all observations, with one sigma0 for all standard deviations."
     if factor == 1:
         return ""
     return (
         "Weights: the standard deviations of the image points were multiplied by "
-        f"{factor:.3f}, from their variance component, so that the other kinds of "
-        "observation keep those stated for them. A test of all observations together would pass by "
-        "construction; each kind is tested against the standard deviations stated for it."
+        f"{factor:.3f}, from their variance component, and the other kinds of "
+        "observation keep their stated ones. A test of all observations together would pass by "
+        "construction, so each kind is tested against its stated standard deviations."
     )
 
 
 def describe_check(found: ControlCheck, unit: str) -> str:
-    """Return how far the placed points are from control that took no part.
+    """Return the differences between the fitted points and control that took no part.
 
     Args:
         found: the differences.
@@ -118,25 +118,25 @@ def describe_check(found: ControlCheck, unit: str) -> str:
 
 
 def describe_limiting(precision: Precision) -> str:
-    """Return why a limiting standard deviation is above the achieved one; empty where none is.
+    """Return why a limiting standard deviation exceeds the achieved one; empty if none does.
 
-    With the cameras held, shift, rotation and scale of the points are theirs; inner constraints on the
-    points take these out, and can take out more of a coordinate than the errors of the cameras add.
+    With the cameras held, the points take their shift, rotation and scale from the cameras. Inner constraints
+    on the points remove these, which can remove more of a coordinate's error than the cameras add.
     """
     if not (precision.limiting > precision.rms).any():
         return ""
     return (
-        "The limiting precision is in the datum of the cameras, in which a coordinate can be less precise "
-        "than in that of the adjustment."
+        "The limiting precision is in the datum of the cameras. A coordinate can be less precise in it than "
+        "in the datum of the adjustment."
     )
 
 
 def describe_precision(typical: float, largest: float, unit: str) -> str:
-    """Return the precision of the points: one standard deviation, and what 95 % of the errors are within.
+    """Return the precision of the points: one standard deviation, and the limit for 95 % of the errors.
 
     Args:
         typical: RMS standard deviation, object unit.
-        largest: likewise.
+        largest: largest standard deviation, object unit.
         unit: object unit.
     """
     factor, finer = finer_unit(unit, largest)
@@ -147,7 +147,7 @@ def describe_precision(typical: float, largest: float, unit: str) -> str:
 
 
 def describe_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
-    """Return c and principal point, their 1 sigma, their 95 %, and the projection uncertainty."""
+    """Return c and principal point, their 1 sigma and 95 % limits, and the projection uncertainty."""
     values, sigmas, within = [], [], []
     for one in camera.parameters:
         value, sigma = with_exponent(one.value, one.sigma)
@@ -167,13 +167,13 @@ def describe_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
 
 
 def describe_fixed(precision: Precision) -> str:
-    """Say that fixed coordinates do not count; empty where there are none."""
+    """Return a note that fixed coordinates do not count; empty if there are none."""
     count = precision.fixed_points
     return f"without the fixed coordinates of {counted(count, 'point')}" if count else ""
 
 
 def words_left_out(findings: Findings) -> str:
-    """Say what of the survey the comparison with the other adjuster leaves out; empty where nothing."""
+    """Return what the comparison with the other adjuster omits from the survey; empty if nothing."""
     counts, fixed = findings.counts, findings.precision.fixed_points
     control = findings.result.adjustment.datum == "control"
     left_out = [
@@ -194,7 +194,7 @@ def words_left_out(findings: Findings) -> str:
 
 
 def describe_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
-    """Yield each rig and where one of its cameras is mounted: base and angles with standard deviations."""
+    """Yield the name of each rig with the mount of a camera: base and angles with standard deviations."""
     for rig in rigs:
         for mount in rig.mounts:
             base = " ± ".join(with_exponent(mount.base, mount.base_sigma))
@@ -208,26 +208,26 @@ def describe_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Write a number with so many decimals, and no sign before zero."""
+    """Write a number with a given number of decimals, and without a sign before zero."""
     return f"{float(value):z.{decimals}f}"
 
 
 def scientific(value: float, decimals: int) -> str:
-    """Write a number with an exponent and so many decimals before it."""
+    """Write a number with an exponent and a given number of decimals."""
     return f"{value:.{decimals}e}"
 
 
 def general(value: float, digits: int) -> str:
-    """Write a number with at most so many digits, with an exponent where that is shorter."""
+    """Write a number with a maximum number of digits, with an exponent if that is shorter."""
     return f"{value:.{digits}g}"
 
 
 def placed(value: float, size: float) -> str:
-    """Write a coordinate with the decimals that leave six digits of the largest one.
+    """Write a coordinate with the decimals that give the largest one six digits.
 
     Args:
         value: a coordinate, in any unit.
-        size: the largest of all that are written beside it, in that unit.
+        size: the largest coordinate written beside it, in the same unit.
     """
     return fixed(value, max(0, 5 - math.floor(math.log10(size)))) if size > 0 else general(value, 6)
 
@@ -238,17 +238,17 @@ def signed(value: float) -> str:
 
 
 def or_unlimited(value: float) -> str:
-    """Write a reliability, which is unlimited where nothing checks an observation."""
+    """Write a reliability, which is unlimited if nothing checks an observation."""
     return "unlimited" if np.isinf(value) else significant(value)
 
 
 def or_fixed(sigma: float) -> str:
-    """Write the standard deviation of a coordinate, which a fixed one has not."""
+    """Write the standard deviation of a coordinate, or "fixed" if it is zero."""
     return "fixed" if sigma == 0 else significant(sigma)
 
 
 def alike(values: Sequence[float], digits: int = 3) -> tuple[str, ...]:
-    """Write numbers of one quantity with significant digits, all with an exponent if one has it."""
+    """Write numbers of one quantity with significant digits, all with an exponent if one needs it."""
     written = tuple(significant(value, digits) for value in values)
     if not any("e" in one for one in written):
         return written
@@ -256,7 +256,7 @@ def alike(values: Sequence[float], digits: int = 3) -> tuple[str, ...]:
 
 
 def with_exponent(value: float, sigma: float) -> tuple[str, str]:
-    """Write a parameter to the second digit of its standard deviation, and the latter; small ones as m e-n.
+    """Write a parameter to the second digit of its sigma, and the sigma; small ones as m e-n.
 
     Args:
         value: the parameter.
@@ -275,11 +275,11 @@ def with_exponent(value: float, sigma: float) -> tuple[str, str]:
 
 
 def with_sigma(value: float, sigma: float) -> tuple[str, str]:
-    """Write a value to the second digit of its standard deviation, and the latter.
+    """Write a value to the second digit of its standard deviation, and the standard deviation.
 
     Args:
-        value: of any unit.
-        sigma: its standard deviation, 0 if it was held or defines the system, NaN if it is not known.
+        value: a value of any unit.
+        sigma: its standard deviation, 0 if it was held or defines the datum, NaN if it is not known.
     """
     if np.isnan(sigma):
         return f"{value:.9g}", "not known"
@@ -289,7 +289,7 @@ def with_sigma(value: float, sigma: float) -> tuple[str, str]:
 
 
 def to_precision(value: float, sigma: float) -> str:
-    """Write a coordinate to the second digit of its standard deviation, six decimals if that is not known."""
+    """Write a coordinate to the second digit of its standard deviation, or with six decimals without one."""
     if not np.isfinite(value):
         return "not known"
     known = np.isfinite(sigma) and sigma > 0
@@ -298,7 +298,7 @@ def to_precision(value: float, sigma: float) -> str:
 
 
 def raised(unit: str) -> str:
-    """Write the exponent of a unit such as mm^-2 above the line, nothing for a pure number."""
+    """Write the exponent of a unit such as mm^-2 as a superscript; empty for a pure number."""
     if unit == "1":
         return ""
     base, _, power = unit.partition("^")
@@ -306,16 +306,16 @@ def raised(unit: str) -> str:
 
 
 def finer_unit_of(unit: str, *values: FloatArray) -> tuple[float, str]:
-    """Return the same for arrays of lengths, of which the largest known one counts."""
+    """Return factor and unit as `finer_unit` does, for the largest known length of some arrays."""
     return finer_unit(unit, max(float(np.nanmax(np.abs(array), initial=0.0)) for array in values))
 
 
 def length_of(value: float, unit: str, *, of_unknown: str = "object units") -> str:
-    """Write a length in a unit in which it reads well, or in the words for a unit that is not known."""
+    """Write a length in a readable unit, or with the given words if the unit is not known."""
     factor, finer = finer_unit(unit, value)
     return f"{significant(value * factor)} {finer or of_unknown}"
 
 
 def is_number(text: str) -> bool:
-    """Whether a cell of a table is a number, which is set to the right."""
+    """Return whether a table cell is a number, which is right-aligned."""
     return text.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in text.replace("e", ""))

@@ -1,4 +1,4 @@
-"""The page of a planned network: what it will give, where it is weak, the photographs."""
+"""The page of a planned network: predicted precision, weak points, and the photographs to take."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ from sfm.report.phrases import (
 from sfm.report.tables.summary import summary_of_rigs
 from sfm.report.viewer.embedded import plan_viewer
 
-MAX_NAMED = 12  # weak points that are listed
+MAX_NAMED = 12  # weak points listed
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 
 
 def page(plan: Plan) -> Page:
-    """Return the page: the scene to explore, figures, list of photographs, weak points and the camera."""
+    """Return the page of a plan: scene, key figures, photographs, weak points and camera."""
     p, unit = plan.prediction, plan.unit
     m, n = np.nonzero(p.sight.seen)
     deviation = np.sqrt(np.diagonal(p.sight.covariance[m, n], axis1=1, axis2=2))
@@ -71,15 +71,15 @@ def page(plan: Plan) -> Page:
     columns = shot_columns(unit, size)
     points = _points(plan, size)
     prediction = Note(
-        "Predicted for the standard deviations of the image points that the plan states, with a free datum "
-        "and the camera adjusted as below; targets are assumed to be measured wherever they are seen. Sigma "
-        "of a point: RMS of its three coordinates."
+        "Predicted for the standard deviations of image points that the plan states, with a free datum and "
+        "the camera adjusted as described below. Targets are assumed to be measured in every photograph "
+        "that sees them. Sigma of a point: RMS of its three coordinates."
     )
     axis = Note(
-        "Azimuth from +X towards +Y and elevation: where the camera looks. Roll: counter-clockwise about "
-        "that direction, 0 upright. Distance: mean of the points shown, along the axis. Focus: one for all "
-        "photographs, as a calibration is valid for one focus only; unless it was given, as sharp at the "
-        "nearest point as at the farthest."
+        "Azimuth (from +X towards +Y) and elevation give the viewing direction. Roll: counter-clockwise "
+        "about that direction, 0 upright. Distance: mean distance of the visible points along the axis. "
+        "Focus: one setting for all photographs, as a calibration is valid for one focus only. Unless it "
+        "was given, the nearest and the farthest point are equally sharp."
     )
     rows = [(name[0].upper() + name[1:], value) for name, value in figures(plan)]
     return Page(
@@ -107,7 +107,7 @@ def page(plan: Plan) -> Page:
 
 
 def exterior_table(stations: Stations, cameras: Sequence[Camera] = ()) -> Table:
-    """Return the exterior orientation of planned photographs, for a file; of a rig with camera and moment."""
+    """Return the exterior orientation of planned photographs for a file; for a rig with camera and moment."""
     angles = np.degrees(angles_from_rotation(stations.rotation)).tolist()
     rows: list[tuple[object, ...]] = [
         (n, *X0, *a) for n, X0, a in zip(stations.names, stations.position.tolist(), angles, strict=True)
@@ -125,8 +125,8 @@ def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Colum
 
     Args:
         unit: object unit.
-        size: the largest coordinate that is written, in that unit.
-        planned: whether focus and coded points are planned, too.
+        size: largest coordinate in the table, in that unit.
+        planned: whether focus and coded points are planned as well.
     """
     return (
         Column("station", "image"),
@@ -140,7 +140,7 @@ def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Colum
 
 
 def shot_rows(shots: Sequence[Shot], *, rounded: bool = False) -> list[tuple[object, ...]]:
-    """Return the rows of photographs to be taken, for files rounded as they can be carried out."""
+    """Return the rows of photographs to be taken, rounded for files to what can be set up."""
     rows: list[tuple[object, ...]] = []
     for one in shots:
         lengths = [*one.position.tolist(), one.distance, one.focus]
@@ -152,7 +152,7 @@ def shot_rows(shots: Sequence[Shot], *, rounded: bool = False) -> list[tuple[obj
 
 
 def _points(plan: Plan, size: float) -> Table:
-    """Return the points with what is predicted of them."""
+    """Return the points with their predicted precision."""
     p = plan.prediction
     factor, fine = finer_unit(plan.unit, p.rms_sigma)
     columns = (
@@ -178,7 +178,7 @@ def _points(plan: Plan, size: float) -> Table:
 
 
 def _weak(plan: Plan) -> tuple[Part, ...]:
-    """Return the weak points, the worst first."""
+    """Return the weak points, worst first."""
     if not plan.weak:
         return (Paragraph("None: no point is more than 1.5 times as uncertain as the median."),)
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
@@ -192,21 +192,22 @@ def _weak(plan: Plan) -> tuple[Part, ...]:
 
 
 def _camera(plan: Plan) -> tuple[Part, ...]:
-    """Return whether the network calibrates its camera."""
+    """Return the parts on whether the network calibrates its cameras."""
     if not plan.calibrations:
-        return (Paragraph("Its interior orientation is held."),)
+        return (Paragraph("The interior orientation is held fixed."),)
     return tuple(part for c in plan.calibrations for part in _calibration(c, plan.prediction.cameras))
 
 
 def _calibration(c: Calibratability, cameras: Sequence[Camera]) -> tuple[Part, ...]:
-    """Return whether the network calibrates a camera."""
+    """Return the parts on whether the network calibrates one camera."""
     rolled, turned, deep = fixed(100 * c.rolled, 0), fixed(c.convergence_deg, 0), fixed(100 * c.depth, 0)
     words = Paragraph(
         f"The network {'calibrates' if c.good else 'does not calibrate'} "
-        f"{'the camera' if len(cameras) == 1 else f'camera {c.camera}'}: what is left uncertain "
-        f"of it is {significant(c.contribution)} sigmas of an image coordinate, and adjusting it costs "
-        f"{significant(100 * c.cost - 100, 2)} % of the precision of points. {rolled} % of the photographs "
-        f"are rolled, axes converge by {turned} deg, the object is {deep} % of its distance deep."
+        f"{'the camera' if len(cameras) == 1 else f'camera {c.camera}'}. The uncertainty that remains in it "
+        f"contributes {significant(c.contribution)} sigmas of an image coordinate, and adjusting it costs "
+        f"{significant(100 * c.cost - 100, 2)} % of the precision of the points. {rolled} % of the "
+        f"photographs are rolled, the axes converge by {turned} deg, and the object's depth is {deep} % of "
+        "its distance."
     )
     columns = (
         *(Column("parameter"), Column("sigma", format=str), Column("unit")),
@@ -217,7 +218,7 @@ def _calibration(c: Calibratability, cameras: Sequence[Camera]) -> tuple[Part, .
 
 
 def _rigs(plan: Plan) -> tuple[Part, ...]:
-    """Return where the cameras of the rig are mounted, with what is predicted of it."""
+    """Return the mounts of the cameras of the rig, with their predicted precision."""
     columns = (*map(Column, ("camera", "")), Column("value"), Column("sigma"), Column("unit"))
     rows = [
         (mount.camera, name, *with_exponent(value, sigma), plan.unit if is_length else "deg")
@@ -230,7 +231,7 @@ def _rigs(plan: Plan) -> tuple[Part, ...]:
 
 
 def _gain(plan: Plan) -> tuple[Part, ...]:
-    """Return what the rig and each kind of observations add."""
+    """Return the contribution of the rig and of each kind of observation."""
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
     columns = (
         *(Column("", "kind"), Column("number", "count", format=str)),
@@ -251,16 +252,17 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
         for o in plan.contributions
     ]
     note = Note(
-        "Gain: standard deviation of points without it over that with it, RMS of a coordinate, all else "
-        "kept. Gives: shifts, rotations and scale of the network, and points, that nothing else gives; "
-        "both standard deviations are then those with inner constraints for these. Where two kinds give "
-        "the same, the gain of each is that beside the other. Scale bars: distances of tables among them."
+        "Gain: standard deviation of points without the observation over that with it, RMS of a "
+        "coordinate, all else unchanged. Gives: shifts, rotations and scale of the network, and points, "
+        "that nothing else gives; both standard deviations are then those with inner constraints for "
+        "these. If two kinds give the same, the gain of each is that in addition to the other. Scale bars: "
+        "including distances in tables."
     )
     return Table(columns, rows, "gain"), note
 
 
 def figures(plan: Plan) -> list[tuple[str, str]]:
-    """Return the figures of a plan, each with its unit."""
+    """Return the key figures of a plan, each with its unit."""
     p, a, unit = plan.prediction, plan.prediction.adjustment, plan.unit
     found = reliability(a)
     d = found_displacement(p)[p.determined]
@@ -273,21 +275,21 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("image points", f"{len(a.network.image_points)}, sigma {significant(p.sigma_px)} px (median)"),
         ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),
         (
-            "sigma of points" + (", what is not determined left out" if a.undetermined else ""),
+            "sigma of points" + (", without those not determined" if a.undetermined else ""),
             f"1 sigma {length_of(p.rms_sigma, unit)} RMS per coordinate (95 % "
             f"{length_of(NORMAL_95 * p.rms_sigma, unit)}), {length_of(worst, unit)} at the worst point, "
             f"{length_of(along, unit)} in its worst direction",
         ),
         (
-            f"displacement found between two such surveys ({POWER:.0%} power, {ALPHA:.1%} significance)",
+            f"displacement detectable between two such surveys ({POWER:.0%} power, {ALPHA:.1%} significance)",
             f"{length_of(float(np.median(d)), unit)} (median), {length_of(float(d.max()), unit)} (worst)",
         ),
         (
             "redundancy",
             f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
         ),
-        ("gross error that is found", _spread(found.minimal_bias, "px")),
-        ("its effect if it is not found", _spread(found.external, "sigmas of an unknown")),
+        ("detectable gross error", _spread(found.minimal_bias, "px")),
+        ("its effect if not detected", _spread(found.external, "sigmas of an unknown")),
         (
             "rule of Fraser",
             f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
@@ -313,7 +315,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _gain_in_words(one: Contribution) -> str:
-    """Return what a kind of observations adds: gives the scale; beside it points 1.30 times as precise."""
+    """Return in words what a kind of observation adds, as "alone gives the scale; points 1.30 times ..."."""
     precise = f"points {one.gain:.2f} times as precise" if np.isfinite(one.gain) else "nothing without it"
     if not _given(one):
         return precise
@@ -322,7 +324,7 @@ def _gain_in_words(one: Contribution) -> str:
 
 
 def _given(one: Contribution) -> list[str]:
-    """Return what nothing but a kind of observations gives, in words."""
+    """Return in words what only one kind of observation determines."""
     counts = ((one.shifts, "shift"), (one.rotations, "rotation"))
     words = [counted(count, what) for count, what in counts if count]
     words += ["the scale"] if one.scale else []
@@ -365,7 +367,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
 
 
 def _observed(plan: Plan) -> dict[str, Any]:
-    """Return what a plan has beside image points, with the values that it gives, for a simulation."""
+    """Return the planned observations other than image points, with values, for a simulation."""
     network, mounts = plan.prediction.adjustment.network, plan.prediction.stations.rig
     bars = network.scale_bars
     ends = ([network.points[j] for j in side] for side in (bars.start, bars.end))
@@ -427,12 +429,12 @@ def _camera_rows(c: Calibratability, camera: Camera) -> list[tuple[str, ...]]:
 
 
 def _first(undetermined: tuple[str, ...]) -> str:
-    """Write the first of what is not determined, and how many more there are."""
+    """Write the first undetermined quantity, and how many more there are."""
     more = len(undetermined) - 1
     return undetermined[0] + (f"; and {more} more" if more else "")
 
 
 def _spread(values: FloatArray, unit: str) -> str:
-    """Write median and largest of reliabilities, which are unlimited where nothing checks an image point."""
+    """Write median and largest reliability, which is unlimited if nothing checks an image point."""
     median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
     return f"{median} {unit} (median), {largest} at most"

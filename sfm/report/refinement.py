@@ -1,4 +1,4 @@
-"""The page of a model before and after refinement, with its standard deviations."""
+"""The page of a COLMAP model before and after refinement, with standard deviations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
-from sfm.display import agreeing, counted
+from sfm.display import counted
 from sfm.remarks.verdict import judge
 from sfm.report.findings.bundle_statistics import given_of
 from sfm.report.findings.checks import rms_of_groups, standard_deviations
@@ -23,31 +23,31 @@ from sfm.survey.refining.windows import MIN_RAYS
 
 @dataclass(frozen=True)
 class Numbers:
-    """How the file of a model counts photographs and points, and its interior orientation in its terms."""
+    """Identifiers in the files of a model, and its interior orientation in its own terms."""
 
     image_ids: tuple[int, ...]  # of each photograph
     point_ids: tuple[int, ...]  # of each point
     interior: tuple[tuple[object, ...], ...]  # camera, model, parameter, before, after, sigma; NaN: held
-    written: int = 0  # key points with a point in the files
-    written_px: float = 0.0  # their RMS per coordinate by COLMAP
+    written: int = 0  # key points with a point in the written files
+    written_px: float = 0.0  # their RMS per coordinate as COLMAP computes it
 
 
 def describe_key_points(found: Refinement, numbers: Numbers) -> str:
-    """Return the line of the RMS that COLMAP finds in the files, and why it is larger than that adjusted."""
+    """Return the line on the RMS that COLMAP finds in the files, which exceeds the adjusted RMS."""
     kept = numbers.written - found.refined
     return (
-        f"in the files  {numbers.written_px:.4f} px, with {counted(kept, 'key point')} as "
-        f"{agreeing(kept, 'it|they')} came, of points not measured anew in {MIN_RAYS} photographs"
+        f"in the files  {numbers.written_px:.4f} px, including {counted(kept, 'unchanged key point')} of "
+        f"points not measured anew in {MIN_RAYS} photographs"
     )
 
 
 def page(found: Refinement, *, numbers: Numbers, title: str) -> Page:
-    """Return the page: what changed, key points that took no part, targets, cameras and photographs.
+    """Return the page: changes, unused key points, targets, cameras and photographs.
 
     Args:
-        found: the model before and after.
-        numbers: as its file counts.
-        title: of the page, such as the folder of the model.
+        found: the model before and after refinement.
+        numbers: identifiers and interior orientation in its files.
+        title: title of the page, such as the folder of the model.
     """
     px = significant(found.before_px), significant(found.after_px)
     figures = f"RMS of the key points {px[0]} px before, {px[1]} px after"
@@ -74,43 +74,44 @@ def _changes(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]
         Column(),
         *(Column(name, format=str) for name in ("as it came", "adjusted here", "measured anew")),
     )
-    control = ", those after in the datum of the control" if found.adjustment.datum == "control" else ""
+    control = ""
+    if found.adjustment.datum == "control":
+        control = ", those after refinement in the datum of the control"
     note = Note(
-        "Adjusted here: the key points of the model as they came, in an adjustment of inner constraints "
-        f"without rejection. Measured anew: by least squares matching with windows of {found.window_px} px; "
-        "adjusted are the points whose windows do not overlap, the others are intersected afterwards. "
+        "Adjusted here: the key points of the model as they came, in an adjustment with inner constraints "
+        f"and without rejection. Measured anew: by least squares matching with windows of {found.window_px} "
+        "px. Points whose windows do not overlap are adjusted; the others are intersected afterwards. "
         f"Standard deviations are in the datum of inner constraints{control}, and scaled by sigma0 of the "
-        "same column. The files hold the key points measured anew, and those that stay as they came: of "
-        f"points that could not be measured anew in {MIN_RAYS} photographs. COLMAP finds their RMS in the "
-        "files."
+        "same column. The files contain the key points measured anew, and the unchanged key points of points "
+        f"that could not be measured anew in {MIN_RAYS} photographs. COLMAP finds their RMS in the files."
     )
     return Table(columns, _sizes(found, numbers, unit)), note
 
 
 def _reasons(found: Refinement) -> tuple[Part, ...]:
-    """Return why key points took no part."""
+    """Return the reasons why key points were not used."""
     if not found.reasons:
         return (Paragraph("None."),)
     columns = (Column("why"), Column("key points", format=str), Column("of all", "", "%", "z.1f"))
     return (
         Table(columns, [(why, count, 100 * count / found.key_points) for why, count in found.reasons]),
         Note(
-            f"Too far: further from the model's key point than {general(MAX_SHIFT_FACTOR, 2)} times the "
+            f"Too far: farther from the model's key point than {general(MAX_SHIFT_FACTOR, 2)} times the "
             f"robust spread of the model's residuals (at least {general(MIN_SHIFT_PX, 2)} px). Outside: the "
-            "window reaches beyond a photograph. Template of a point without a match: the window that was "
-            "found in no other photograph. Contradict the others: large residual in the adjustment. "
+            "window reaches beyond a photograph. Template of a point without a match: the window was found "
+            "in no other photograph. Contradict the others: large residual in the adjustment. "
             "Diverged: no solution, or the window turned inside out."
         ),
         Note(
-            "A key point that was not measured anew no longer claims its point where enough others do, and "
-            "stays in the model without one. Points that fewer than three photographs see keep their key "
+            "A key point that was not measured anew is detached from its point if enough others were, and "
+            "stays in the model without a point. Points seen in fewer than three photographs keep their key "
             "points and are intersected anew."
         ),
     )
 
 
 def _targets(found: Refinement, unit: str) -> tuple[Part, ...]:
-    """Return the targets that were adjusted with the key points, and what was given."""
+    """Return the targets that were adjusted with the key points, and the given values."""
     if found.targets is None:
         return ()
     after = found.adjustment
@@ -118,9 +119,9 @@ def _targets(found: Refinement, unit: str) -> tuple[Part, ...]:
     names = [after.network.points[j].removeprefix(PREFIX) for j in found.target_points]
     datum = "datum of the control" if after.datum == "control" else "datum of inner constraints"
     note = Note(
-        f"Measured in the photographs beside the key points, and adjusted with them, in the {datum}. The "
-        "same with all digits is in targets.csv. COLMAP's files do not hold them: its mapper wants key "
-        "points as they are in its database."
+        f"Measured in the photographs in addition to the key points, and adjusted with them, in the {datum}. "
+        "targets.csv contains the same with all digits. COLMAP's files do not contain them, since its mapper "
+        "requires key points as they are in its database."
     )
     table = _coordinates(found, "target", names, found.target_points, "targets", unit)
     return *given_parts(given, after, unit), table, note
@@ -143,21 +144,21 @@ def _cameras(found: Refinement, numbers: Numbers) -> tuple[Part, ...]:
         for camera, model, name, *values in numbers.interior
     ]
     note = Note(
-        "COLMAP's parameters, its pixel coordinates from the corner of the photograph. Held: not estimated, "
-        "by --fix, because it was 0, or cx and cy of a camera with few photographs. Sigma: one standard "
-        "deviation."
+        "COLMAP's parameters, with pixel coordinates from the corner of the photograph. Held: not estimated, "
+        "because of --fix, because it was 0, or as cx or cy of a camera with few photographs. Sigma: one "
+        "standard deviation."
     )
     return Table(columns, rows, "sigma_cameras"), note
 
 
 def _common_px(a: Adjustment) -> str:
-    """Return the standard deviation of what neighbouring image points err together, px."""
+    """Return the standard deviation of the error that neighbouring image points share, px."""
     found = a.error_correlation
     return "none" if found is None else significant(found.sigmas_px(a.sigma0_px)[1])
 
 
 def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[object, ...]]:
-    """Return rows of what the page compares: name, before, adjusted here, after."""
+    """Return the rows of the comparison: name, before, adjusted here, measured anew."""
     readjusted = found.readjusted
     both = (readjusted, found.adjustment)
     medians = (
@@ -169,28 +170,28 @@ def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[object,
     return [
         ("RMS of key points, per coordinate [px]", *rms[:3]),
         ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
-        ("Errors that neighbours have in common [px]", "", *map(_common_px, both)),
+        ("Errors that neighbours share [px]", "", *map(_common_px, both)),
         *((name, "", *s) for name, *s in zip(medians, *map(_median_sigmas, both), strict=True)),
         ("Photographs", len(found.images), *(len(one.network.images) for one in both)),
         ("Points", len(found.points), len(readjusted.network.points), found.points_anew.sum()),
         ("Points whose windows do not overlap, adjusted", "", "", found.points.sum()),
         ("Key points with a point", found.key_points, (~readjusted.rejected).sum(), found.refined),
         ("Key points with a point in the files", found.key_points, "", numbers.written),
-        ("of these, as they came", found.key_points, "", numbers.written - found.refined),
+        ("of these, unchanged", found.key_points, "", numbers.written - found.refined),
         ("RMS of the key points in the files, per coordinate [px]", rms[0], "", rms[3]),
         *([("Targets", "", "", len(found.target_points))] if found.targets else []),
     ]
 
 
 def _median_sigmas(one: Adjustment) -> list[str]:
-    """Return the medians of what one coordinate of centres, rotations (mdeg) and points has, RMS of three."""
+    """Return median standard deviations per coordinate (RMS of three) of centres, rotations and points."""
     C = one.covariance
     parts = (C.exterior[:, :3, :3], np.degrees(1e3) ** 2 * C.exterior[:, 3:, 3:], C.points)
     return [significant(float(np.median(np.sqrt(np.einsum("nii->n", Q) / 3)))) for Q in parts]
 
 
 def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:
-    """Return the photographs with standard deviations and residuals; NaN where they were not adjusted."""
+    """Return the photographs with standard deviations and residuals; NaN if they were not adjusted."""
     seen, a, m = found.model.image_points, found.adjustment, len(found.images)
     used = ~a.rejected
     used[len(found.rows) :] = False  # targets
@@ -223,8 +224,8 @@ def _photographs(found: Refinement, numbers: Numbers, unit: str) -> tuple[Part, 
         )
     ]
     note = Note(
-        "Sigma X0, Y0, Z0: of the projection centre. The same with all digits, and those of the points and "
-        "cameras, are in sigma_images.csv, sigma_points.csv and sigma_cameras.csv beside this page."
+        "Sigma X0, Y0, Z0: of the projection centre. sigma_images.csv beside this page contains the same "
+        "with all digits; sigma_points.csv and sigma_cameras.csv contain those of points and cameras."
     )
     return Table(columns, rows, "sigma_images"), note
 
@@ -238,7 +239,7 @@ def _points(found: Refinement, numbers: Numbers) -> Table:
 def _coordinates(
     found: Refinement, name: str, names: Sequence[object], points: IntArray, file: str, unit: str = ""
 ) -> Table:
-    """Return name, coordinates, their standard deviations and rays of points of the adjustment."""
+    """Return name, coordinates, standard deviations and rays of some points of the adjustment."""
     a = found.adjustment
     rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
     sigma = standard_deviations(a.covariance.points[points])

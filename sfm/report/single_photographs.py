@@ -1,4 +1,4 @@
-"""What `kolinear match` and `kolinear resect` print and write."""
+"""Output of `kolinear match` and `kolinear resect`: tables, JSON, text and pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ METHODS = (
     *(Column(name, format=".5f") for name in ("omega", "phi", "kappa")),
     Column("rms mm", format=".6f"),
 )
-NO_SECOND = -1.0  # r of the second-best place where there is none
+NO_SECOND = -1.0  # r of the second-best position if there is none
 COLUMNS = (
     *(Column("point", "point"), Column(None, "x_px"), Column(None, "y_px"), Column("left px", format=str)),
     *(Column(None, "x_right_px"), Column(None, "y_right_px"), Column("right px", format=str)),
@@ -42,12 +42,12 @@ NAMES = tuple(one.name for one in COLUMNS if one.name)
 TABLE_ENDINGS = (".csv", ".json")
 PICTURE_ENDING = ".png"
 PNG_HEAD = 33  # bytes of the signature and the first chunk (PNG specification, sec. 5.2 and 11.2.1)
-MARK = b"Software\0kolinear match"  # text in a picture of this program (PNG specification, sec. 11.3.3)
-LOOKED_AT = 4096  # bytes of an existing file by which it is recognised
+MARK = b"Software\0kolinear match"  # identifies pictures by this program (PNG specification, sec. 11.3.3)
+LOOKED_AT = 4096  # bytes of an existing file that are checked
 
 
 def matches_table(names: tuple[str, ...], found: ConjugatePoints) -> Table:
-    """Return the results, NaN where there is nothing."""
+    """Return the matches as a table, NaN for missing values."""
     values = np.column_stack([found.left, found.right, found.sigma, found.correlation, found.second])
     rows = []
     for name, row, steps, why in zip(names, values.tolist(), found.steps, found.reason, strict=True):
@@ -59,7 +59,7 @@ def matches_table(names: tuple[str, ...], found: ConjugatePoints) -> Table:
 
 
 def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
-    """Return the results as JSON, null where there is nothing."""
+    """Return the matches as JSON, null for missing values."""
     beside = zip(matches_table(names, found).records, found.covariance, found.gain, found.offset, strict=True)
     entries = [
         entry | {"covariance_px2": Q if np.isfinite(Q).all() else None, "gain": gain, "offset": offset}
@@ -69,16 +69,16 @@ def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
 
 
 def refuse_outputs(out: Path | None, picture: Path | None, inputs: tuple[Path, ...], as_json: bool) -> None:
-    """Refuse outputs of another ending, and those that would take the place of anything but earlier ones.
+    """Refuse outputs with a wrong suffix, and outputs that would replace anything but earlier outputs.
 
     Args:
         out: table to be written, or None.
         picture: picture to be written, or None.
         inputs: files that are read.
-        as_json: whether JSON is asked for.
+        as_json: whether JSON is requested.
 
     Raises:
-        OutputError: with the option at fault, and what was found in its place.
+        OutputError: with the option at fault, and what was found at its path.
     """
     if out is not None:
         endings = (".json",) if as_json else TABLE_ENDINGS
@@ -91,10 +91,10 @@ def refuse_outputs(out: Path | None, picture: Path | None, inputs: tuple[Path, .
 
 @contextmanager
 def whole_outputs(out: Path | None, picture: Path | None) -> Iterator[tuple[Path | None, Path | None]]:
-    """Give a table and a picture to write, which take their places when both are finished.
+    """Yield temporary paths for a table and a picture, which replace the final files when both are finished.
 
     Raises:
-        OutputError: one of them cannot be written; none is then.
+        OutputError: one of them cannot be written; then neither is.
     """
     with ExitStack() as stack:
         yield (
@@ -104,7 +104,7 @@ def whole_outputs(out: Path | None, picture: Path | None) -> Iterator[tuple[Path
 
 
 def picture_file(drawing: AnyArray) -> bytes:
-    """Return a picture as PNG with the mark by which it is known again."""
+    """Return a picture as PNG with a mark that identifies it."""
     data = cv2.imencode(PICTURE_ENDING, drawing)[1].tobytes()
     return data[:PNG_HEAD] + _chunk(b"tEXt", MARK) + data[PNG_HEAD:]
 
@@ -121,7 +121,7 @@ def _refuse_ending(option: str, path: Path, endings: tuple[str, ...]) -> None:
 
 
 def _refuse_taken(option: str, path: Path, inputs: tuple[Path, ...], heads: tuple[bytes, ...]) -> None:
-    """Refuse an input, by whatever path, and anything that does not begin like an earlier output."""
+    """Refuse an input, by any path, and a file that does not begin like an earlier output."""
     if not path.exists() and not path.is_symlink():
         return
     for given in inputs:
@@ -137,15 +137,15 @@ def _refuse_taken(option: str, path: Path, inputs: tuple[Path, ...], heads: tupl
 
 
 def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
-    """Return what one method finds, ready for JSON.
+    """Return the result of one method, ready for JSON.
 
     Args:
-        found: by `resection.by_method.resect`.
+        found: result of `resection.by_method.resect`.
         c: principal distance, mm.
 
     Returns:
         method, points, solutions (best first: X0, Y0, Z0, omega_deg, phi_deg, kappa_deg, M, rms_mm) and,
-        where they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history, residuals_mm,
+        if they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history, residuals_mm,
         line_fit, interior, rejected, trials, warning.
     """
     unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
@@ -176,7 +176,7 @@ def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
 
 
 def comparison_json(found: dict[str, ResectionResult | GeometryError], c: float) -> list[dict[str, Any]]:
-    """Return what all methods find, or why one finds nothing, ready for JSON; c in mm."""
+    """Return the results of all methods, or the reason for no result, ready for JSON; c in mm."""
     return [
         {"method": name, "error": str(one)} if isinstance(one, GeometryError) else resection_json(one, c)
         for name, one in found.items()
@@ -184,7 +184,7 @@ def comparison_json(found: dict[str, ResectionResult | GeometryError], c: float)
 
 
 def comparison_table(found: dict[str, ResectionResult | GeometryError], c: float) -> str:
-    """Return what all methods find side by side, and below why others find nothing; c in mm."""
+    """Return the results of all methods in a table, and below it the reasons for no result; c in mm."""
     rows, remarks = [], []
     for name, one in found.items():
         if isinstance(one, GeometryError):
@@ -197,7 +197,7 @@ def comparison_table(found: dict[str, ResectionResult | GeometryError], c: float
 
 
 def resection_text(found: ResectionResult, c: float) -> str:
-    """Return what one method finds as text; c in mm."""
+    """Return the result of one method as text; c in mm."""
     lines = [f"{found.method}, {counted(found.points, 'point')}"]
     for k, one in enumerate(found.solutions, start=1):
         X0, Y0, Z0, omega, phi, kappa = _values(one)

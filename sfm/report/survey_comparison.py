@@ -1,4 +1,4 @@
-"""Comparisons of a survey in its report: with the other adjuster, and with another pipeline."""
+"""Comparisons in the report of a survey: with the other adjuster, and with another pipeline."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from sfm.report.phrases import finer_unit, fixed, general, scientific, significa
 
 
 def adjuster_parts(f: Findings) -> Iterator[Part]:
-    """Yield whether the other adjuster agrees."""
+    """Yield the parts on whether the other adjuster agrees."""
     both, unit = f.result.comparison, f.result.length_unit
     if both is None:
-        yield Paragraph("The survey asked for no comparison.")
+        yield Paragraph("The survey did not request a comparison.")
         return
     d, name = both.comparison, program_name(both.backend)
     alike = " ".join(one.text for one in of_kind(f.verdict.remarks, "adjuster_fits_alike"))
@@ -39,13 +39,13 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
         yield facts([("because", reason) for reason in _reasons(both)])
     survey_px = f.result.adjustment.rms_px
     left_out, models = words_left_out(f), " and ".join(f.interior.models)
-    unchecked = f", and {name} does not check what is left out here" if left_out else ""
+    unchecked = f", and {name} does not check what is omitted here" if left_out else ""
     yield Paragraph(
-        f"Both adjusters had the {len(both.network.image_points)} accepted image points alone, with equal "
+        f"Both adjusters had only the {len(both.network.image_points)} accepted image points, with equal "
         "weights, in a free datum and in the camera model "
-        f"{both.model}{f', {left_out}' if left_out else ''}. The survey itself is another adjustment: its "
-        f"RMS residual is {fixed(survey_px, 4)} px with its weights in {models}{unchecked}. One "
-        "solution is brought onto the other by shift, rotation and scale before anything is compared."
+        f"{both.model}{f', {left_out}' if left_out else ''}. The survey itself is a different adjustment: "
+        f"its RMS residual is {fixed(survey_px, 4)} px with its weights in {models}{unchecked}. One "
+        "solution is fitted to the other by shift, rotation and scale before anything is compared."
     )
     rms, cost = [fixed(one, 9) for one in d.rms_px], [general(one, 9) for one in d.cost]
     ends = ["yes" if one else "no" for one in (both.adjustment.converged, both.backend_converged)]
@@ -69,9 +69,9 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
     yield Heading("Precision of the points")
     C = both.adjustment.covariance
     sigmas = (
-        ("Kolinear: everything adjusted is uncertain (marginal)", C.points),
+        ("Kolinear: all unknowns uncertain (marginal)", C.points),
         ("Kolinear: photographs and cameras held (conditional)", C.points_limiting),
-        (f"{name}: photographs, cameras held (conditional)", both.backend_points),
+        (f"{name}: photographs and cameras held (conditional)", both.backend_points),
     )
     factor, finer = finer_unit(unit, point_sigma(C.points)[1])
     precision = [
@@ -81,13 +81,13 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
     ]
     yield Table(columns("standard deviation of a coordinate", ">RMS", ">largest", "unit"), precision)
     yield Note(
-        "With photographs and cameras held, what is uncertain of them is missing: only the marginal standard "
-        f"deviations are those of the whole adjustment. {name} gives the conditional ones alone. They are of "
+        "With photographs and cameras held, their uncertainty is missing: only the marginal standard "
+        f"deviations are those of the whole adjustment. {name} gives only the conditional ones. All refer to "
         "the compared adjustment, with its sigma0."
     )
     converted = [one for one in both.conversions if one.source_model != one.camera.model]
     if converted:
-        yield Heading("Cameras written in another model")
+        yield Heading("Cameras converted to another model")
         heads = (Column("misfit RMS", "", "px", ".4f"), Column("largest", "", "px", ".4f"))
         written = [
             (one.camera.name, one.source_model, one.camera.model, one.rms_px, one.max_px) for one in converted
@@ -99,20 +99,20 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
         )
     if both.held:
         yield Note(
-            "The distortion was held at the survey's result in both adjusters, since the image points do not "
-            f"determine all of it in this model: {', '.join(both.held)}."
+            "The distortion was held at the survey's result in both adjusters, because the image points do "
+            f"not determine all of it in this model: {', '.join(both.held)}."
         )
     if both.unshared:
         yield Note(
-            f"{name} shares all parameters of a camera among photographs or none. Held at the survey's "
-            f"result in both adjusters were therefore: {'; '.join(both.unshared)}."
+            f"{name} shares all parameters of a camera among photographs or none. Therefore these were held "
+            f"at the survey's result in both adjusters: {'; '.join(both.unshared)}."
         )
     if both.freed:
-        yield Note(f"Free in the comparison besides the survey's parameters: {'; '.join(both.freed)}.")
+        yield Note(f"Free in the comparison in addition to the survey's parameters: {'; '.join(both.freed)}.")
 
 
 def _reasons(both: AdjusterComparison) -> list[str]:
-    """Return why two adjusters do not agree."""
+    """Return the reasons why two adjusters do not agree."""
     reasons = [*both.comparison.exceeded]
     if reasons and both.adjustment.converged:
         reasons.append(_other_minimum(both))
@@ -121,18 +121,18 @@ def _reasons(both: AdjusterComparison) -> list[str]:
 
 
 def _other_minimum(both: AdjusterComparison) -> str:
-    """Return in words which of two minima is the lower one."""
+    """Return in words which of two minima is lower."""
     ours, theirs = both.comparison.cost
     lower = program_name("kolinear" if ours < theirs else both.backend)
     ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
     return (
-        f"going on from {program_name(both.backend)}'s solution does not lead to Kolinear's: these are two "
-        f"minima, and that of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
+        f"continuing from {program_name(both.backend)}'s solution does not lead to Kolinear's: there are two "
+        f"minima, and that of {lower} is lower, by a factor of {ratio:.6g} in the sum of squares"
     )
 
 
 def pipeline_parts(f: Findings) -> Iterator[Part]:
-    """Yield how another pipeline does on the photographs alone."""
+    """Yield the parts on the result of another pipeline on the photographs alone."""
     found, unit = f.result.baseline, f.result.length_unit
     if found is None:
         return
@@ -147,10 +147,10 @@ def pipeline_parts(f: Findings) -> Iterator[Part]:
     )
     yield Paragraph(
         f"{name} oriented {found.photographs[1]} of {found.total} photographs from their natural texture "
-        f"alone, Kolinear {found.photographs[0]} from the survey's points. Brought onto the survey by "
-        f"shift, rotation and scale, its orientations put {counted(found.targets, 'point')} of the survey "
-        f"{point} {finer} (RMS of a coordinate) from where the survey has them; its standard deviation is "
-        f"{sigma} {finer}."
+        f"alone, Kolinear {found.photographs[0]} from the survey's points. After a fit to the survey by "
+        f"shift, rotation and scale, its orientations place {counted(found.targets, 'point')} of the survey "
+        f"{point} {finer} (RMS of a coordinate) from their positions in the survey; their standard "
+        f"deviation there is {sigma} {finer}."
     )
     oriented = (f"{one} of {found.total}" for one in found.photographs)
     rms, seconds = [significant(one) for one in found.rms_px], [fixed(one, 1) for one in found.seconds]
@@ -165,10 +165,10 @@ def pipeline_parts(f: Findings) -> Iterator[Part]:
         ("projection centre", centre, most_centre, finer),
         ("rotation", "", significant(found.max_rotation_deg), "deg"),
     )
-    heads = columns("difference after the similarity", ">RMS of a coordinate", ">largest", "unit")
+    heads = columns("difference after the fit", ">RMS of a coordinate", ">largest", "unit")
     yield Table(columns("", ">Kolinear", f">{name}", "unit"), rows)
     yield Table(heads, apart)
     yield Note(
         f"The survey's accepted image points were intersected with the orientations and camera of {name}, so "
-        "that the same points are compared. It knows no scale."
+        "the same points are compared. It does not know the scale."
     )

@@ -1,4 +1,4 @@
-"""How good a survey is: precision, geometry, given values, image points, cameras in its report."""
+"""Quality of a survey in its report: precision, geometry, given values, image points, cameras."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ from sfm.report.phrases import (
 )
 from sfm.report.tables.csv_files import component_rows
 
-MAX_BINS = 12  # numbers of rays that are listed one by one
-MAX_OPEN = 30  # parameters that are shown without a click
-MAX_WEAK_POINTS = 5  # points
+MAX_BINS = 12  # numbers of rays listed one by one
+MAX_OPEN = 30  # parameters shown without a click
+MAX_WEAK_POINTS = 5
 MAX_CORRELATIONS = 20  # correlations of the exterior orientation; all are in summary.json
 OVER = f"{100 * MIN_REPORTED_CORRELATION:.0f} %"
 
@@ -69,7 +69,7 @@ def precision_parts(f: Findings) -> Iterator[Part]:
         ("object points, RMS, 1 sigma", p.rms, factor, finer),
         ("object points, RMS, 95 %", NORMAL_95 * p.rms, factor, finer),
         ("object points, largest sigma", p.largest, factor, finer),
-        ("limiting: RMS with cameras free of error", p.limiting, factor, finer),
+        ("limiting: RMS if the cameras are free of error", p.limiting, factor, finer),
         ("projection centres, RMS sigma", p.centres, of_centres, centre_unit),
         ("omega, phi, kappa, RMS sigma", np.degrees(p.angles) * 3600, 1.0, "arc seconds"),
     ]
@@ -84,8 +84,8 @@ def precision_parts(f: Findings) -> Iterator[Part]:
     if words := describe_limiting(p):
         yield Paragraph(words)
     yield Note(
-        f"Standard deviations are a posteriori and in the datum of the adjustment ({a.datum}); in a free "
-        "network they state how the points lie to one another, not in an outer frame."
+        f"Standard deviations are a posteriori and in the datum of the adjustment ({a.datum}). In a free "
+        "network they describe the positions of the points relative to one another, not in an outer frame."
     )
     if words := describe_neighbours(a):
         yield Paragraph(f"By the residuals, {words}.")
@@ -104,8 +104,8 @@ def precision_parts(f: Findings) -> Iterator[Part]:
             ],
         )
         yield Note(
-            "kolinear plan more RESULT, with this folder as RESULT, proposes the further photographs that "
-            "help them most."
+            "kolinear plan more RESULT, with this folder as RESULT, proposes the additional photographs that "
+            "help these points most."
         )
 
 
@@ -138,14 +138,15 @@ def geometry_parts(f: Findings) -> Iterator[Part]:
         ]
     )
     yield Note(
-        "Rays are the accepted image points of a point; its intersection angle is the largest between two of "
-        "them, 90 degrees at best. Coverage is the part of a photograph within the convex hull of its image "
-        "points: the lens is known only there. Of every point and photograph: points.csv and images.csv."
+        "Rays are the accepted image points of a point. Its intersection angle is the largest angle "
+        "between two of them, 90 degrees at best. Coverage is the part of a photograph within the convex "
+        "hull of its image points: the lens is known only there. points.csv and images.csv list every "
+        "point and photograph."
     )
 
 
 def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
-    """Return (rays, points with so many); ranges of rays where there are many different numbers."""
+    """Return pairs of a number of rays and the number of points; ranges if there are many numbers."""
     histogram = found.histogram()
     if len(histogram) <= MAX_BINS:
         return tuple((str(rays), n) for rays, n in histogram)
@@ -160,7 +161,7 @@ def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
 
 
 def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: int) -> str:
-    """Write the smallest and the largest of values, and whose they are."""
+    """Write the smallest and the largest value, each with its name."""
     if not np.isfinite(values).any():
         return "not known"
     ends = int(np.nanargmin(values)), int(np.nanargmax(values))
@@ -175,34 +176,34 @@ def _covered(one: Coverage) -> str:
 
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:
-    """Return how the given values fit."""
+    """Return the parts on how well the given values fit."""
     r = f.result
     return given_parts(f.given, r.adjustment, r.length_unit, r.control_check, r.equipment)
 
 
 def image_point_parts(f: Findings) -> Iterator[Part]:
-    """Yield sigma0, the global tests, and the tests and reliability of image coordinates."""
+    """Yield sigma0, the global tests, and tests and reliability of the image coordinates."""
     a, s, sigma0 = f.result.adjustment, f.statistics, f.sigma0
     yield Heading("Image coordinates")
     rows = (
         ("sigma0, a posteriori, of all observations", fixed(sigma0.px, 5), "px"),
         ("sigma0 over the standard deviations of the weights", fixed(a.sigma0, 4), ""),
-        ("the same at the start values of the adjustment", significant(a.start_sigma0), ""),
+        ("the same at the start of the adjustment", significant(a.start_sigma0), ""),
         ("sigma0 on the sensor", fixed(sigma0.mm, 6), "mm"),
-        ("standard deviation by the image points alone", fixed(sigma0.image_points_px, 5), "px"),
+        ("standard deviation from the image points alone", fixed(sigma0.image_points_px, 5), "px"),
         ("standard deviation stated beforehand", fixed(sigma0.stated_px, 5), "px"),
-        ("of the image points, a posteriori over that stated", fixed(sigma0.ratio, 3), ""),
+        ("of the image points, a posteriori over stated", fixed(sigma0.ratio, 3), ""),
         ("RMS residual per coordinate", fixed(a.rms_px, 5), "px"),
-        ("longest residual vector among the accepted", fixed(a.max_residual_px, 4), "px"),
+        ("longest accepted residual vector", fixed(a.max_residual_px, 4), "px"),
     )
     yield Table(columns("", ">value", "unit"), rows)
     yield facts([("global test", describe_test(test, a)) for test in s.global_tests])
     if words := describe_weights(f.result):
         yield Paragraph(words)
     yield Note(
-        "The global test asks whether the standard deviations stated beforehand are those of the residuals. "
-        "That of the image points (sigma_px) is only a rough guess: a test that is not passed states by how "
-        "much to correct it, unless sigma0 is several times too large."
+        "The global test asks whether the residuals confirm the standard deviations stated beforehand. That "
+        "of the image points (sigma_px) is only a rough guess. A test that is not passed shows how much to "
+        "correct it, unless sigma0 is several times too large."
     )
     if s.known:
         yield FoldedParts("Tests and reliability of single image coordinates", *_reliability(f), in_text=True)
@@ -239,21 +240,21 @@ def _reliability(f: Findings) -> Iterator[Part]:
         f"{a.redundancy}."
     )
     yield Paragraph(
-        "Minimal bias: the smallest gross error with which the tau test of an image coordinate exceeds its "
+        "Minimal bias: the smallest gross error for which the tau test of an image coordinate exceeds its "
         f"critical value, {fixed(s.reliability.critical, 2)}, in {fixed(100 * POWER, 0)} of 100 cases. "
-        "External reliability: its effect on an unknown if it is not found, in standard deviations of the "
-        "unknown."
+        "External reliability: the effect of this error on an unknown if it is not detected, in standard "
+        "deviations of the unknown."
     )
     yield Note(
         "Where the redundancy is small, another coordinate may exceed the critical value by more and be "
-        "rejected instead. Of every image coordinate: reliability.csv."
+        "rejected instead. reliability.csv lists every image coordinate."
     )
 
 
 def largest_residual_parts(f: Findings) -> Iterator[Part]:
     """Yield the largest standardised residuals."""
     if f.largest:
-        yield Heading(f"The {len(f.largest)} largest residuals that were accepted")
+        yield Heading(f"The {len(f.largest)} largest accepted residuals")
         heads = (*columns("photograph", "point"), *axes("v", "px", "+.3f", parts="xy"))
         tests = (Column("w (Baarda)", format="+.2f"), Column("tau (Pope)", format="+.2f"))
         yield Table((*heads, *tests), f.largest)
@@ -278,7 +279,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         camera = family.camera
         yield Subheading(family.name)
         size, pixel = camera.size_px, [general(1000 * one, 5) for one in camera.pixel_mm]
-        shared = f"; these parameters are common to {counted(family.photographs, 'photograph')}"
+        shared = f"; these parameters are shared by {counted(family.photographs, 'photograph')}"
         yield Paragraph(
             f"model {camera.model}, {size[0]} x {size[1]} px of {pixel[0]} x {pixel[1]} µm"
             f"{shared if camera.shared else ''}"
@@ -295,7 +296,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
             f"{one.parameters} of {one.camera}: {probability(one.probability)}"
             for one in f.protocol.cumulative
         )
-        yield Paragraph(f"Radial distortion together against 0 (F test): {'; '.join(tests)}.")
+        yield Paragraph(f"Radial distortion terms jointly tested against 0 (F test): {'; '.join(tests)}.")
     if single := f.interior.single:
         summary = f"{counted(len(single), 'parameter')} of single photographs and groups"
         yield FoldedParts(summary, _parameters(single, of=True), open=len(single) <= MAX_OPEN, in_text=True)
@@ -303,7 +304,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         yield Heading(f"Rig {rig.name}")
         yield Paragraph(
             f"In the image axes of camera {rig.reference}: x right, y up, z towards the camera. From "
-            f"{rig.moments} moments with photographs of two cameras at least."
+            f"{rig.moments} moments with photographs of at least two cameras."
         )
         unit = f.result.length_unit
         rows = [
@@ -327,7 +328,8 @@ def _correlations(f: Findings) -> Iterator[Part]:
     if s.camera_correlations:
         yield _pairs(s.camera_correlations)
         yield Note(
-            "Parameters so strongly correlated cannot be separated: each makes up for errors of the other."
+            "Parameters correlated this strongly cannot be separated: each compensates for errors of the "
+            "other."
         )
     else:
         yield Paragraph(f"No two parameters of a camera are correlated beyond {OVER}.")
@@ -340,10 +342,10 @@ def _correlations(f: Findings) -> Iterator[Part]:
         rows = [
             (one.parameter, one.partners, 100 * one.largest, f"{one.part} of {one.image}") for one in strong
         ]
-        yield Table((*heads, Column("largest", "", "%", "+.1f"), Column("which is with")), rows)
+        yield Table((*heads, Column("largest", "", "%", "+.1f"), Column("with")), rows)
         yield Note(
-            "The photographs can hardly separate these, as c from Z0 in a flat network. Photographs turned "
-            "about their axis, convergent ones, and an object with depth can."
+            "The photographs can hardly separate these, such as c from Z0 in a flat network. Photographs "
+            "rolled about their axis, convergent photographs, and an object with depth can."
         )
     else:
         yield Paragraph(
@@ -355,7 +357,7 @@ def _correlations(f: Findings) -> Iterator[Part]:
     )
     yield Paragraph(
         "Not significantly different from 0 (t test, 5 %; in brackets the value over its standard "
-        f"deviation): {tests}. Held at 0, each by itself would worsen the fit by no more than chance."
+        f"deviation): {tests}. Holding any one of them at 0 would worsen the fit by no more than chance."
         if tests
         else "All adjusted parameters differ significantly from 0 (t test, 5 %)."
     )
@@ -375,10 +377,10 @@ COMPONENTS = {
 
 
 def component_parts(f: Findings) -> Iterator[Part]:
-    """Yield the variance components of kinds of observation, cameras and photographs, the largest first."""
+    """Yield the variance components of kinds of observation, cameras and photographs, largest first."""
     yield Note(
-        "Variance components: sigma0 of a group over that stated beforehand; a group far above the others "
-        "was measured worse, or does not fit."
+        "Variance components: sigma0 of a group over the value stated beforehand. A group far above the "
+        "others was measured with less precision, or does not fit."
     )
     rows = sorted(component_rows(f.statistics), key=lambda row: -np.nan_to_num(row[-1]))
     for kind, name in (("kind", "kind of observation"), ("camera", "camera"), ("photograph", "photograph")):

@@ -1,4 +1,7 @@
-"""The report of a survey, in the order of a surveyor's questions: a section a function, a row in SECTIONS."""
+"""The report of a survey, in the order of a surveyor's questions.
+
+Each section is a function and a row of SECTIONS.
+"""
 
 from __future__ import annotations
 
@@ -55,13 +58,13 @@ from sfm.report.tables.csv_files import left_out_rows, table_stems
 from sfm.report.viewer.embedded import Viewer
 from sfm.result import likest_first
 
-MAX_LISTED = 60  # rejected points and small pictures on the page
+MAX_LISTED = 60  # rejected points and thumbnails on the page
 MAX_OPEN = 60  # object points that are shown without a click
 CONVENTIONS = (
     "Pixel frame: (0, 0) is the centre of the top-left pixel, x to the right, y down. Rotation: "
     "R = Rx(omega) Ry(phi) Rz(kappa) turns image axes (x right, y up, looking along -z) into object axes. "
     "Residuals are computed minus measured. A sigma is one standard deviation, a posteriori; w and minimal "
-    "bias rest on those of the weights."
+    "bias use the standard deviations behind the weights."
 )
 
 
@@ -80,7 +83,7 @@ class Report:
         return self.f.result.adjustment
 
     def plot(self, stem: str) -> Plot | None:
-        """Return a plot by the name of its file; None without it."""
+        """Return a plot by the stem of its file name; None if there is none."""
         return next((one for one in self.plots if one.stem == stem), None)
 
 
@@ -95,11 +98,11 @@ def page(
     """Return the report of a survey.
 
     Args:
-        found: the result and what is stated of it.
-        plots: the pictures of the adjustment.
-        overlays: the drawn photographs; links lead to the folder of overlays.
+        found: the findings of the result.
+        plots: pictures of the adjustment.
+        overlays: annotated photographs; links lead to the folder of overlays.
         has_model: whether the folder contains the compared solution as a COLMAP model.
-        viewer: the scene to explore, whose pictures may lie beside the page; None leaves it out.
+        viewer: the scene of the 3D viewer, whose pictures may be files beside the page; None omits it.
     """
     report = Report(found, plots, overlays, has_model)
     return Page(
@@ -115,13 +118,13 @@ def page(
 
 
 def text_report(found: Findings) -> str:
-    """Return report.txt: no dates and hosts, so that two reports can be compared."""
+    """Return the text of report.txt, without dates and hosts so that two reports can be compared."""
     files = f"Tables (.csv): {', '.join(table_stems(found))}."
     return "\n".join([text(page(found)), *wrapped(CONVENTIONS, behind=0), *wrapped(files, behind=0), ""])
 
 
 def _tiles(f: Findings) -> Iterator[Tile]:
-    """Yield the figures that a reader sees first."""
+    """Yield the key figures at the top of the page."""
     result, a = f.result, f.result.adjustment
     for one in f.calibrated[:2]:
         values, sigmas, within, projection = describe_calibration(one)
@@ -161,7 +164,7 @@ def _precision_tile(f: Findings) -> Tile:
 
 
 def worked(report: Report) -> Section:
-    """Return whether the survey worked: photographs, adjustment, rank, observations."""
+    """Return the section on whether the survey worked: photographs, adjustment, rank, observations."""
     f, a, result = report.f, report.a, report.f.result
     counts, failed = f.counts, result.failed
     oriented = f"{len(a.network.images)} of {result.images_total} oriented"
@@ -188,7 +191,7 @@ def worked(report: Report) -> Section:
     )
     rows = (
         ("image coordinates", counts.image),
-        ("coordinates of control with a standard deviation", counts.control),
+        ("control coordinates with a standard deviation", counts.control),
         ("parameters of exterior orientation", counts.exterior),
         ("parameters of interior orientation", counts.interior),
         ("scale bars", counts.scale_bars),
@@ -198,13 +201,13 @@ def worked(report: Report) -> Section:
         columns("observations", ">number"), [row for row in rows if row[1]], total=("all", counts.total)
     )
     fixes = agreeing(counts.constraints, "fixes|fix")
-    besides = f"Besides, {counted(counts.constraints, 'constraint')} {fixes} the datum."
+    besides = f"In addition, {counted(counts.constraints, 'constraint')} {fixes} the datum."
     lost = left_out("photograph", f)
     return Section(
         "Did it work?",
         *_calibrated(f),
         *(state, Heading("Observations"), observed, Paragraph(besides) if counts.constraints else None),
-        *((Heading("Photographs that are not in the result"), lost) if failed else ()),
+        *((Heading("Photographs not in the result"), lost) if failed else ()),
         report.plot("network"),
         key="worked",
     )
@@ -220,7 +223,7 @@ def left_out(kind: str, f: Findings) -> Table:
 
 
 def _calibrated(f: Findings) -> Iterator[Part]:
-    """Yield the cameras where they are the result."""
+    """Yield the calibrated cameras if they are the result of the survey."""
     if f.calibrated:
         rows = []
         for one in f.calibrated:
@@ -231,7 +234,7 @@ def _calibrated(f: Findings) -> Iterator[Part]:
 
 
 def quality(report: Report) -> Section:
-    """Return how good the survey is."""
+    """Return the section on the quality of the survey."""
     f = report.f
     photographs = Heading("Photographs")
     return Section(
@@ -248,7 +251,7 @@ def quality(report: Report) -> Section:
 
 
 def rejected(report: Report) -> Section:
-    """Return what was rejected or left out, and why."""
+    """Return the section on rejected and omitted points, with the reasons."""
     f, a, result = report.f, report.a, report.f.result
     parts: list[Part] = []
     limits, rows = f"Rejection: {f.protocol.limits}.", np.flatnonzero(a.rejected)
@@ -256,8 +259,8 @@ def rejected(report: Report) -> Section:
         parts.append(
             Paragraph(
                 f"{len(rows)} of {len(a.rejected)} image points were rejected in the adjustment "
-                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Their residuals are too long for their "
-                f"standard deviations; they took no part in the result. {limits}"
+                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Their residuals are too large for their "
+                f"standard deviations, so they do not contribute to the result. {limits}"
             )
         )
         parts += [_rejected_points(a), FoldedParts("Rejected rays by point", _rejected_rays(f), in_text=True)]
@@ -268,12 +271,12 @@ def rejected(report: Report) -> Section:
         seen = sum(one.image_points for one in result.left_out)
         lost = left_out("point", f)
         parts += [
-            Heading("Measured points that are not in the result"),
+            Heading("Measured points not in the result"),
             Paragraph(f"{counted(len(lost.rows), 'point')} with {counted(seen, 'image point')}."),
             lost,
         ]
     if result.no_circles:
-        why = "uncoded points were left out, their outlines are not the images of a circle in space:"
+        why = "uncoded points were left out because their outlines are not images of a circle in space:"
         words = f"{len(result.no_circles)} {why} {', '.join(result.no_circles)}"
         parts += [Heading("Points that are not circles"), Paragraph(words)]
     if result.photographs:
@@ -310,7 +313,7 @@ def _rejected_rays(f: Findings) -> Table:
 
 
 def _candidates(f: Findings) -> FoldedParts:
-    """Return what was measured in each photograph, and why other candidates were not."""
+    """Return the counts of measured targets and of other candidates, by reason, in each photograph."""
     result = f.result
     used = dict(zip(f.result.adjustment.network.images, f.geometry.image_points.tolist(), strict=True))
     counts = {one.image: Counter(dict(one.reasons())) for one in result.photographs}
@@ -327,15 +330,15 @@ def _candidates(f: Findings) -> FoldedParts:
         *map(every.get, reasons),
     )
     note = Note(
-        "Blobs that might have been targets and were not measured, by reason, those most like targets first. "
-        "Clutter in view makes many of them; the overlays show each."
+        "Blobs that might have been targets but were not measured, by reason; the most target-like first. "
+        "Clutter in view produces many of them. The overlays show each one."
     )
     heads = columns("photograph", ">measured", ">accepted in the result", *(f">{one}" for one in reasons))
     return FoldedParts("Candidates in the photographs", note, Table(heads, rows, total=total), open=True)
 
 
 def coordinates(report: Report) -> Section:
-    """Return where the coordinates are: the files of the folder, the object points, the orientations."""
+    """Return the section with the coordinates: files of the folder, object points, exterior orientation."""
     f, result, unit = report.f, report.f.result, report.f.result.length_unit
     corrected = "; corrected for eccentricity (the circle's centre)" if result.eccentricity else ""
     files = [
@@ -352,27 +355,27 @@ def coordinates(report: Report) -> Section:
         ),
         (
             "left_out.csv",
-            "photographs and points that were measured and are not in the result, with the reason",
+            "photographs and points that were measured but are not in the result, with the reason",
         ),
         (
             "given.csv",
-            "control, scale bars, interior and exterior orientation that took part: given value, difference, "
-            "standard deviation, redundancy number, w",
+            "given values that took part (control, scale bars, interior and exterior orientation): value, "
+            "difference, standard deviation, redundancy number, w",
         ),
         (
             "reliability.csv",
-            "of every image coordinate: residual [px], redundancy number, w, tau, minimal detectable bias "
+            "for every image coordinate: residual [px], redundancy number, w, tau, minimal detectable bias "
             "[px], external reliability [sigmas of an unknown]",
         ),
-        ("variance_components.csv", "sigma0 of kinds of observation, cameras and photographs"),
+        ("variance_components.csv", "sigma0 by kind of observation, by camera and by photograph"),
         ("points.ply", f"the object points as a point cloud [{unit}]"),
         ("report.txt", "the bundle report as plain text"),
-        ("summary.json", "the figures of this page for programs"),
+        ("summary.json", "the numbers of this page, for other programs"),
     ]
     if result.comparison and report.has_model:
         words = (
-            f"the solution that was compared, in COLMAP's camera model ({result.comparison.model}): free "
-            "datum, equal weights, without control and scale bars; the survey's result is above"
+            f"the compared solution in COLMAP's camera model ({result.comparison.model}): free datum, equal "
+            "weights, no control or scale bars; the survey's own result is in the files above"
         )
         files.append(("colmap/", words))
     points, photographs = _object_points(f), _exterior(f)
@@ -436,20 +439,20 @@ def _with_digits(pair: tuple[float, float]) -> str:
 
 
 def photographs(report: Report) -> Section:
-    """Return small pictures of the photographs with what was measured in them, leading to the large ones."""
+    """Return thumbnails of the photographs with their measured targets, linked to the full-size overlays."""
     f, overlays, images = report.f, report.overlays, report.a.network.images
     if not overlays:
-        none = Paragraph("The survey began with image points, there are no photographs to show.")
+        none = Paragraph("The survey started from image points, so there are no photographs to show.")
         return Section("The photographs", none, key="photographs", in_text=False)
     edges = ""
     if f.edges:
         edges = (
-            " Edges: median standard deviation of the edges of targets, by lens, focus, motion and pixels."
+            " Edges: median blur of target edges (standard deviation), from lens, focus, motion and pixels."
         )
     legend = Paragraph(
         "Green: accepted targets with their names; red: rejected in the adjustment; blue: measured, but "
         "not part of the result; yellow: residual vectors, enlarged; crosses: candidates that were not "
-        f"measured, coloured by reason. A click opens the photograph in full size.{edges}"
+        f"measured, coloured by reason. Click a picture to see it at full size.{edges}"
     )
     cards = []
     for one in overlays[:MAX_LISTED]:
@@ -462,13 +465,13 @@ def photographs(report: Report) -> Section:
             words += f", edges {fixed(f.edges[one.image], 2)} px"
         cards.append(Card(f"overlays/{one.file_name}", one.thumbnail, one.image, words))
     others = [(Link(one.image, f"overlays/{one.file_name}"),) for one in overlays[MAX_LISTED:]]
-    without = f"{counted(len(others), 'further photograph')}, without a small picture here"
+    without = f"{counted(len(others), 'further photograph')} without a thumbnail here"
     more = FoldedParts(without, Table(columns("photograph"), others)) if others else None
     return Section("The photographs", legend, Cards(cards), more, key="photographs", in_text=False)
 
 
 def process(report: Report) -> Section:
-    """Return how it was done: settings, times, corrections, conventions."""
+    """Return the section on processing: settings, times, corrections, conventions."""
     result = report.f.result
     written = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     times = [(one.stage, one.seconds) for one in result.seconds]
@@ -481,22 +484,22 @@ def process(report: Report) -> Section:
     eccentricity = None
     if found := result.eccentricity:
         eccentricity = Paragraph(
-            "Eccentricity: the centre of an ellipse is not the picture of the circle's centre. Image "
-            f"points were corrected by {fixed(found.rms_px, 4)} px RMS per coordinate, "
-            f"{fixed(found.largest_px, 4)} px at most; the correction has a standard deviation of "
-            f"{fixed(found.sigma_px, 5)} px, which is part of theirs."
+            "Eccentricity: the centre of an ellipse is not the image of the circle's centre. Image points "
+            f"were corrected by {fixed(found.rms_px, 4)} px RMS per coordinate, "
+            f"{fixed(found.largest_px, 4)} px at most. Their standard deviations include that of the "
+            f"correction, {fixed(found.sigma_px, 5)} px."
         )
     parts = (settings, seconds, eccentricity, Note(CONVENTIONS))
     return Section("How it was done", *parts, key="process", in_text=False)
 
 
 def comparison(report: Report) -> Section:
-    """Return whether the other adjuster agrees."""
+    """Return the section on the agreement with the other adjuster."""
     return Section("Does the other adjuster agree?", *adjuster_parts(report.f), key="comparison")
 
 
 def baseline(report: Report) -> Section:
-    """Return how another pipeline does on the photographs alone; nothing where the survey asks for none."""
+    """Return the section on another pipeline run on the photographs alone; empty if none was requested."""
     found = report.f.result.baseline
     return Section(f"And {found.name if found else ''} by itself?", *pipeline_parts(report.f), key="baseline")
 

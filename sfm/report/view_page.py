@@ -1,4 +1,4 @@
-"""The page of `kolinear view`: any stored result to explore, in one file."""
+"""The page of `kolinear view`: any stored result for exploration, in one file."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from sfm.report.viewer.pictures import BUDGET_MB, Pictures, ViewerScene, cut_pic
 from sfm.runtime.progress import SILENT, Progress
 
 MARK = b"<!DOCTYPE html>\n<!-- kolinear view -->\n"
-"""by which an earlier page is known, which a new one may replace"""
+"""identifies an earlier page, which a new one may replace"""
 
 
 def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
     """Return the page of a scene.
 
     Args:
-        scene: what is shown.
-        pictures: of its photographs.
-        source: what it was read from.
+        scene: scene of the viewer.
+        pictures: pictures of its photographs.
+        source: file or folder that the result was read from.
     """
     s, u = scene, scene.unit
     viewer = viewer_of(scene, pictures)
@@ -73,7 +73,7 @@ def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
 
 
 def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
-    """Return the page of a scene as HTML, with the mark by which it is known again."""
+    """Return the page of a scene as HTML, with the mark that identifies it."""
     text = html(page(scene, pictures=pictures, source=source))
     return text.replace("<!DOCTYPE html>\n", MARK.decode(), 1)
 
@@ -91,16 +91,16 @@ def write_view(
     """Write the page of a scene, whole or not at all.
 
     Args:
-        scene: what is shown.
-        out: the page; an earlier one is replaced, anything else in its place is an error.
-        source: what it was read from.
+        scene: scene of the viewer.
+        out: path of the page; an earlier page is replaced, anything else there is an error.
+        source: file or folder that the result was read from.
         paths: files of the photographs by name.
-        budget_mb: what the pictures inside may take, 10^6 bytes.
-        jobs: photographs cut at the same time.
+        budget_mb: maximum size of the pictures inside the page, 10^6 bytes.
+        jobs: photographs processed at the same time.
         progress: called for every photograph.
 
     Raises:
-        OutputError: something else is in its place, or it cannot be written.
+        OutputError: something else exists at this path, or the page cannot be written.
     """
     refuse_foreign_page(out)
     pictures = cut_pictures(scene, paths, budget_mb=budget_mb, jobs=jobs, progress=progress)
@@ -110,7 +110,7 @@ def write_view(
 
 
 def refuse_foreign_page(out: Path) -> None:
-    """Raise OutputError where something is in the place of a page that `kolinear view` has not written."""
+    """Raise OutputError if a path exists and is not a page written by `kolinear view`."""
     if out.is_file() and not out.is_symlink():
         with disk_errors(f"{out}: cannot be read"), out.open("rb") as file:
             if file.read(len(MARK)) == MARK:
@@ -119,11 +119,11 @@ def refuse_foreign_page(out: Path) -> None:
 
 
 def photographs_in(folder: Path, names: tuple[str, ...]) -> dict[str, Path]:
-    """Return the photographs of some names that are in a folder; names that lead out of it have none."""
+    """Return the photographs of given names in a folder; names that lead out of the folder are left out."""
     root = folder.resolve()
     found = {}
     for name in names:
-        with suppress(OSError, ValueError):  # a name that is no name of a file here
+        with suppress(OSError, ValueError):  # a name that is not a valid file name here
             path = (root / name).resolve()
             if path.is_relative_to(root) and path.is_file():
                 found[name] = path

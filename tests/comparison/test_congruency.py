@@ -140,7 +140,7 @@ def test_a_change_of_size_is_a_change_where_both_have_a_scale() -> None:
     longer = epoch(3, "free", bar=1.01)
     found = compare_results(epoch(2, "free"), longer)
     assert found.changed is True and found.a_from_b.scale == 1.0
-    assert describe_scale(found) == "scale kept: both results have one"
+    assert describe_scale(found) == "scale kept: both results are scaled"
     unscaled = compare_results(epoch(2, "free"), replace(longer, unit=""))
     assert unscaled.changed is False and unscaled.scale_estimated
     assert unscaled.a_from_b.scale == pytest.approx(1 / 1.01, rel=1e-3)

@@ -65,12 +65,12 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
 def test_words() -> None:
     still, moved, _ = (pair.displacements for pair in series().pairs)
     assert tuple(remarks_of_pair(still)) == ()
-    assert describe_stable(still) == "All 60 points of reference agree."
+    assert describe_stable(still) == "All 60 reference points agree."
     (one,) = remarks_of_pair(moved)
     assert one.kind == "displaced" and one.names("points") == ("5", "17", "22", "41")
     assert abs(one.number("distance") - 0.01) < 1e-3 and one.number("tested") == 60
     assert verdict_of_epochs(series()).level == "fair"
-    assert "56 of 60 points of reference are proposed as stable" in describe_stable(moved)
+    assert "56 of 60 reference points are proposed as stable" in describe_stable(moved)
 
 
 def test_refusals_are_one_line() -> None:

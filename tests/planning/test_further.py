@@ -68,7 +68,7 @@ def test_further_photographs_of_a_rig_are_single_ones() -> None:
     assert found.camera == "camera 1" and (found.after < found.before).all()
     moment = found.adjustment.network.moment
     assert moment is not None and moment.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 5]
-    single = "They are single photographs by camera camera 1, without the others of its rig."
+    single = "These are single photographs by camera camera 1, without the others of its rig."
     stated = page_of(found, result=Solution("rig", network, truth, unit="m")).verdict
     assert isinstance(stated, Banner) and single in [line.text for line in stated.lines]
 

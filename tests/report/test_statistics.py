@@ -382,16 +382,16 @@ def test_control_that_contradicts_is_separated_from_the_image_points(
     assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
     figure, words = describe_sigma0(sigma0_of(result))
     assert figure == f"{a.sigma0_px:.4f} px"
-    assert f"image points by themselves {own:.4f} px" in words
+    assert f"image points alone {own:.4f} px" in words
     page = " ".join(html_of(findings_of(result)).split())
     assert figure in page and words in page
-    assert re.search(rf"by the image points alone +{own:.5f}  px", text_report(findings_of(result)))
+    assert re.search(rf"from the image points alone +{own:.5f}  px", text_report(findings_of(result)))
     written = summary(findings_of(result))["statistics"]
     assert written["image_points_px"] == pytest.approx(own) and written["stated_px"] == pytest.approx(
         NOISE_PX
     )
     free = result_of(adjust(network, truth, datum=Datum("free")))
-    assert "by themselves" not in " ".join(describe_sigma0(sigma0_of(free)))
+    assert "points alone" not in " ".join(describe_sigma0(sigma0_of(free)))
 
 
 def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(
@@ -427,7 +427,7 @@ def test_the_global_test_of_an_m_estimator_is_left_out_with_the_reason(
     synthetic: tuple[Network, Estimate], reject: str
 ) -> None:
     network, truth = synthetic
-    reason = "not tested, the weights come from the residuals, so that v'Pv is not chi-square distributed"
+    reason = "not tested, the weights come from the residuals, so v'Pv is not chi-square distributed"
     for one, of in (
         (network, "all observations"),
         (with_bars(network, truth, (0.0, 1e-5), 1e-4), "image points"),
@@ -463,7 +463,7 @@ def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate])
     bars = with_bars(known, truth, (0.0,), 1e-4)
     barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
     page = " ".join(html_of(findings_of(barred)).split())
-    assert "by the control lengths are 1.0025 times those of the scale bars" in page
+    assert "lengths by the control are 1.0025 times those by the scale bars" in page
     words = describe_check(check, "m")
     assert "largest 173 µm" in words and words in page and words in text_report(findings_of(barred))
     assert "A single bar gives the scale" in page
@@ -671,7 +671,7 @@ def test_comparison_tells_what_it_changed(compared: tuple[Adjustment, AdjusterCo
     result = replace(result_of(a), comparison=both)
     page = html_of(findings_of(result))
     assert "k&lt;4&gt; of camera 1" in page and "camera 1: k3" in page
-    assert f"{both.conversions[0].rms_px:.4f}" in page and "Cameras written in another model" in page
+    assert f"{both.conversions[0].rms_px:.4f}" in page and "Cameras converted to another model" in page
     text = summary(findings_of(result))["comparison"]
     assert text["conversions"][0]["max_px"] == both.conversions[0].max_px
     assert text["held"] == ["k<4> of camera 1"] and text["freed"] == ["camera 1: k3"]

@@ -86,8 +86,8 @@ def test_what_has_no_coordinates_is_left_out_and_reported() -> None:
     assert len(made.photographs) == 5 and len(made.points) == 39
     assert one.network.points[7] not in made.points and one.network.images[2] not in made.photographs
     assert made.notes == (
-        "1 of 6 photographs have no coordinates: left out.",
-        "1 of 40 points have no coordinates: left out.",
+        "1 of 6 photographs have no coordinates: omitted.",
+        "1 of 40 points have no coordinates: omitted.",
     )
     assert made.rms_px == pytest.approx(0.1, rel=0.15)
 

@@ -1,4 +1,4 @@
-"""Figures of comparisons, of measured results, and of the sizes of targets."""
+"""Figures of comparisons, of inspections, and of target sizes for planning."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from sfm.report.phrases import finer_unit, significant
 BINS = 30
 COLOURS = {IN: GREEN, OUT: RED}
 SIZE_IN = (7.0, 4.5)
-DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # lines of the diagram
-MAX_DRAWN = 12  # points of a series that are drawn, those that moved farthest
-BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
-LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
+DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # px across the target, one line of the diagram each
+MAX_DRAWN = 12  # points drawn of a series: those that moved farthest
+BANDS = "Displacements since the first epoch along their latest direction; bands of two standard deviations."
+LONGEST_ARROW = 0.1  # length of the largest difference over the size of the object
 
 
 def difference_figure(
     xyz: FloatArray, difference: FloatArray, significant_ones: BoolArray, unit: str
 ) -> Figure:
-    """Draw differences as arrows on the object's main plane, and across it as colours.
+    """Draw differences: their part in the object's main plane as arrows, the part across it as colours.
 
     Args:
         xyz: coordinates, object unit, (n, 3).
         difference: object unit, (n, 3).
         significant_ones: drawn in red, (n,).
-        unit: the object unit, empty where it is not known.
+        unit: the object unit, empty if it is not known.
     """
     plane, names = plan_axes(xyz)
     turned, d = xyz @ plane.T, difference @ plane.T
@@ -101,7 +101,7 @@ def time_figure(validation: Validation) -> Figure:
 
 
 def plot_series(found: EpochSeries) -> Plot | None:
-    """Return the series of the points that moved farthest; None with two epochs, or where none moved."""
+    """Plot the series of the points that moved farthest; None with two epochs, or if no point moved."""
     if len(found.names) < 3:
         return None
     pairs = [pair.displacements for pair in found.since_first]
@@ -131,7 +131,7 @@ def plot_series(found: EpochSeries) -> Plot | None:
 
 
 def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
-    """Displacements of a point since the first epoch along its last direction, and their sigmas."""
+    """Return displacements of a point since the first epoch along its latest direction, and their sigmas."""
     rows = [one.differences.points.index(name) if name in one.differences.points else -1 for one in pairs]
     last, k = next((one, k) for one, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
     direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
@@ -157,21 +157,21 @@ def design_diagram(
     tilt_deg: float = 0.0,
     lines: Sequence[float] = DIAGRAM_PIXELS,
 ) -> bytes:
-    """Return the design diagram as SVG: diameter of the dot over the distance, a line for each least size.
+    """Return the design diagram as SVG: dot diameter over distance, with a line for each minimum size.
 
     Args:
         w_mm: width of the sensor, mm.
-        d: farthest distance of the camera from the object, which the diagram ends at.
+        d: farthest distance of the camera from the object, where the diagram ends.
         c_mm: principal distance (focal length), mm.
         n: pixels along the width of the photograph.
-        unit: of the distance and the diameter.
+        unit: unit of the distance and the diameter.
         tilt_deg: largest angle between the ray and the normal of a target, deg.
-        lines: pixels across the target, at least, of each line.
+        lines: minimum size of the target in the photograph for each line, px.
 
     Raises:
-        GeometryError: a number that is not positive, or a tilt at which targets are not recognised.
+        GeometryError: a number is not positive, or targets are not recognised at this tilt.
 
-    Source: document 000, fig. 2.11, there for 7 px and a camera of 18 mm.
+    Source: document 000, fig. 2.11, drawn there for 7 px and a camera of 18 mm.
     """
     figure = Figure(figsize=SIZE_IN, layout="constrained")
     FigureCanvasSVG(figure)
@@ -195,7 +195,7 @@ def design_diagram(
 
 
 def deviation_figure(found: Deviations, unit: str) -> Figure:
-    """Draw the histogram of deviations, and each with its uncertainty, in the order of their size."""
+    """Draw a histogram of the deviations, and each deviation with its uncertainty in ascending order."""
     limits = [x for x in (found.lower, found.upper) if np.isfinite(x)]
     largest = float(np.abs([*found.value, *limits]).max())
     factor, fine = finer_unit(unit, largest)
@@ -216,7 +216,7 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
 
 
 def length_error_figure(found: Acceptance) -> Figure:
-    """Draw the errors of length measurement over the length, with their limit."""
+    """Draw the length measurement errors over the length, with their limits."""
     length, error = found.lengths.length, found.error
     U = found.coverage * np.nan_to_num(found.lengths.sigma)
     factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
@@ -239,7 +239,7 @@ def length_error_figure(found: Acceptance) -> Figure:
 def _draw_decided(
     axes: Axes, x: AnyArray, y: FloatArray, U: FloatArray, decision: AnyArray, size: float
 ) -> None:
-    """Draw values with their uncertainty, in a colour for each decision."""
+    """Draw values with their uncertainty, one colour per decision."""
     for name in dict.fromkeys(decision.tolist()):
         rows = decision == name
         colour, label = COLOURS.get(name, ORANGE), f"{name} ({rows.sum()})"

@@ -1,4 +1,4 @@
-"""Overlays: photographs with their targets and residuals, and patches that were matched."""
+"""Overlays: photographs with their targets and residuals, and pictures of matched patches."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from sfm.result import PhotographTargets, SurveyResult, in_words
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.outlines import Flag
 
-PANEL = 168  # least side of a patch in the picture, px
-ZOOM = 8  # least side of one of its pixels, px
+PANEL = 168  # minimum side of a patch in the picture, px
+ZOOM = 8  # minimum side of one of its pixels in the picture, px
 GAP = 4  # between the patches, px
 MAX_PICTURES = 25  # points in one picture
 LINE = 20  # height of a line of text, px
-LETTER = 9  # width of a letter at most, px
-MAX_LETTERS = 160  # of a line; names may be long
+LETTER = 9  # maximum width of a letter, px
+MAX_LETTERS = 160  # in a line; names may be long
 MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720
 JPEG_QUALITY = 82
-ARROW_PX = 22.0  # length in the picture of a residual of the size of the RMS
-MAX_NAMED_POINTS = 300  # image points of a photograph; more of them are drawn as dots without names
-CROWDED_ARROW_PX = 8.0  # the same length where photographs are crowded, which keeps the vectors apart
+ARROW_PX = 22.0  # length in the picture of a residual that equals the RMS
+MAX_NAMED_POINTS = 300  # image points of a photograph; beyond this they are drawn as dots without names
+CROWDED_ARROW_PX = 8.0  # the same length in crowded photographs, to keep the vectors apart
 DOT_PX = 2  # radius of such a dot
 LABEL_SIZE = 0.5  # of OpenCV's Hershey font
-SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
-SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
+SAME_PX = 0.5  # maximum distance from a target to its image point, which re-measurement may have moved
+SHIFT = 4  # fractional bits of the coordinates that OpenCV takes
 # Colours in OpenCV's order blue, green, red.
 USED, DROPPED, UNUSED, ARROW, INK, PAPER = (
     (110, 255, 110),
@@ -83,15 +83,15 @@ class Overlay:
 
 
 def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = SILENT) -> tuple[Overlay, ...]:
-    """Draw all readable photographs of a survey.
+    """Draw the overlays of all readable photographs of a survey.
 
     Args:
-        result: the result; its photographs are read again from their files.
+        result: result of the survey; its photographs are read again from their files.
         jobs: photographs drawn at the same time.
         progress: called for every photograph.
 
     Returns:
-        The overlays in the order of the photographs; those that can no longer be read are left out.
+        The overlays in the order of the photographs, without photographs that can no longer be read.
     """
     factor = arrow_factor(result.adjustment)
     names = overlay_names(tuple(photograph.image for photograph in result.photographs))
@@ -120,15 +120,15 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
 
 
 def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, factor: float) -> AnyArray:
-    """Draw one photograph.
+    """Draw the overlay of one photograph.
 
     Args:
-        photograph: its file and photograph.
+        photograph: the photograph with its targets.
         adjustment: gives ids, residuals and rejections of its image points.
-        factor: how many times as long as they are the residual vectors are drawn.
+        factor: magnification of the residual vectors.
 
     Returns:
-        Picture, shape (H, W, 3), uint8, blue, green, red.
+        Picture in the channel order blue, green, red, uint8, shape (H, W, 3).
 
     Raises:
         PhotographError: the file can no longer be read.
@@ -161,7 +161,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
 
 
 def arrow_factor(adjustment: Adjustment) -> float:
-    """Return by what residual vectors are enlarged: 1, 2 or 5 times a power of ten."""
+    """Return the magnification of residual vectors: 1, 2 or 5 times a power of ten."""
     rms, network = adjustment.rms_px, adjustment.network
     if not np.isfinite(rms) or rms <= 0:
         return 1.0
@@ -172,7 +172,7 @@ def arrow_factor(adjustment: Adjustment) -> float:
 
 
 def overlay_names(images: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a file name for the overlay of each photograph; no two are equal, in small letters either."""
+    """Return a file name for the overlay of each photograph; names differ even without regard to case."""
     names: list[str] = []
     taken: set[str] = set()
     for image in images:
@@ -196,7 +196,7 @@ def _image_points(image: str, adjustment: Adjustment) -> tuple[IntArray, tuple[s
 
 
 def nearest_image_points(xy: FloatArray, measured: FloatArray) -> IntArray:
-    """Return for each target of a photograph the image point that was made of it, -1 for none, (k,).
+    """Return the index of the image point that each target became, -1 for none, shape (k,).
 
     Args:
         xy: centres of the targets, px, (k, 2).
@@ -209,17 +209,17 @@ def nearest_image_points(xy: FloatArray, measured: FloatArray) -> IntArray:
 
 
 def _remarks(photograph: PhotographTargets) -> IntArray:
-    """Return the remarks on the measured targets, none where they were not kept, (k,)."""
+    """Return the remark flags of the measured targets, 0 if they were not kept, shape (k,)."""
     return np.zeros(len(photograph.xy), np.int64) if photograph.flag is None else photograph.flag
 
 
 def _drawn(xy: FloatArray, scale: float) -> AnyArray:
-    """Return positions as OpenCV takes them with SHIFT fractional bits; half pixels move with the scale."""
+    """Return positions with SHIFT fractional bits, as OpenCV takes them, scaled about the pixel corner."""
     return np.round(((xy + 0.5) * scale - 0.5) * (1 << SHIFT)).clip(-(2**28), 2**28).astype(np.int32)
 
 
 def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]], scale: float) -> None:
-    """Draw lines of no length, as thick as the dots: all of one colour at once."""
+    """Draw dots as lines of zero length and the thickness of a dot, all dots of one colour at once."""
     at = np.repeat(_drawn(xy, scale)[:, None], 2, axis=1)
     for one_colour in dict.fromkeys(colour):
         dots = at[[one == one_colour for one in colour]]
@@ -229,7 +229,7 @@ def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]],
 def _outlines(
     picture: AnyArray, photograph: PhotographTargets, colour: list[tuple[int, int, int]], scale: float
 ) -> None:
-    """Draw the outlines of targets, and one more around these for each remark."""
+    """Draw the outlines of targets, each with one further outline around it per remark."""
     remarks = _remarks(photograph)
     for k, at in enumerate(_drawn(photograph.xy, scale).tolist()):
         colours = [colour[k], *(second for remark, second in REMARK_COLOURS if remarks[k] & remark.value)]
@@ -241,7 +241,7 @@ def _outlines(
 
 
 def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) -> None:
-    """Draw rejected candidates, of which a photograph may have thousands, all of one flag at once."""
+    """Draw rejected candidates, all of one flag at once; a photograph may have thousands."""
     at = _drawn(xy, scale)
     for value in np.unique(flag).tolist():
         colour = next((colour for reason, colour in REASON_COLOURS if value & reason.value), INK)
@@ -308,17 +308,17 @@ def fitted_picture(picture: AnyArray, side: int) -> AnyArray:
     if scale >= 1:
         return picture
     size = round(width * scale), round(height * scale)
-    # OpenCV averages whole blocks some ten times as fast as parts of pixels
+    # OpenCV averages whole blocks about ten times as fast as fractions of pixels.
     blocks = [k for k in range(2, int(1 / scale) + 1) if width % k == height % k == 0]
     if blocks:
         whole = width // blocks[-1], height // blocks[-1]
         picture = cv2.resize(picture, whole, interpolation=cv2.INTER_AREA)
-    few = max(picture.shape[:2]) < 2 * side  # pixels to one, which four neighbours stand for
+    few = max(picture.shape[:2]) < 2 * side  # source pixels per pixel, so that four neighbours suffice
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if few else cv2.INTER_AREA))
 
 
 def jpeg_of(picture: AnyArray, quality: int) -> bytes:
-    """Return a picture as JPEG of a quality of 1 to 100."""
+    """Return a picture as JPEG with a quality from 1 to 100."""
     _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data.tobytes())
 
@@ -326,11 +326,12 @@ def jpeg_of(picture: AnyArray, quality: int) -> bytes:
 def draw_patches(
     names: tuple[str, ...], left: AnyArray, right: AnyArray, found: ConjugatePoints, template_px: int
 ) -> AnyArray:
-    """Return template, matched patch (in the template's intensities) and difference, a row for each point.
+    """Return a picture with template, matched patch and difference of each point in a row.
 
-    Above each row stand the name and r; of points that were not matched, the reason and the template, if it
-    lies inside. The difference is grey where there is none and saturates at a quarter of the scale of the
-    template. The last line states if not all points are drawn.
+    The matched patch is converted to the template's intensities. The name and r are written above each row.
+    A point that was not matched has the reason there, and only its template if that lies inside the
+    photograph. The difference is mid-grey at zero and saturates at a quarter of the range of the template.
+    A last line is added if not all points are drawn.
     """
     zoom = max(ZOOM, math.ceil(PANEL / template_px))
     drawn = min(len(found), MAX_PICTURES)
@@ -349,7 +350,7 @@ def draw_patches(
 def _panels(
     left: AnyArray, right: AnyArray, found: ConjugatePoints, k: int, template_px: int, zoom: int
 ) -> list[AnyArray]:
-    """Return the patches of one point beside each other; none if its template is outside."""
+    """Return the patches of one point side by side; none if its template is outside the photograph."""
     half = template_px // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
     template = resample(left, found.left[k] + np.stack([u, v], axis=-1), interpolation="bilinear")
@@ -373,7 +374,7 @@ def _panels(
 
 
 def _caption(name: str, found: ConjugatePoints, k: int) -> str:
-    """Return name, r and reason in the letters that OpenCV can draw."""
+    """Return name, r and reason in characters that OpenCV can draw."""
     r = float(found.correlation[k])
     what = f"{name}  r {r:.4f}" if math.isfinite(r) else name
     line = f"{what}  not matched: {found.reason[k]}" if found.reason[k] else what
@@ -381,12 +382,12 @@ def _caption(name: str, found: ConjugatePoints, k: int) -> str:
 
 
 def _text(line: str, width: int) -> AnyArray:
-    """Return a line of text, black on white."""
+    """Return a picture of a line of text, black on white."""
     row = np.full((LINE, width), 255, np.uint8)
     cv2.putText(row, line, (2, LINE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 0, 1, cv2.LINE_AA)
     return row
 
 
 def _widened(row: AnyArray, width: int) -> AnyArray:
-    """Return a row with white to its right."""
+    """Return a picture padded with white on the right."""
     return np.pad(row, ((0, 0), (0, width - row.shape[1])), constant_values=255)

@@ -1,4 +1,4 @@
-"""Data for the plots of a report, apart from the code that finds or draws them."""
+"""Data for the plots of a report, separate from the code that computes or draws them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from sfm.conventions import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture of a page, whole and in its panels."""
+    """A picture of a page, as a whole and cut into its panels."""
 
     stem: str  # of its file name
     caption: str
     png: bytes
-    panels: tuple[bytes, ...]  # PNG each, row by row: a page puts as many beside one another as are legible
+    panels: tuple[bytes, ...]  # a PNG each, row by row; a page puts as many side by side as are legible
     kind: ClassVar[str] = "figure"  # among the parts of a page
 
 
 @dataclass(frozen=True)
 class PlotCamera:
-    """A camera as people know it, whatever varies between its photographs."""
+    """A camera as its user knows it, even if parameters vary between its photographs."""
 
     name: str
     c_px: float
@@ -33,8 +33,8 @@ class ProjectionMap:
     """Projection uncertainty of a camera over its photographs."""
 
     x: FloatArray  # columns of a grid, px, (c,)
-    y: FloatArray  # rows of it, px, (r,)
-    sigma: FloatArray  # root mean square of both coordinates, px; NaN where the model folds over, (r, c)
+    y: FloatArray  # rows of the grid, px, (r,)
+    sigma: FloatArray  # RMS of both coordinates, px; NaN where the model folds over, (r, c)
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ class PlotData:
     rotation: FloatArray  # from camera to object axes, (m, 3, 3)
     points: FloatArray  # object points, object unit, (n, 3)
     cameras: tuple[PlotCamera, ...]
-    camera: IntArray  # index of that of each photograph, (m,)
+    camera: IntArray  # index of the camera of each photograph, (m,)
     image: IntArray  # photograph of each image point, (k,)
     xy: FloatArray  # image coordinates, px, (k, 2)
-    from_centre: FloatArray  # the same from the middle of the photograph, px, (k, 2)
+    from_centre: FloatArray  # image coordinates from the centre of the photograph, px, (k, 2)
     residuals: FloatArray  # px, (k, 2)
     standardised: FloatArray  # residuals over their standard deviation a posteriori, (2k,)
     image_rms_px: FloatArray  # root mean square residual per coordinate of each photograph, px, (m,)
-    image_points: IntArray  # number of each photograph, (m,)
+    image_points: IntArray  # accepted image points of each photograph, (m,)
     rms_px: float  # of all
     sigma: FloatArray  # of the points, RMS of sX, sY, sZ; NaN where fixed or not known, (n,)
-    sigma_unit: str  # of these
-    projection: tuple[ProjectionMap | None, ...]  # of each camera; None where nothing of it was adjusted
+    sigma_unit: str  # unit of sigma
+    projection: tuple[ProjectionMap | None, ...]  # of each camera; None if no parameter was adjusted
     epipolar: tuple[EpipolarMap, ...] = ()  # of each mount of a rig

@@ -1,6 +1,7 @@
-"""A process that draws the plots of a report while others measure and adjust.
+"""A process that draws the plots of a report while the survey is measured and adjusted.
 
-Importing matplotlib and drawing with it takes a second of Python, and threads take turns in Python.
+Importing matplotlib and drawing with it takes a second of Python time. Threads share that time, a process
+does not.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from threading import Thread
 
 from sfm.report.figures.plot_data import Plot, PlotData
 
-# Nothing of the current folder, the environment or a user's packages is imported before the paths of this
-# process are known; multiprocessing would, and would run the program of this process again.
+# The process imports nothing from the current folder, the environment or a user's packages before it has the
+# paths of this process. multiprocessing would import them, and would run the program of this process again.
 BEGIN = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
     "from sfm.report.figures.plot_process import serve; serve()"
@@ -24,20 +25,20 @@ BEGIN = (
 
 
 def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
-    """Draw every plot of a report in this process."""
+    """Draw every plot of a report in the current process."""
     from sfm.report.figures.plots import all_plots
 
     return all_plots(shown)
 
 
 class PlotProcess:
-    """Draws the plots of one report.
+    """A separate process that draws the plots of one report.
 
-    It ends with the process that began it, whatever ends that: no other process has the ends of its pipes.
-    Ctrl-C does not reach it, as it is in a separate session.
+    It ends when its parent process ends for any reason, as no other process has the ends of its pipes.
+    Ctrl-C does not reach it, as it runs in a separate session.
 
     Raises:
-        OSError: it cannot be started, as with a limit on processes.
+        OSError: it cannot be started, for example because of a limit on processes.
     """
 
     def __init__(self) -> None:
@@ -53,7 +54,7 @@ class PlotProcess:
         self._send(list(sys.path))
 
     def begin(self, shown: PlotData) -> None:
-        """Begin to draw; the process may still be importing, and a pipe takes little."""
+        """Start drawing, from a thread: the process may still be importing, and its pipe buffers little."""
         self._shown = shown
         sender = Thread(target=self._send, args=(shown,), daemon=True)
         try:
@@ -64,9 +65,9 @@ class PlotProcess:
             self._sender = sender
 
     def plots(self) -> tuple[Plot, ...]:
-        """Return what was begun; drawn here if the process has ended, so that a fault is one of this process.
+        """Return the plots begun before; draw them here if the process has ended.
 
-        Others may end it for want of memory.
+        The system may end it for lack of memory. A fault in drawing then shows in this process.
         """
         assert self._shown is not None and self._process.stdout is not None, "begin first"
         try:
@@ -76,18 +77,18 @@ class PlotProcess:
         return plots
 
     def close(self) -> None:
-        """End the process, which has nothing that could be left half-done."""
+        """End the process, which leaves nothing half-done."""
         self._process.kill()
         self._process.wait()
         if self._sender is not None:
             self._sender.join()
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
-            with suppress(OSError):  # what was not sent has nowhere to go
+            with suppress(OSError):  # data not yet sent is lost
                 pipe.close()
 
     def _send(self, what: object) -> None:
-        """Send something, or end the process: `plots` waits for it otherwise."""
+        """Send an object, or end the process, for which `plots` would otherwise wait."""
         assert self._process.stdin is not None
         try:
             pickle.dump(what, self._process.stdin)
@@ -98,10 +99,10 @@ class PlotProcess:
 
 @contextmanager
 def plot_process(jobs: int) -> Iterator[PlotProcess | None]:
-    """Give a process that draws plots; None where one has to do everything, or none can be started.
+    """Yield a process that draws plots; None with a single job, or if none can be started.
 
     Args:
-        jobs: how much may be worked on at a time.
+        jobs: number of tasks that may run at the same time.
     """
     process = None
     if jobs > 1 and sys.executable and not getattr(sys, "frozen", False):
@@ -115,8 +116,8 @@ def plot_process(jobs: int) -> Iterator[PlotProcess | None]:
 
 
 def serve() -> None:
-    """Draw what comes in by stdin, out to stdout, until its reader is gone; faults are for who began this."""
-    # what a library prints must not come between
+    """Draw the plot data from stdin and write plots to stdout, until the reader is gone or a fault occurs."""
+    # what a library prints must not mix with the plots
     given, drawn, sys.stdout = sys.stdin.buffer, sys.stdout.buffer, sys.stderr
     with suppress(Exception):
         import sfm.report.figures.plots  # noqa: F401  # while the survey is measured
@@ -124,4 +125,4 @@ def serve() -> None:
         while True:
             pickle.dump(draw_plots(pickle.load(given)), drawn)
             drawn.flush()
-    os._exit(0)  # nothing is left to write, and no one to write it to
+    os._exit(0)  # there is nothing left to write, and no reader

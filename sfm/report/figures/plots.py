@@ -1,4 +1,4 @@
-"""Pictures of an adjustment: network, residuals over the format, their distribution, the photographs."""
+"""Pictures of an adjustment: network, residuals over the format, residual statistics, photographs."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
-COMPRESSION = 2  # of PNG, 1 to 9: more takes its time and hardly makes lines on white smaller
-WIDTH_IN = 9.6  # of pictures of two panels
-ALONE_IN = 6.0  # of pictures of one
+COMPRESSION = 2  # of PNG, 1 to 9: more takes time and hardly shrinks lines on white
+WIDTH_IN = 9.6  # of pictures with two panels
+ALONE_IN = 6.0  # of pictures with one panel
 LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.9, 0.15, 0.55, 0.35, 1.05  # margins
-BAR_FRACTION = 0.2  # of a panel, for the scale of its colours with its labels
-LETTER_IN = 0.065  # width of a letter of the names of photographs
-# Large values are far from the paper, small ones not too near, on light pages and turned over on dark ones.
+BAR_FRACTION = 0.2  # of a panel, for its colour bar with labels
+LETTER_IN = 0.065  # width of a letter in the names of photographs
+# Large values contrast most with the paper and small ones still do, on light pages and inverted on dark ones.
 SHADES = ListedColormap(colormaps["viridis"](np.linspace(0.8, 0.0, 256)))
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
-LEVELS = 11  # of the projection uncertainty, in equal ratios
-OUTSIDE = 0.02  # of the photograph is under the lowest of them
-CELLS = 12  # of the grid of mean residuals along the longer side
+LEVELS = 11  # contours of the projection uncertainty, in equal ratios
+OUTSIDE = 0.02  # part of the photograph below the lowest contour
+CELLS = 12  # cells of the grid of mean residuals along the longer side
 TITLES = ("Plan", "Elevation")
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
 
@@ -55,7 +55,7 @@ def all_plots(shown: PlotData) -> tuple[Plot, ...]:
 
 
 def plot(stem: str, caption: str, figure: Figure) -> Plot:
-    """Draw a figure, and cut it into its panels where it is `panelled`."""
+    """Draw a figure, and cut it into its panels if it is `panelled`."""
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
@@ -73,7 +73,7 @@ def _png(pixels: AnyArray) -> bytes:
 
 
 def _cells(figure: Figure) -> list[tuple[slice, slice]]:
-    """Return rows and columns of pixels of each panel that shows something, with its labels."""
+    """Return the pixel rows and columns of each visible panel, including its labels."""
     specs = [panel.get_subplotspec() for panel in figure.axes if panel.axison]
     shown = [spec.get_topmost_subplotspec() for spec in specs if spec is not None]
     grid = shown[0].get_gridspec()
@@ -86,12 +86,12 @@ def _cells(figure: Figure) -> list[tuple[slice, slice]]:
 
 
 def alone(height_in: float) -> Figure:
-    """Return a figure for one panel, no wider than a telephone makes legible."""
+    """Return a figure for one panel, narrow enough to be legible on a telephone."""
     return Figure(figsize=(ALONE_IN, height_in), layout="constrained")
 
 
 def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
-    """Return a figure with margins for rows of two panels; matplotlib's layouts draw everything twice."""
+    """Return a figure with margins for rows of two panels; matplotlib's layouts would draw twice."""
     each_in = (height_in - TOP_IN - bottom_in - (rows - 1) * BETWEEN_IN) / rows
     figure = Figure(figsize=(WIDTH_IN, height_in))
     figure.subplots_adjust(
@@ -106,14 +106,14 @@ def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -
 
 
 def entitled(panel: Axes, title: str) -> None:
-    """Put a title above a panel, where it is; matplotlib else measures all labels to find the place."""
+    """Put a title above a panel at a fixed height; otherwise matplotlib measures all labels to place it."""
     panel.set_title(title, y=1.0, fontsize=10)
 
 
-_NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
+_NETWORK = "Photographs (pyramids that open towards the object) and object points."
 _RESIDUALS = (
-    "Residual vectors over the format of each camera, enlarged by the factor behind ×: all of them, and "
-    "their mean in each cell. A pattern in the means is distortion that the camera model does not describe."
+    "Residual vectors over the format of each camera, enlarged by the factor after ×: all vectors, and the "
+    "mean of each cell. A pattern in the means is distortion that the camera model does not describe."
 )
 _DISTRIBUTION = (
     "Residuals divided by their standard deviations, against the normal distribution, and residuals by "
@@ -122,18 +122,18 @@ _DISTRIBUTION = (
 _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points of each photograph."
 _PRECISION = (
     "Precision of the object points: 1 sigma, root mean square of sX, sY, sZ; the 95 % value is 1.96 times "
-    "it. The ends of the scale are the smallest and the largest."
+    "as large. The colour scale runs from the smallest to the largest value."
 )
 _PROJECTION = (
-    "Projection uncertainty of each camera: 1 sigma per image coordinate with which the calibration knows "
-    "where a direction is seen, a rotation of the camera taken out; the 95 % value is 1.96 times it. Dots "
-    "are the image points: beyond them the distortion is extrapolated."
+    "Projection uncertainty of each camera: the standard deviation per image coordinate with which the "
+    "calibration predicts where a direction is imaged, apart from a rotation of the camera. The 95 % value "
+    "is 1.96 times as large. Dots are the image points; beyond them the distortion is extrapolated."
 )
 
-
 _EPIPOLAR = (
-    "Distances of image points from the epipolar lines of the reference camera, points seen by both at one "
-    "moment. A pattern is distortion that the camera model does not describe, or a moment that is none."
+    "Distances of image points from the epipolar lines of the reference camera, for points seen by both at "
+    "one moment. A pattern is distortion that the camera model does not describe, or photographs that were "
+    "not taken at one moment."
 )
 
 
@@ -151,7 +151,7 @@ def epipolar_figure(shown: PlotData) -> Figure:
 
 
 def _two_in_a_row(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with so many panels for formats of photographs."""
+    """Return a figure with the given number of panels for photograph formats."""
     rows = -(-count // 2)
     figure = panelled(4.4 * rows, rows=rows)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
@@ -161,7 +161,7 @@ def _two_in_a_row(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def _show_format(panel: Axes, size_px: tuple[int, int], title: str) -> None:
-    """Let a panel show the format of a photograph, below a title."""
+    """Set up a panel to show the format of a photograph, below a title."""
     width, height = size_px
     panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
     panel.set_aspect("equal")
@@ -169,7 +169,7 @@ def _show_format(panel: Axes, size_px: tuple[int, int], title: str) -> None:
 
 
 def network_figure(shown: PlotData) -> Figure:
-    """Draw the network in plan and in elevation."""
+    """Draw the network in plan and elevation."""
     axes_from_object, labels = plan_axes(shown.points, shown.position)
     points = shown.points @ axes_from_object.T
     position = shown.position @ axes_from_object.T
@@ -185,7 +185,7 @@ def network_figure(shown: PlotData) -> Figure:
             panel.add_collection(LineCollection(list(edges[:, :, plane]), colors=colour, linewidths=0.8))
             label = _plain(camera.name)
             panel.plot(*position[of_camera][:, plane].T, "o", color=colour, markersize=4, label=label)
-        panel.margins(0.1)  # for the names of the photographs
+        panel.margins(0.1)  # room for the names of the photographs
         panel.autoscale_view()
         _show_object(panel, labels[across], labels[up], shown.unit, title)
     figure.axes[0].legend(loc="upper right", fontsize=7)
@@ -195,7 +195,7 @@ def network_figure(shown: PlotData) -> Figure:
 
 
 def _show_object(panel: Axes, across: str, up: str, unit: str, title: str) -> None:
-    """Let a panel show a plane of the object, its axes by their names, below a title."""
+    """Set up a panel to show a plane of the object with named axes, below a title."""
     panel.set_aspect("equal", adjustable="datalim")
     panel.set(xlabel=f"{across} [{_plain(unit)}]", ylabel=f"{up} [{_plain(unit)}]")
     panel.grid(color="#ddd", linewidth=0.5)
@@ -203,7 +203,7 @@ def _show_object(panel: Axes, across: str, up: str, unit: str, title: str) -> No
 
 
 def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
-    """Write names beside places, inwards and above where there is room; one without room is left out."""
+    """Write names beside positions, preferably above and inwards; omit a name without room."""
     figure = panel.get_figure(root=True)
     assert figure is not None
     figure.draw_without_rendering()
@@ -231,7 +231,7 @@ def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
 
 
 def precision_figure(shown: PlotData) -> Figure:
-    """Draw the points in plan and in elevation, coloured by their standard deviation."""
+    """Draw the object points in plan and elevation, coloured by their standard deviation."""
     axes_from_object, labels = plan_axes(shown.points, shown.position)
     points = shown.points @ axes_from_object.T
     known = np.isfinite(shown.sigma)
@@ -272,7 +272,7 @@ def projection_figure(shown: PlotData) -> Figure:
 
 
 def residual_figure(shown: PlotData) -> Figure:
-    """Draw residual vectors over the format of each camera, one by one and as means of cells."""
+    """Draw residual vectors over the format of each camera: each one, and the mean of each cell."""
     rows = len(shown.cameras)
     figure = panelled(4.4 * rows, rows=rows)
     panels = figure.subplots(rows, 2, squeeze=False)
@@ -295,7 +295,7 @@ def residual_figure(shown: PlotData) -> Figure:
 
 
 def distribution_figure(shown: PlotData) -> Figure:
-    """Draw the histogram of standardised residuals and the residuals by distance from the centre."""
+    """Draw the histogram of standardised residuals, and residuals by distance from the centre."""
     v, ray = shown.residuals, shown.from_centre
     figure = panelled(3.8)
     histogram, radial = figure.subplots(1, 2)
@@ -322,7 +322,7 @@ def distribution_figure(shown: PlotData) -> Figure:
     radial.axhline(0, color="black", linewidth=0.5)
     radial.set(xlabel="distance from the centre of the photograph [px]", ylabel="residual [px]")
     lowest, highest = radial.get_ylim()
-    radial.set_ylim(lowest, highest + 0.25 * (highest - lowest))  # for the legend
+    radial.set_ylim(lowest, highest + 0.25 * (highest - lowest))  # room for the legend
     radial.legend(fontsize=8, loc="upper left", ncols=2)  # "best" takes seconds with many points
     return figure
 
@@ -353,15 +353,16 @@ def photograph_figure(shown: PlotData) -> Figure:
 def plan_axes(
     points: FloatArray, position: FloatArray | None = None
 ) -> tuple[FloatArray, tuple[str, str, str]]:
-    """Return the axes in which the object is best seen from the cameras' side, and what they are called.
+    """Return axes that show the object best from the side of the cameras, and their names.
 
     Args:
         points: object points, shape (n, 3).
         position: projection centres, shape (m, 3); without them the third axis may point either way.
 
     Returns:
-        Rotation from object axes, shape (3, 3): the identity if the object lies nearly level below the
-        cameras, turned about X if above them, else its principal axes; and the names of the three axes.
+        Rotation from object axes, shape (3, 3), and the names of the three axes. The rotation is the identity
+        if the object is nearly level and below the cameras. It is a half turn about X if the object is nearly
+        level and above them. Otherwise its rows are the principal axes of the object.
     """
     centre = points.mean(axis=0)
     towards = np.zeros(3) if position is None or not len(position) else position.mean(axis=0) - centre
@@ -377,7 +378,7 @@ def plan_axes(
 
 
 def _pyramids(shown: PlotData, images: IntArray, camera: PlotCamera, size: float) -> FloatArray:
-    """Return the edges of a pyramid of view at each photograph, shape (edges, 2, 3)."""
+    """Return the edges of the viewing pyramid of each photograph, shape (edges, 2, 3)."""
     width, height = camera.size_px
     x, y = width / 2 / camera.c_px, height / 2 / camera.c_px
     corners = np.array([[-x, -y, -1], [x, -y, -1], [x, y, -1], [-x, y, -1]]) * size
@@ -394,7 +395,7 @@ def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:
 
 
 def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
-    """Return centre and mean residual of each cell of the format that contains at least three."""
+    """Return centre and mean residual of each cell of the format with at least three residuals."""
     side = max(width, height) / CELLS
     columns = int(np.ceil(width / side))
     cell = (xy // side).astype(int) @ (1, columns)
@@ -405,7 +406,7 @@ def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple
 
 
 def _ring_means(values: FloatArray, ring: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean and root mean square of the values of each of the 12 rings, NaN where there are none."""
+    """Return mean and RMS of the values in each of the 12 rings, NaN in an empty ring."""
     count = np.bincount(ring, minlength=12).astype(float)
     count[count == 0] = np.nan
     mean = np.bincount(ring, weights=values, minlength=12) / count
@@ -418,7 +419,7 @@ def _typical(v: FloatArray) -> float:
 
 
 def _round_factor(factor: float) -> float:
-    """Return the largest of 1, 2, 5 x 10^n that is not above the factor, at least 1."""
+    """Return the largest of 1, 2, 5 x 10^n that does not exceed the factor, at least 1."""
     if not np.isfinite(factor) or factor <= 1:
         return 1.0
     power = 10.0 ** np.floor(np.log10(factor))
@@ -431,11 +432,11 @@ def _short(name: str) -> str:
 
 
 def _clipped(name: str) -> str:
-    """Return a name, its end alone where it is long."""
+    """Return a name, or only its end if it is long."""
     return name if len(name) <= 16 else "..." + name[-13:]
 
 
 def _plain(text: str) -> str:
-    """Return text that matplotlib draws as it stands: no mathematics, no characters that its font lacks."""
+    """Return text that matplotlib draws literally: no mathematics, no characters missing in its font."""
     shown = "".join(c if c.isprintable() and ord(c) < 0x250 else "?" for c in text)
     return shown.replace("$", r"\$")

@@ -1,8 +1,8 @@
 """Findings of a result: every number of the reports, computed once.
 
-`findings_of` in `survey_remarks` is where to begin: it returns what all renderers print, with the remarks.
-The other modules each answer one question: how good the observations are and how precise the unknowns
-(`checks`), how the network lies and how well it meets what was given (`bundle_statistics`), how cameras are
-calibrated and mounted (`calibrated_cameras`), what to remark on them (`camera_remarks`), and what protocols
-of other programs state (`protocol`).
+Start with `findings_of` in `survey_remarks`: it returns what all renderers print, with the remarks. Each
+other module answers one question. `checks`: how good are the observations, and how precise the unknowns?
+`bundle_statistics`: what is the geometry of the network, and how well does it fit the given values?
+`calibrated_cameras`: how are the cameras calibrated and mounted? `camera_remarks`: what is remarkable about
+them? `protocol`: what do the protocols of other programs state?
 """

@@ -1,11 +1,10 @@
 """Statistics, geometry and given values of a bundle report, each with its residuals.
 
-Geometry of an adjusted network: rays and angles of points, coverage of photographs, their residuals.
-
-Only image points that were accepted count.
+The geometry of an adjusted network consists of rays and intersection angles of points, and of the coverage of
+photographs. Only accepted image points count.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.1 (network design: rays, intersection
-angles, full format); the figures are those that the report of DBAT gives (Boerlin and Grussenmeyer 2013,
+angles, full format). The figures are those in the report of DBAT (Boerlin and Grussenmeyer 2013,
 Photogramm. Record 28(144)).
 """
 
@@ -40,12 +39,12 @@ from sfm.report.findings.calibrated_cameras import families, family_of_photograp
 from sfm.report.findings.checks import rms_of_groups
 from sfm.result import SurveyResult
 
-WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across
+WEAK_DEG = 10.0  # below this angle a point is eleven times less precise along its rays than across
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Smallest, mean, median and largest of the values known, NaN without any."""
+    """Smallest, mean, median and largest of the known values, NaN if none is known."""
 
     smallest: float
     mean: float
@@ -55,29 +54,29 @@ class Spread:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of a bundle report besides the unknowns and their standard deviations."""
+    """Statistics of a bundle report other than the unknowns and their standard deviations."""
 
-    global_tests: tuple[GlobalTest, ...]  # of all observations, or of each kind where there are several
+    global_tests: tuple[GlobalTest, ...]  # of all observations, or of each kind if there are several
     w: CoordinateTest  # Baarda's test of every image coordinate
     tau: CoordinateTest  # Pope's
-    largest_w: float  # absolute, NaN where none is known
+    largest_w: float  # absolute, NaN if none is known
     largest_tau: float
     reliability: Reliability  # internal and external, of every image coordinate
     minimal_bias: Spread  # of the image coordinates, px
-    external: Spread  # effect of the same on an unknown, in its standard deviations
+    external: Spread  # effect of the minimal bias on an unknown, in standard deviations of the unknown
     redundancy: Spread  # redundancy numbers of the image coordinates
-    redundancy_of_image_points: float  # sum of the same
-    redundancy_sum: float  # of the redundancy numbers of all kinds of observation
-    kinds: VarianceComponents  # over the standard deviations stated, as the next two
+    redundancy_of_image_points: float  # sum of their redundancy numbers
+    redundancy_sum: float  # sum of the redundancy numbers of all kinds of observation
+    kinds: VarianceComponents  # relative to the stated standard deviations, as are the next two
     cameras: VarianceComponents
     photographs: VarianceComponents
     significance: tuple[Significance, ...]
-    correlations: tuple[Correlation, ...]  # strong ones of parameters of one camera or one photograph
-    camera_correlations: tuple[Correlation, ...]  # of them, those of cameras
+    correlations: tuple[Correlation, ...]  # strong ones between parameters of one camera or one photograph
+    camera_correlations: tuple[Correlation, ...]  # those of cameras among them
 
     @property
     def known(self) -> bool:
-        """Whether there are redundancy numbers, as there are with a covariance."""
+        """Return whether redundancy numbers are known, which requires a covariance."""
         return bool(np.isfinite(self.redundancy.largest))
 
     @property
@@ -87,10 +86,10 @@ class Statistics:
 
 
 def statistics_of(result: SurveyResult) -> Statistics:
-    """Return the statistics of a result with its covariance, against the standard deviations stated for it.
+    """Return the statistics of a result with its covariance, relative to its stated standard deviations.
 
-    Each kind of observation is tested by itself, since a test of all of them together passes by
-    construction where the image points have the weight that their residuals give.
+    Each kind of observation is tested separately. A test of all kinds together passes by construction if the
+    image points have the weight that their residuals suggest.
     """
     adjustment = result.adjustment
     kinds = by_kind(adjustment)
@@ -129,7 +128,7 @@ def statistics_of(result: SurveyResult) -> Statistics:
 
 
 def spread(values: FloatArray) -> Spread:
-    """Return smallest, mean, median and largest of the known values; infinite where nothing checks them."""
+    """Return smallest, mean, median and largest known value; infinite if nothing checks an observation."""
     known = values[~np.isnan(values)]
     if not len(known):
         return Spread(np.nan, np.nan, np.nan, np.nan)
@@ -138,34 +137,34 @@ def spread(values: FloatArray) -> Spread:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of its photographs a camera's image points cover."""
+    """The part of its photographs that a camera's image points cover."""
 
     camera: str
-    hull: FloatArray  # area of their convex hull in each photograph over that of the photograph, (p,)
-    hull_of_all: float  # the same of the image points of all photographs together
-    radius: FloatArray  # largest distance from the centre over half the diagonal, of each photograph, (p,)
+    hull: FloatArray  # area of their convex hull over that of the photograph, for each photograph, (p,)
+    hull_of_all: float  # the same for the image points of all photographs together
+    radius: FloatArray  # largest distance from the centre over half the diagonal, for each photograph, (p,)
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Rays, angles, coverage and residuals; NaN where nothing is known."""
+    """Rays, angles, coverage and residuals; NaN if not known."""
 
     rays: IntArray  # of each point, (n,)
     angle_deg: FloatArray  # largest angle between two rays of each point, 0 parallel to 90, deg, (n,)
     point_rms_px: FloatArray  # root mean square residual per coordinate of each point, px, (n,)
-    image_rms_px: FloatArray  # the same of each photograph, px, (m,)
-    hull: FloatArray  # share of each photograph within the convex hull of its image points, (m,)
+    image_rms_px: FloatArray  # root mean square residual per coordinate of each photograph, px, (m,)
+    hull: FloatArray  # part of each photograph within the convex hull of its image points, (m,)
     coverage: tuple[Coverage, ...]  # of each camera that took photographs
-    image_points: IntArray  # number of each photograph, (m,)
+    image_points: IntArray  # accepted image points of each photograph, (m,)
 
     @property
     def weak(self) -> IntArray:
-        """Points whose rays meet at a small angle, smallest first."""
+        """Points whose rays meet at a small angle, smallest angle first."""
         order = np.argsort(self.angle_deg, kind="stable")
         return order[self.angle_deg[order] < WEAK_DEG]
 
     def histogram(self) -> tuple[tuple[int, int], ...]:
-        """Return (rays, points with so many)."""
+        """Return pairs of a number of rays and the number of points with that many rays."""
         values, counts = np.unique(self.rays, return_counts=True)
         return tuple(zip(values.tolist(), counts.tolist(), strict=True))
 
@@ -196,7 +195,7 @@ def geometry_of(adjustment: Adjustment) -> Geometry:
 
 
 def hull_area(xy: FloatArray) -> float:
-    """Return the area of the convex hull of points (k, 2), 0 where they lie on a line."""
+    """Return the area of the convex hull of points (k, 2), 0 if they lie on a line."""
     if len(xy) < 3:
         return 0.0
     try:
@@ -207,7 +206,7 @@ def hull_area(xy: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Given:
-    """Given values that took part beside the photographs, kind by kind."""
+    """Given values that took part in addition to the image points, kind by kind."""
 
     kinds: tuple[GivenResiduals, ...]
 
@@ -228,27 +227,27 @@ class Given:
 
     @property
     def further(self) -> tuple[GivenResiduals, ...]:
-        """Those that are neither control points, scale bars, interior nor exterior orientation."""
+        """Given values other than control points, scale bars, interior and exterior orientation."""
         others = (ObjectPoints.single, ScaleBars.single, InteriorObservations.single, CENTRE, ROTATION)
         return tuple(kind for kind in self.kinds if kind.kind not in others)
 
     def of(self, kind: str) -> GivenResiduals | None:
-        """Return the residuals of a kind, by the name of one of them; None without any."""
+        """Return the residuals of a kind by its singular name; None without any."""
         return next((one for one in self.kinds if one.kind == kind), None)
 
     @property
     def exterior(self) -> tuple[GivenResiduals, ...]:
-        """Projection centres and angles, of the photographs of which something was observed."""
+        """Projection centres and angles of the photographs with observed exterior orientation."""
         kinds = (kind.observed() for kind in self.kinds if kind.kind in (CENTRE, ROTATION))
         return tuple(kind for kind in kinds if kind is not None)
 
 
 def given_of(a: Adjustment, length_unit: str) -> Given:
-    """Return everything that was given beside the image points and took part.
+    """Return the residuals of all given values that took part in an adjustment.
 
     Args:
-        a: what `adjust` returned.
-        length_unit: of its coordinates.
+        a: result of `adjust`.
+        length_unit: unit of its coordinates.
     """
     took_part = {one.index: (one.rows, one.redundancy_numbers, one.standardised) for one in a.observed}
     found: list[GivenResiduals] = []

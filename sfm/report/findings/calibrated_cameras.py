@@ -1,6 +1,6 @@
-"""Calibrated cameras as people ask for them, and where the cameras of rigs are mounted.
+"""Calibrated cameras with their interior orientation, and the mounts of the cameras of rigs.
 
-Interior orientation as people ask for it: every parameter once, whoever shares it.
+Interior orientation is listed in a user's terms: every parameter once, even if several photographs share it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ TINY = float(np.finfo(float).tiny)
 
 @dataclass(frozen=True)
 class InteriorParameter:
-    """A parameter of interior orientation as people ask for it: once, whoever shares it."""
+    """A parameter of interior orientation, listed once even if several photographs share it."""
 
-    owner: str  # camera, or group of photographs that have it in common
-    photographs: int  # how many have it
+    owner: str  # camera, or group of photographs that share the parameter
+    photographs: int  # number of photographs that share it
     parameter: Parameter
     value: float
-    sigma: float  # NaN where it was not adjusted
+    sigma: float  # NaN if it was not adjusted
 
     @property
     def name(self) -> str:
@@ -43,7 +43,7 @@ class InteriorParameter:
 
     @property
     def t(self) -> float | None:
-        """The parameter over its standard deviation; None where 0 is no sensible value, as for c."""
+        """Return the parameter over its standard deviation; None where 0 is no sensible value, as for c."""
         tested = self.sigma > 0 and self.parameter.has_null_hypothesis
         return abs(self.value) / self.sigma if tested else None
 
@@ -54,28 +54,29 @@ CALIBRATION_FAILED = "calibration_failed"  # kind of remark
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """An adjusted camera, shared parameters once."""
+    """An adjusted camera; shared parameters appear once."""
 
     name: str
     parameters: tuple[InteriorParameter, ...]  # focal lengths and principal point
-    projection_rms_px: float  # projection uncertainty, 1 sigma, over the whole photograph, px; infinite where
+    projection_rms_px: float  # RMS projection uncertainty over the whole photograph, 1 sigma, px; infinite if
     # a parameter is not determined
     projection_largest_px: float  # its largest value, px; likewise
-    observed_rms_px: float  # projection uncertainty between the image points, px; likewise
-    observed: float  # part of the photograph that the image points cover together, their convex hull
+    observed_rms_px: float  # the RMS within the hull of the image points, px; likewise
+    observed: float  # part of the photograph within the convex hull of all image points of the camera
 
 
 def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ()) -> bool:
-    """Return whether a survey calibrates its cameras: it adjusts as much of them as of unknown coordinates.
+    """Return whether a survey calibrates its cameras.
 
-    The coordinates of a point are known if all three are given, to better than a pixel as its photographs
-    see it. Standard deviations that small, as of a plate, differ from a fixed point in no way that matters.
-    The points of a further plate are known to one another; its place is no more a result than that of a
-    photograph.
+    It does if it adjusts at least as many camera parameters as unknown coordinates. The coordinates of a
+    point are known if all three are given with a standard deviation below a pixel in its photographs.
+    Standard deviations as small as those of a plate do not differ from a fixed point in any way that matters.
+    The points of an additional plate are known relative to one another; the pose of such a plate is no more a
+    result than that of a photograph.
 
     Args:
         adjustment: finished.
-        plates: plates of the survey, with those that are control.
+        plates: plates of the survey, including those used as control.
     """
     network, known = adjustment.network, np.zeros(len(adjustment.network.points), dtype=bool)
     if adjustment.datum != "control" or not adjustment.unknown_counts[1]:
@@ -94,10 +95,10 @@ def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ())
 
 
 def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> tuple[CalibratedCamera, ...]:
-    """Return the adjusted cameras of a survey that calibrates them; none of another survey.
+    """Return the adjusted cameras of a survey that calibrates them; empty for other surveys.
 
-    One whose c was held at a start value is not among them: its projection uncertainty would be that of a
-    camera whose c is known.
+    A camera whose c was held at a start value is omitted, as its projection uncertainty would be that of a
+    camera with known c.
     """
     adjustment = result.adjustment
     failed = {
@@ -139,20 +140,20 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
 def projection_of(
     adjustment: Adjustment, photographs: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return the projection uncertainty of the camera of some photographs.
+    """Return the projection uncertainty of the camera that took some photographs.
 
     Args:
         adjustment: finished, with its covariance.
-        photographs: which photographs, (m,).
+        photographs: True for those photographs, (m,).
 
     Returns:
-        Columns (c,) and rows (r,) of a grid, px, and the standard deviation at its crossings, px, (r, c);
-        None where the camera was held or is not determined.
+        Columns (c,) and rows (r,) of a grid, px, and the standard deviation at its nodes, px, (r, c); None if
+        the camera was held or is not determined.
     """
     network, seen = adjustment.network, adjustment.network.image_points.select(~adjustment.rejected)
     if not photographs.any():
         return None
-    k = int(network.camera[photographs][0])  # of several that share parameters the first
+    k = int(network.camera[photographs][0])  # the first of several cameras that share parameters
     camera, covariance = adjustment.estimate.cameras[k], adjustment.covariance.interior[k]
     if not len(covariance) or not np.isfinite(covariance).all() or not np.diagonal(covariance).any():
         return None
@@ -165,19 +166,19 @@ class CameraFamily:
 
     name: str
     camera: Camera  # the first of them
-    parameters: tuple[InteriorParameter, ...]  # that all of them have in common
-    photographs: int  # that have them
+    parameters: tuple[InteriorParameter, ...]  # common to all of them
+    photographs: int  # number of photographs with these parameters
 
 
 @dataclass(frozen=True)
 class InteriorOrientation:
     """Interior orientation of all cameras."""
 
-    parameters: tuple[InteriorParameter, ...]  # every one once, common ones first, without those fixed at 0
+    parameters: tuple[InteriorParameter, ...]  # each once, common ones first, without those fixed at 0
     families: tuple[CameraFamily, ...]
-    single: tuple[InteriorParameter, ...]  # parameters of single photographs and groups
-    sigmas: tuple[FloatArray, ...]  # of all parameters of each camera, NaN where not adjusted, (p,)
-    family: IntArray  # index of the family of cameras that each photograph was taken with, (m,)
+    single: tuple[InteriorParameter, ...]  # parameters of single photographs and of groups
+    sigmas: tuple[FloatArray, ...]  # of all parameters of each camera, NaN if not adjusted, (p,)
+    family: IntArray  # index of the camera family of each photograph, (m,)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -206,7 +207,7 @@ def interior_of(adjustment: Adjustment) -> InteriorOrientation:
 
 
 def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]:
-    """Return every parameter of interior orientation once, common ones first, those fixed at 0 left out."""
+    """Return every parameter of interior orientation once, common ones first, without those fixed at 0."""
     network = adjustment.network
     used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
     found: dict[tuple[str, str, int], InteriorParameter] = {}
@@ -226,14 +227,14 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
 
 
 def families(adjustment: Adjustment) -> tuple[tuple[str, Camera], ...]:
-    """Return the name of each family of cameras that share parameters, and the first camera of it."""
+    """Return the name and the first camera of each family of cameras that share parameters."""
     cameras = adjustment.estimate.cameras
     names, family = camera_families(cameras, adjustment.network.camera)
     return tuple((name, cameras[int(np.argmax(family == f))]) for f, name in enumerate(names))
 
 
 def family_of_photographs(adjustment: Adjustment) -> IntArray:
-    """Return the index of the family of cameras that each photograph was taken with, (m,)."""
+    """Return the index of the camera family of each photograph, (m,)."""
     network = adjustment.network
     return camera_families(adjustment.estimate.cameras, network.camera)[1][network.camera]
 
@@ -242,8 +243,8 @@ def family_of_photographs(adjustment: Adjustment) -> IntArray:
 class EpipolarDistances:
     """Distances of image points from the epipolar lines of the same points in the reference camera."""
 
-    xy: FloatArray  # image points that both saw at one moment, px, (k, 2)
-    px: FloatArray  # their distances, (k,)
+    xy: FloatArray  # image points seen by both cameras at one moment, px, (k, 2)
+    px: FloatArray  # their distances from the epipolar lines, (k,)
 
     @property
     def rms_px(self) -> float:
@@ -260,9 +261,9 @@ class Mount:
     base_sigma: float
     position: FloatArray  # X, Y, Z of the projection centre, object unit, (3,)
     position_sigma: FloatArray  # (3,)
-    rotation_deg: FloatArray  # omega, phi, kappa of R, image axes to those of the rig, deg, (3,)
+    rotation_deg: FloatArray  # omega, phi, kappa of R from image axes to rig axes, deg, (3,)
     rotation_sigma_deg: FloatArray  # (3,)
-    epipolar: EpipolarDistances | None  # None where image points are planned
+    epipolar: EpipolarDistances | None  # None if image points are planned
 
     @property
     def values(self) -> tuple[tuple[str, float, float, bool], ...]:
@@ -284,11 +285,11 @@ class Rig:
     name: str
     reference: str
     mounts: tuple[Mount, ...]
-    moments: int  # with photographs of two cameras at least
+    moments: int  # with photographs of at least two cameras
 
 
 def rigs_of(a: Adjustment, *, planned: bool = False) -> tuple[Rig, ...]:
-    """Return the rigs of an adjustment; of one that is planned without distances from epipolar lines."""
+    """Return the rigs of an adjustment, without epipolar distances if it is planned."""
     mounts, moment = a.estimate.mounts, a.network.moment
     if mounts is None or moment is None:
         return ()
@@ -304,7 +305,7 @@ def rigs_of(a: Adjustment, *, planned: bool = False) -> tuple[Rig, ...]:
 
 
 def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> EpipolarDistances:
-    """Return the distances of image points of a camera from epipolar lines of its reference camera.
+    """Return the distances of image points from epipolar lines of the reference camera of their rig.
 
     Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.3.2 (coplanarity).
     """

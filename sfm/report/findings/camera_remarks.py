@@ -16,22 +16,22 @@ from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import PhotographTargets, SurveyResult
 
-SURE_SIGMAS = 3.0  # standard deviations from which a camera is as the adjustment has it
-# Of the diagonal, half way to a corner: no principal point is farther from the centre.
-MAX_OFFSET_FRACTION = 0.25
-DECENTRING_FRACTION = 0.02  # of the diagonal: so far a lens or sensor may be off
+SURE_SIGMAS = 3.0  # standard deviations beyond which a deviation of a camera is considered real
+MAX_OFFSET_FRACTION = 0.25  # of the diagonal, half way to a corner: no principal point is farther off centre
+DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected
 
 
 def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
-    """Return the remarks on all cameras, where they are the result on how well they are known as such."""
+    """Return the remarks on all cameras; on calibrated cameras, the remarks on how well they are known."""
     weak = _not_calibrated(result, calibrated) if calibrated else _hardly_determined(result)
     return (*weak, *_principal_points(result), *_pixels(result))
 
 
 def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
-    """Return the cameras of a calibration that do not know where a direction is seen in the photograph.
+    """Return remarks on calibrated cameras whose projection uncertainty is too large.
 
-    It is the margin of the photograph that lacks image points where between these the camera is known.
+    If the camera is well known between the image points, the remark says that the margin of the photograph
+    lacks image points.
     """
     sigma, found = result.adjustment.sigma0_px, list[Remark]()
     for one in calibrated:
@@ -49,7 +49,7 @@ def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ..
 
 
 def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return principal distances that the photographs hardly determine, as those of long lenses."""
+    """Return remarks on principal distances that the photographs hardly determine, as with long lenses."""
     strong = {one.parameter: one.partners for one in result.orientation_correlations}
     found: dict[str, tuple[Remark, ...]] = {}
     for number, camera in enumerate(result.adjustment.estimate.cameras):
@@ -64,7 +64,7 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return adjusted principal points where no lens has them, and the format of which they are centres."""
+    """Return remarks on implausible adjusted principal points, and on the format they are the centre of."""
     remarks: list[Remark] = []
     for number, camera in enumerate(result.adjustment.estimate.cameras):
         if not camera.free[camera.parts[1]].any():
@@ -86,14 +86,14 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _principal_sigma_px(result: SurveyResult, number: int) -> float:
-    """Return the larger standard deviation of the principal point of a camera, px; 0 where it is held."""
+    """Return the larger standard deviation of the two principal point coordinates, px; 0 if held."""
     camera = result.adjustment.estimate.cameras[number]
     sigma = np.nan_to_num(result.adjustment.interior_sigma(number)[camera.parts[1]], nan=0.0)
     return float(sigma.max() / (np.mean(camera.pixel_mm) if camera.in_mm else 1.0))
 
 
 def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return adjusted affinity and shear of pixels where no sensor has them."""
+    """Return remarks on adjusted affinity and shear of pixels that no sensor has."""
     found: list[Remark] = []
     for number, camera in enumerate(result.adjustment.estimate.cameras):
         sigma = dict(zip(camera.names, result.adjustment.interior_sigma(number).tolist(), strict=True))
@@ -104,7 +104,7 @@ def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
             for name, one in zip(camera.names, adjusted, strict=True)
             if one and abs(values[name]) > SURE_SIGMAS * sigma[name]
         }
-        if camera.free[camera.parts[0]].sum() == 2:  # of both directions
+        if camera.free[camera.parts[0]].sum() == 2:  # a focal length for each direction
             first, second = np.flatnonzero(camera.parts[0])
             ratio = camera.parameters[second] / camera.parameters[first]
             ratio *= camera.pixel_mm[1] / camera.pixel_mm[0]
@@ -119,7 +119,7 @@ def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] | None:
-    """Return the format whose centre a place is: the sides exchanged, doubled or halved; None without one."""
+    """Return the format centred at a position: sides exchanged, doubled or halved; None without one."""
     formats = [(height, width), *((round(s * width), round(s * height)) for s in (0.5, 2.0))]
     for one in formats:
         if np.linalg.norm(at - np.array(one) / 2) < DECENTRING_FRACTION * np.hypot(*one):
@@ -128,14 +128,13 @@ def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] |
 
 
 def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
-    """Return the median blur of the edges of the targets of each photograph.
+    """Return the median blur of the target edges of each photograph.
 
     Args:
-        photographs: with their targets.
+        photographs: photographs with their targets.
 
     Returns:
-        Standard deviation of an edge, px, by name; photographs without measured edges are
-        left out.
+        Standard deviation of an edge, px, by name; photographs without measured edges are left out.
     """
     found = {}
     for one in photographs:
@@ -148,10 +147,10 @@ def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
 def sharpness_remarks(
     result: SurveyResult, edges: Mapping[str, float], consistency: Consistency
 ) -> tuple[Remark, ...]:
-    """Return that photographs are blurred where that explains their residuals, few points or absence.
+    """Return remarks on blurred photographs if blur explains large residuals, few points or absence.
 
-    Photographs are compared with those of their camera: lens, pixels and size of the photographs differ
-    between cameras, and edges with them.
+    Photographs are compared within their camera, since lens, pixels and format, and with them the edges,
+    differ between cameras.
     """
     a = result.adjustment
     m, n = len(a.network.images), len(a.network.points)
@@ -183,11 +182,11 @@ def sharpness_remarks(
 
 
 def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> BoolArray:
-    """Return which values are larger than those of the others by more than chance, fewer than half, (n,).
+    """Return which values exceed the others by more than chance explains, fewer than half of them, (n,).
 
     Args:
-        values: (n,).
-        level: probability that chance makes one of them larger.
+        values: values to compare, (n,).
+        level: probability that chance alone marks any of them.
 
     Source: Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics
     25(2), 165-172; one-sided.

@@ -1,7 +1,7 @@
-"""How well observations agree with one another and with control, and how precise unknowns are.
+"""Agreement of observations with one another and with control, and precision of unknowns.
 
-The basis of a verdict. Standard deviations are those stated before the adjustment; sigma0 shows by how
-much they were wrong, and must not hide it.
+These checks are the basis of a verdict. Standard deviations are those stated before the adjustment; sigma0
+shows by how much they were wrong, and must not hide it.
 """
 
 from __future__ import annotations
@@ -18,64 +18,64 @@ from sfm.observations.kind import is_observed
 from sfm.result import SurveyResult
 
 MAX_LISTED = 10  # largest residuals
-TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is stated beside that of all
+TOLD_APART = 0.01  # relative difference beyond which sigma0 of the image points is stated separately
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
 
 
 @dataclass(frozen=True)
 class ObservationCounts:
-    """Scalar observations of an adjustment by type."""
+    """Number of scalar observations in an adjustment by type."""
 
-    image: int  # image coordinates that were accepted
-    control: int  # weighted coordinates of control; fixed ones are no observations
+    image: int  # accepted image coordinates
+    control: int  # weighted coordinates of control; fixed ones are not observations
     exterior: int  # observed parameters of exterior orientation
     interior: int  # observed parameters of interior orientation
     scale_bars: int
-    further: int  # of other kinds, less the parameters that these add
-    constraints: int  # of the datum
+    further: int  # of other kinds, less the parameters that these kinds add
+    constraints: int  # datum constraints
     total: int  # without the constraints
 
 
 @dataclass(frozen=True)
 class Sigma0:
-    """Standard deviation of an image coordinate, a posteriori and as stated."""
+    """Standard deviation of an image coordinate: a posteriori, and as stated."""
 
-    px: float  # a posteriori, of all observations together: control that contradicts raises it, px
-    ratio: float  # of the image points by themselves, a posteriori over that stated
+    px: float  # a posteriori, from all observations together, px; contradictory control raises it
+    ratio: float  # a posteriori over stated, from the image points alone
     stated_px: float  # a priori, px
     pixel_mm: float = float("nan")  # mean size of a pixel over the image points, mm
 
     @property
     def mm(self) -> float:
-        """A posteriori, of all observations together, on the sensor, mm."""
+        """Sigma0 a posteriori of all observations together, on the sensor, mm."""
         return self.px * self.pixel_mm
 
     @property
     def image_points_px(self) -> float:
-        """A posteriori, of the image points by themselves, px."""
+        """Sigma0 a posteriori of the image points alone, px."""
         return self.ratio * self.stated_px
 
     @property
     def differs(self) -> bool:
-        """Whether the image points by themselves show another one than all observations."""
+        """Return whether sigma0 of the image points alone differs from that of all observations."""
         return abs(self.px - self.image_points_px) > TOLD_APART * self.image_points_px
 
 
 @dataclass(frozen=True)
 class LongestResidual:
-    """The accepted image point whose residual is the longest in standard deviations."""
+    """The accepted image point with the longest residual in standard deviations."""
 
     image: str
     point: str
     length_px: float
-    over_sigma: float  # its length in standard deviations, times the factor on its weight
-    weight: float  # factor on its weight, below 1 by reweighting
+    over_sigma: float  # length in standard deviations, multiplied by the factor on its weight
+    weight: float  # factor on its weight, below 1 after reweighting
 
 
 def sigma0_of(result: SurveyResult) -> Sigma0:
-    """Return sigma0 of all observations, and of the image points by themselves.
+    """Return sigma0 of all observations, and of the image points alone.
 
-    The latter is by the variance component of the image points; without redundancy of theirs it is sigma0
+    Sigma0 of the image points comes from their variance component. If they have no redundancy, it is sigma0
     of all observations.
     """
     a = result.adjustment
@@ -87,12 +87,11 @@ def sigma0_of(result: SurveyResult) -> Sigma0:
 
 
 def longest_residual(adjustment: Adjustment) -> LongestResidual:
-    """Return the longest residual in standard deviations; of length 0 without image points.
+    """Return the longest residual in standard deviations; its length is 0 without image points.
 
-    A residual of a reweighted image point counts by its influence, weight times length, which Huber's weights
-    bound. The standard
-    deviation is the a priori one, or that which the median of the residuals shows if it is larger, so
-    that a cautious guess of it makes no good image point an outlier.
+    The residual of a reweighted image point counts by its influence, weight times length, which Huber's
+    weights bound. The standard deviation is the a priori one, or the one that the median of the residuals
+    shows if that is larger. A cautious a priori value therefore makes no good image point an outlier.
     """
     used, seen = np.flatnonzero(~adjustment.rejected), adjustment.network.image_points
     if not len(used):
@@ -115,7 +114,7 @@ def longest_residual(adjustment: Adjustment) -> LongestResidual:
 
 
 def count_observations(adjustment: Adjustment) -> ObservationCounts:
-    """Return how many observations of each type took part."""
+    """Return the number of observations of each type that took part."""
     network = adjustment.network
     image = 2 * int((~adjustment.rejected).sum())
     control = 0
@@ -143,7 +142,7 @@ def largest_residuals(adjustment: Adjustment, count: int = MAX_LISTED) -> tuple[
     """Return the accepted image points with the largest standardised residuals, largest first.
 
     Returns:
-        Photograph, point, residuals vx and vy, px, Baarda's w of the worse coordinate and Pope's tau of it.
+        Photograph, point, residuals vx and vy, px, and Baarda's w and Pope's tau of the worse coordinate.
     """
     a, seen = adjustment, adjustment.network.image_points
     if len(a.standardised) != len(a.rejected):
@@ -163,17 +162,17 @@ def _variances(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Precision:
-    """Standard deviations of points and photographs; of X, Y, Z or omega, phi, kappa, and of all together."""
+    """Standard deviations of points and photographs: of X, Y, Z or omega, phi, kappa, and of all together."""
 
     points: FloatArray  # of each coordinate, 0 where fixed, object unit, (n, 3)
-    limiting_points: FloatArray  # the same with the cameras free of error
+    limiting_points: FloatArray  # the same if the cameras are free of error
     exterior: FloatArray  # of each photograph, object unit and rad, (m, 6)
     rms: FloatArray  # of the points, object unit, (4,)
     largest: FloatArray  # of the points, object unit, (4,)
-    limiting: FloatArray  # RMS of the points with the cameras free of error, object unit, (4,)
+    limiting: FloatArray  # RMS of the points if the cameras are free of error, object unit, (4,)
     centres: FloatArray  # RMS of the projection centres, object unit, (4,)
     angles: FloatArray  # RMS of omega, phi, kappa, rad, (4,)
-    fixed_points: int  # points with fixed coordinates, as control or in a minimal datum
+    fixed_points: int  # points with fixed coordinates, from control or a minimal datum
 
     @property
     def exterior_deg(self) -> FloatArray:
@@ -200,7 +199,7 @@ def precision_of(adjustment: Adjustment) -> Precision:
 
 
 def adjusted_sigmas(covariance: FloatArray) -> FloatArray:
-    """Return standard deviations of covariance matrices (n, d, d), NaN where fixed or not known, (n, d)."""
+    """Return standard deviations from covariances (n, d, d), NaN where fixed or not known, (n, d)."""
     variance = np.einsum("nii->ni", covariance)
     adjusted = variance > 0
     return np.asarray(np.where(adjusted, np.sqrt(np.where(adjusted, variance, 1.0)), np.nan))
@@ -209,7 +208,7 @@ def adjusted_sigmas(covariance: FloatArray) -> FloatArray:
 def point_precision(adjustment: Adjustment) -> FloatArray:
     """Return RMS, largest, and RMS limiting standard deviation of X, Y, Z and all, object unit, (3, 4).
 
-    Limiting is the precision with the cameras free of error. NaN where no coordinate was adjusted.
+    The limiting precision assumes cameras free of error. NaN if no coordinate was adjusted.
     """
     sigma = adjusted_sigmas(adjustment.covariance.points)
     limiting = adjusted_sigmas(adjustment.covariance.points_limiting)
@@ -217,23 +216,23 @@ def point_precision(adjustment: Adjustment) -> FloatArray:
 
 
 def root_mean_squares(values: FloatArray) -> FloatArray:
-    """Return the root mean square of each column (n, d) and of all, of the values known, (d + 1,)."""
+    """Return the root mean square of the known values of each column (n, d) and of all, (d + 1,)."""
     return np.array([root_mean_square(column) for column in (*values.T, values)])
 
 
 def root_mean_square(values: FloatArray) -> float:
-    """Return the root mean square of the values that are known, NaN without any."""
+    """Return the root mean square of the known values, NaN if none is known."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 def rms_of_groups(index: IntArray, v: FloatArray, count: int) -> FloatArray:
-    """Return the RMS residual per coordinate of each photograph or point, px, NaN without any, (n,).
+    """Return the RMS residual per coordinate of each photograph or point, px, NaN if unknown, (n,).
 
     Args:
         index: photograph or point of each image point, (k,).
         v: residuals, NaN where not known, px, (k, 2).
-        count: of photographs or points, n.
+        count: number of photographs or points, n.
     """
     known = np.isfinite(v).all(axis=1)
     number = np.bincount(index[known], minlength=count)
@@ -243,17 +242,17 @@ def rms_of_groups(index: IntArray, v: FloatArray, count: int) -> FloatArray:
 
 
 def largest(values: FloatArray) -> FloatArray:
-    """Return the largest of each column (n, d) and of all, of the values known, (d + 1,)."""
+    """Return the largest known value of each column (n, d) and of all, (d + 1,)."""
     columns = np.where(np.isfinite(values), values, -np.inf).max(axis=0, initial=-np.inf)
     found = np.array([*columns, columns.max()])
     return np.asarray(np.where(np.isfinite(found), found, np.nan))
 
 
 def point_sigma(covariance: FloatArray) -> tuple[float, float]:
-    """Return RMS and largest known standard deviation of the coordinates of points, object unit, NaN without.
+    """Return RMS and largest known standard deviation of point coordinates, object unit, NaN if unknown.
 
     Args:
-        covariance: of the points, object unit^2, (n, 3, 3).
+        covariance: covariance of each point, object unit^2, (n, 3, 3).
     """
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     known = sigma[np.isfinite(sigma)]

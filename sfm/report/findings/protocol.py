@@ -1,7 +1,7 @@
-"""Entries of a bundle protocol that people know from other programs.
+"""Entries of a bundle protocol that users know from other programs.
 
-Residuals by photograph and by point, rejected rays by point, control before and after, points by kind and
-rays, distortion and field of view of the cameras, radial distortion tested term by term.
+The entries are: residuals by photograph and by point, rejected rays by point, control before and after,
+points by kind and rays, distortion and field of view of the cameras, cumulative tests of radial distortion.
 
 Source: the protocols of DBAT (Boerlin and Grussenmeyer 2013, Photogramm. Record 28(144)) and of AICON 3D
 Studio.
@@ -25,11 +25,11 @@ from sfm.report.findings.bundle_statistics import Given
 from sfm.report.findings.checks import standard_deviations
 from sfm.result import ControlCheck, SurveyResult
 
-EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
+EDGE_STEPS = 9  # positions along a side of the photograph at which distortion is evaluated
 
 
 class ControlCoordinate(NamedTuple):
-    """A coordinate of control or of a check point, before and after."""
+    """A coordinate of a control or check point, before and after the adjustment."""
 
     use: str  # control | check
     point: str
@@ -39,7 +39,7 @@ class ControlCoordinate(NamedTuple):
     adjusted: float  # object unit
     posterior: float  # standard deviation of the adjusted coordinate, object unit
     difference: float  # adjusted minus given, object unit
-    test: float  # difference over the standard deviation expected of it, NaN where nothing checks it
+    test: float  # difference over its expected standard deviation, NaN if nothing checks it
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Lens:
     """Distortion and field of view of a camera."""
 
     camera: str
-    largest_px: float  # displacement by distortion along the edge of the photograph
+    largest_px: float  # largest displacement by distortion along the edge of the photograph
     field_of_view_deg: FloatArray  # horizontal, vertical, diagonal, (3,)
 
 
@@ -57,18 +57,18 @@ class CumulativeTest:
 
     camera: str
     parameters: str  # such as "K2, K3"
-    probability: float  # of an F so large by chance
+    probability: float  # of an F this large by chance
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """All these entries."""
+    """All entries of a bundle protocol."""
 
     residuals: tuple[tuple[Any, ...], ...]  # rows of residuals.csv
-    rejected: tuple[tuple[str, tuple[str, ...], int], ...]  # point, photographs of rejected rays, all rays
-    limits: str  # of rejection, in words
+    rejected: tuple[tuple[str, tuple[str, ...], int], ...]  # point, photographs of rejected rays, its rays
+    limits: str  # limits of rejection, in words
     control: tuple[ControlCoordinate, ...]
-    rays_by_kind: tuple[tuple[str, int, float, int], ...]  # kind of point, points, mean rays, fewest rays
+    rays_by_kind: tuple[tuple[str, int, float, int], ...]  # kind of point, points, mean and fewest rays
     lenses: tuple[Lens, ...]
     cumulative: tuple[CumulativeTest, ...]
 
@@ -99,7 +99,7 @@ def _groups(
     other: IntArray,
     others: tuple[str, ...],
 ) -> list[tuple[Any, ...]]:
-    """Return kind, name, accepted, rejected, RMS and largest |v| in x and y, px, and where these are."""
+    """Return kind, name, accepted, rejected, RMS and largest |v| in x and y, px, and who sees the largest."""
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(1, len(names)))
     out = []
@@ -124,7 +124,7 @@ def _rejected(a: Adjustment) -> tuple[tuple[str, tuple[str, ...], int], ...]:
 
 
 def _limits(result: SurveyResult) -> str:
-    """Return from which residual on image points are rejected, and up to which they are taken back."""
+    """Return the limit beyond which image points are rejected, and below which they are restored."""
     a = result.adjustment
     if result.reject == "tau":
         critical = tau_critical(a.test_alpha, a.redundancy)
@@ -150,7 +150,7 @@ def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
 
 
 def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinate]:
-    """Return the control that took no part, beside the points that were placed on it."""
+    """Return the control that took no part, compared with the points placed on it."""
     if check is None:
         return []
     control = a.network.control
@@ -186,7 +186,7 @@ def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
 def _check(
     point: str, c: int, given: float, prior: float, adjusted: float, posterior: float, difference: float
 ) -> ControlCoordinate:
-    """Return a coordinate that took no part, and its difference over the standard deviation of that."""
+    """Return a coordinate that took no part, and its difference over the expected standard deviation."""
     expected = float(np.hypot(prior, posterior))
     test = difference / expected if expected > 0 else np.nan
     numbers = map(float, (given, prior, adjusted, posterior, difference, test))
@@ -214,7 +214,7 @@ def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ..
 
 
 def _lens(camera: Camera) -> Lens:
-    """Return distortion along the edge, c and principal point kept, and the field of view of the rays."""
+    """Return distortion along the edge, relative to the same c and principal point, and the field of view."""
     width, height = camera.size_px
     along = np.linspace(0.0, 1.0, EDGE_STEPS)
     x, y = (width - 1) * along, (height - 1) * along

@@ -1,11 +1,11 @@
 """Everything that the reports of a survey state, computed once: findings, remarks and verdict.
 
-Whatever prints a result takes its numbers from `Findings`: statistics, checks, geometry, given values,
-precision, protocol, verdict.
+Every renderer takes its numbers from `Findings`: statistics, checks, geometry, given values, precision,
+protocol and verdict.
 
-Given values are judged by the image points alone before they take part; these are the tests of those that
-took part, and of those that only check the result. Given interior orientation is not tested here: whether it
-is wrong is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object
+Given values are judged by the image points alone before they take part. The tests here judge those that took
+part, and those that only check the result. They do not test given interior orientation. Whether it is wrong
+is decided by an alternative hypothesis (`sfm.adjustment.hypotheses`), which states the shift of object
 points.
 """
 
@@ -63,20 +63,20 @@ from sfm.result import SurveyResult
 UNCODED = -1
 MM = 1e-3  # m
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
-# The rest of the error of a value that is checked less is below the rounding and the neglected second
-# order of the others, and w magnifies that.
+# Below this redundancy number, the rest of a value's error is smaller than rounding and the neglected second
+# order of other errors, and w magnifies those.
 MIN_REDUNDANCY = 1e-3
-MAX_MAGNIFICATION = 1.0  # of the median image distance c over the object distance; macrophotography is beyond
+MAX_MAGNIFICATION = 1.0  # median image distance c over object distance; beyond it is macrophotography
 HEADLINES: Mapping[Level, str] = {
     "good": "The survey worked: {found}.",
     "fair": "The survey worked, with remarks: {found}.",
     "bad": "The survey has no dependable result.",
 }
-SIGMA0_LOW = 0.5  # as many times too cautious as it may be too large without a warning
+SIGMA0_LOW = 0.5  # as cautious by this factor as it may be too small without a warning
 
 
 def headlines_of(result: SurveyResult) -> dict[Level, str]:
-    """Return what each level means for a survey."""
+    """Return the headline of a survey for each level."""
     a = result.adjustment
     found = (
         f"{len(a.network.images)} of {result.images_total} photographs oriented, "
@@ -86,7 +86,7 @@ def headlines_of(result: SurveyResult) -> dict[Level, str]:
 
 
 def adjustment_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return whether the adjustment converged and determines everything, and how much it rejected."""
+    """Return remarks on convergence, on undetermined unknowns, and on the rejected part."""
     remarks = []
     if not a.converged:
         remarks.append(remark("not_converged", iterations=a.iterations))
@@ -106,7 +106,7 @@ def adjustment_remarks(a: Adjustment) -> tuple[Remark, ...]:
 
 
 def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return how many photographs are not in the result, and which are copies of others."""
+    """Return remarks on photographs that are not in the result, and on copies."""
     oriented, total = len(result.adjustment.network.images), result.images_total
     missing = total - oriented
     copies = [one.image for one in result.failed if one.is_copy]
@@ -118,7 +118,7 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return why mirrored photographs are not in the result, once for those that are it together."""
+    """Return why mirrored photographs are not in the result, once for those mirrored together."""
     remarks = []
     for one in result.failed:
         if one.reason.kind == "photograph_mirrored":
@@ -131,7 +131,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return the farthest other solution that the image points allow, and the farthest reversed in depth.
 
-    Along a flat valley of c there are many; those between them add nothing.
+    A flat valley of c contains many solutions; those in between add nothing.
     """
     found: list[Remark] = []
     for other in sorted(result.other_solutions, key=lambda one: -one.moved):
@@ -153,7 +153,7 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustment) -> tuple[Remark, ...]:
-    """Return whether sigma0 a posteriori is far from that a priori, and how much of it neighbours share."""
+    """Return remarks on a sigma0 far from its a priori value, and on errors shared by neighbours."""
     parts, shared = {}, adjustment.error_correlation
     if shared is not None and shared.common > shared.alone:
         parts["common"] = (shared.sigmas_px(adjustment.sigma0_px)[1], "px")
@@ -169,7 +169,7 @@ def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustmen
 
 
 def residual_remarks(result: SurveyResult, worst: LongestResidual) -> tuple[Remark, ...]:
-    """Return the longest accepted residual, and gross errors where the survey rejects nothing."""
+    """Return the longest accepted residual, and gross errors if the survey rejects nothing."""
     kept = remark(
         "residual_kept",
         point=worst.point,
@@ -181,7 +181,7 @@ def residual_remarks(result: SurveyResult, worst: LongestResidual) -> tuple[Rema
 
 
 def _untested(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return what the test of single image coordinates shows where the survey rejects nothing."""
+    """Return the test of single image coordinates if the survey rejects nothing."""
     if result.reject != "none":
         return ()
     found = robust_test(result.adjustment)
@@ -199,7 +199,7 @@ def _untested(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the points that lost more rays than chance makes or have but two, and a pair of photographs.
+    """Return remarks on points that lost more rays than by chance, on points with two rays, and on a pair.
 
     Known coordinates check the rays of a point, however few there are.
     """
@@ -222,7 +222,7 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
 
 
 def consistency_remarks(found: Consistency) -> tuple[Remark, ...]:
-    """Return what the tests of points and photographs show."""
+    """Return remarks on the tests of points and photographs."""
     remarks = []
     if found.doubtful:
         remarks.append(remark("points_doubtful", points=[one.point for one in found.doubtful]))
@@ -242,7 +242,7 @@ def consistency_remarks(found: Consistency) -> tuple[Remark, ...]:
 
 
 def comparison_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return whether the other adjuster agrees, and whether its camera fits better."""
+    """Return remarks on whether the other adjuster agrees, and whether its camera fits better."""
     both = result.comparison
     if both is None:
         return ()
@@ -272,9 +272,9 @@ def given_remarks(
     """Return the remarks on given values that took part or check the result.
 
     Args:
-        result: of a survey.
-        given: residuals of what took part.
-        statistics: of the adjustment.
+        result: result of a survey.
+        given: residuals of the given values that took part.
+        statistics: statistics of the adjustment.
         checks: coordinates that took no part.
     """
     return (
@@ -286,9 +286,9 @@ def given_remarks(
 
 
 def _kinds(statistics: Statistics, judged: set[str]) -> tuple[Remark, ...]:
-    """Return the remarks on kinds of given values whose residuals are larger than stated, beyond chance.
+    """Return the remarks on kinds of given values with residuals that are too large by more than chance.
 
-    Kinds that were judged against the free network have theirs.
+    Kinds that were judged against the free network already have a remark.
     """
     found = statistics.kinds
     level = LEVEL / max(len(found.names) - 1, 1)
@@ -303,10 +303,10 @@ def _kinds(statistics: Statistics, judged: set[str]) -> tuple[Remark, ...]:
 
 
 def _differing(given: Given) -> Iterator[Remark]:
-    """Yield the remark on the value of each kind whose w is largest, where chance does not explain it.
+    """Yield the remark on the value with the largest w of each kind, if chance does not explain it.
 
-    The shift is that of the adjusted value itself, |w| sqrt((1 - r) / r), a coordinate or a length of the
-    object. The orientation of a photograph is neither, so that none is given there.
+    The shift is that of the adjusted value itself, |w| sqrt((1 - r) / r), for a coordinate or a length of the
+    object. The orientation of a photograph is neither, so no shift is given for it.
     """
     for kind in (given.control, given.bars, *given.further):
         worst = _beyond_chance(kind) if kind else None
@@ -320,7 +320,7 @@ def _differing(given: Given) -> Iterator[Remark]:
 
 
 def _beyond_chance(kind: GivenResiduals) -> GivenValue | None:
-    """Return the value of a kind whose w is largest, if it is larger than chance makes it."""
+    """Return the value of a kind with the largest w, if w is larger than by chance."""
     tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r >= MIN_REDUNDANCY]
     if not tested or not abs(tested[0].w) > -normal_ppf(LEVEL / (2 * len(tested))):
         return None
@@ -328,7 +328,7 @@ def _beyond_chance(kind: GivenResiduals) -> GivenValue | None:
 
 
 def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tuple[float, str]]:
-    """Return a value, its difference and its w as a remark has them."""
+    """Return a value, its difference and its w in the form of a remark."""
     return {
         "given": f"{one.coordinate} of {kind.kind} {one.name}",
         "difference": (abs(one.difference), one.unit),
@@ -337,7 +337,7 @@ def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tup
 
 
 def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...]:
-    """Return the remarks on coordinates that took no part: single ones, or most of them."""
+    """Return the remark on the worst coordinate that took no part, or on most of them together."""
     tested = [one for one in checks if np.isfinite(one.test)]
     critical = -normal_ppf(LEVEL / (2 * max(len(tested), 1)))
     beyond = [one for one in tested if abs(one.test) > critical]
@@ -360,10 +360,11 @@ def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...
 
 
 def _scale(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return the remark on a scale that puts the object nearer to the camera than any lens forms its image.
+    """Return the remark on a scale that puts the object nearer to the camera than any lens can focus.
 
-    At the image distance c the image is as large as the object. Source: DIN 19040-2 (macrophotography is
-    photography at 1 : 1 and larger); Luhmann et al. (2020), sec. 3.1.1 (thin lens).
+    At an object distance equal to the image distance c the image is as large as the object. Source: DIN
+    19040-2 (macrophotography is photography at 1 : 1 and larger); Luhmann et al. (2020), sec. 3.1.1 (thin
+    lens).
     """
     a, metres = result.adjustment, METRES.get(result.length_unit)
     if metres is None or not result.has_scale:
@@ -387,7 +388,7 @@ def _scale(result: SurveyResult) -> tuple[Remark, ...]:
 
 @dataclass(frozen=True)
 class Findings:
-    """A result and everything that is reported of it."""
+    """A result and everything that is reported about it."""
 
     result: SurveyResult
     verdict: Verdict
@@ -397,7 +398,7 @@ class Findings:
     statistics: Statistics
     geometry: Geometry
     interior: InteriorOrientation
-    calibrated: tuple[CalibratedCamera, ...]  # where the cameras are the result
+    calibrated: tuple[CalibratedCamera, ...]  # if the cameras are the result
     given: Given
     rigs: tuple[Rig, ...]
     precision: Precision
@@ -408,14 +409,14 @@ class Findings:
 
 
 def with_remark(findings: Findings, new: Remark) -> Findings:
-    """Return findings with one remark more, and the verdict that follows."""
+    """Return findings with one more remark, and the resulting verdict."""
     result = findings.result
     verdict = judge((*findings.verdict.remarks, new), headlines_of(result))
     return replace(findings, result=replace(result, remarks=(*result.remarks, new)), verdict=verdict)
 
 
 def findings_of(result: SurveyResult) -> Findings:
-    """Return everything that the reports state of a result."""
+    """Return everything that the reports state about a result."""
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given = given_of(a, result.length_unit)

@@ -1,1 +1,1 @@
-"""Files for programs: the tables of a result (`csv_files`) and its figures (`summary`)."""
+"""Files for other programs: the tables of a result (`csv_files`) and its key figures (`summary`)."""

@@ -1,4 +1,4 @@
-"""The tables of a survey's result: its solution, what was left out, given values, and tests."""
+"""The tables of a survey result: solution, omitted points and photographs, given values, and tests."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from sfm.result import SurveyResult
 from sfm.solution import MEASURED
 
 CODED_COLOUR, UNCODED_COLOUR = (20, 140, 60), (120, 120, 120)  # in points.ply
-USUAL_R0 = 2 / 3  # of the largest image radius
+USUAL_R0 = 2 / 3  # usual R0 over the largest image radius
 
 
 def write_tables(findings: Findings, folder: Path) -> None:
-    """Write all tables of a result into an existing folder; `summary.write_summary` adds the figures."""
+    """Write all tables of a result into an existing folder; `summary.write_summary` adds the key figures."""
     result, statistics = findings.result, findings.statistics
     a = result.adjustment
     g, codes = findings.geometry, [None if code < 0 else code for code in result.code.tolist()]
@@ -72,7 +72,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
 
 
 def table_stems(findings: Findings) -> tuple[str, ...]:
-    """Return the names of the tables of a result without their ending, as `write_tables` writes them."""
+    """Return the names of the tables that `write_tables` writes, without suffix."""
     some = {tables.CAMERAS_BALANCED: _is_balanced(findings)}
     some[tables.TARGETS] = len(findings.result.seen_targets.image) > 0
     written = [one.file.removesuffix(".csv") for one in tables.TABLES if some.get(one, True)]
@@ -85,11 +85,11 @@ def _is_balanced(findings: Findings) -> bool:
 
 
 def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return the cameras of model brown_forward in AICON's form, camera, parameter, value, sigma and unit.
+    """Return the cameras of model brown_forward in AICON's form: camera, parameter, value, sigma and unit.
 
-    c is negative, as AICON writes it; sigma is empty where nothing of a value was adjusted. R0 is that of the
-    survey file, else two thirds of the largest image radius, as is usual. A camera that has no such form, as
-    with K4 or distortion that cannot be balanced there, has no rows.
+    c is negative, as AICON writes it; sigma is empty if a value was not adjusted. R0 is taken from the survey
+    file, or else is two thirds of the largest image radius, as is usual. A camera without such a form has no
+    rows: one with K4, or with distortion that cannot be balanced at R0.
     """
     given = dict(findings.result.balance_radius_mm)
     a = findings.result.adjustment
@@ -115,9 +115,9 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
 
 
 def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Return photograph, place and outline of every target, and why candidates were rejected.
+    """Return photograph, position and outline of every target, and the reasons for rejected candidates.
 
-    Rejected candidates have no outline; to 1e-4 px and 1e-3 deg, as they are shown.
+    Rejected candidates have no outline. Values are rounded to 1e-4 px and 1e-3 deg, as they are shown.
     """
     result = findings.result
     seen, names = result.seen_targets, result.network.images
@@ -128,7 +128,7 @@ def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
 
 
 def left_out_rows(result: SurveyResult) -> Iterable[Sequence[Any]]:
-    """Return kind, name, image points and reason of every photograph and point that is not in the result."""
+    """Return kind, name, image points and reason of every photograph and point not in the result."""
     for failed in result.failed:
         yield ("photograph", failed.image, None, failed.reason.text)
     for one in result.left_out:
@@ -136,10 +136,10 @@ def left_out_rows(result: SurveyResult) -> Iterable[Sequence[Any]]:
 
 
 def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
-    """Return the tests of every image point: residual, redundancy number, w, tau, smallest error, its effect.
+    """Return the tests of every image point: residual, redundancy number, w, tau, minimal bias, its effect.
 
-    Empty cells: rejected image points have neither redundancy number nor reliability, and where the
-    redundancy number is 0 no error is found.
+    Rejected image points have empty cells instead of redundancy number and reliability. So have image points
+    with a redundancy number of 0, since no error in them is detected.
     """
     network = adjustment.network
     a, found = adjustment, statistics.reliability
@@ -152,14 +152,14 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
 
 
 def _names(network: Network) -> Iterator[tuple[str, str]]:
-    """Return photograph and point of every image point."""
+    """Yield photograph and point of every image point."""
     seen = network.image_points
     for image, point in zip(seen.image.tolist(), seen.point.tolist(), strict=True):
         yield network.images[image], network.points[point]
 
 
 def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
-    """Return the size that an error would have, v / r, NaN where nothing checks it, px, (k, 2)."""
+    """Return the estimated gross error v / r, NaN if nothing checks it, px, (k, 2)."""
     checked = r > MIN_CHECKED_REDUNDANCY
     return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 
@@ -187,7 +187,7 @@ def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
 
 
 def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Yield the correlations of every interior parameter with every photograph."""
+    """Yield the correlations of every interior parameter with every photograph's exterior orientation."""
     found = findings.result.exterior_correlations
     if found is None:
         return

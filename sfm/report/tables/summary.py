@@ -1,4 +1,4 @@
-"""summary.json: the figures of a result for programs."""
+"""summary.json: the key figures of a result for other programs."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def write_summary(findings: Findings, folder: Path) -> None:
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return the content of summary.json: plain values only, None for what is not known or not finite."""
+    """Return the content of summary.json: plain values only, None for values not known or not finite."""
     names: list[str] = []
     figures: dict[str, Any] = _finite(_figures(findings), "", names)
     return figures | {"not_finite": names}
 
 
 def _finite(value: Any, name: str, names: list[str]) -> Any:
-    """Return a value with None for every number that is not finite; the names of these are appended."""
+    """Return a value with None for every number that is not finite, and append the names of these."""
     if isinstance(value, dict):
         return {key: _finite(one, f"{name}.{key}".lstrip("."), names) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -140,7 +140,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
 
 
 def _error_correlation(a: Adjustment) -> dict[str, float] | None:
-    """Return what neighbouring image points err alone and together, px; None where they are independent."""
+    """Return independent and shared error of neighbouring image points, px; None if all are independent."""
     if a.error_correlation is None:
         return None
     alone, common = a.error_correlation.sigmas_px(a.sigma0_px)
@@ -199,7 +199,7 @@ def _statistics(findings: Findings) -> dict[str, Any]:
 
 
 def _consistency(findings: Findings) -> dict[str, Any]:
-    """Return what the tests of points, photographs and the format have found."""
+    """Return the outcome of the tests of points, photographs and the format."""
     found = findings.consistency
     return {
         "large_residuals": list(found.large),
@@ -258,7 +258,7 @@ def _geometry(findings: Findings) -> dict[str, Any]:
 
 
 def _spread(values: FloatArray) -> dict[str, float | None]:
-    """Return the smallest, mean and largest of the values known."""
+    """Return smallest, mean and largest of the known values."""
     found = spread(values)
     return {"min": or_none(found.smallest), "mean": or_none(found.mean), "max": or_none(found.largest)}
 
@@ -295,7 +295,7 @@ def _scale_bars(findings: Findings) -> list[dict[str, Any]]:
 
 
 def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, Any]]:
-    """Return every given value of a kind; the keys are what its name and coordinate are called."""
+    """Return every given value of a kind; `keys` are the keys of its name and coordinate."""
     return [
         dict(zip(keys, (one.name, one.coordinate), strict=False))
         | values_of(one, "unit given difference sigma r w")
@@ -304,7 +304,7 @@ def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, An
 
 
 def _comparison(result: SurveyResult) -> dict[str, Any] | None:
-    """Return the comparison with the other adjuster, None without one."""
+    """Return the comparison with the other adjuster; None without one."""
     both = result.comparison
     if both is None:
         return None
@@ -336,7 +336,7 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
 
 
 def _baseline(result: SurveyResult) -> dict[str, Any] | None:
-    """Return the comparison with the other pipeline, None without one."""
+    """Return the comparison with the other pipeline; None without one."""
     found = result.baseline
     if found is None:
         return None
@@ -355,7 +355,7 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
 
 
 def _further(given: Given) -> dict[str, list[dict[str, Any]]]:
-    """Return the values of all other kinds, those of all groups of a kind together."""
+    """Return the values of all further kinds, with all groups of a kind together."""
     found = defaultdict[str, list[dict[str, Any]]](list)
     for kind in given.further:
         found[kind.kind] += _given_values(kind, "name", "component")
@@ -363,7 +363,7 @@ def _further(given: Given) -> dict[str, list[dict[str, Any]]]:
 
 
 def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
-    """Return where the cameras of rigs are mounted."""
+    """Return the mounts of the cameras of rigs."""
 
     def stated(values: Any) -> dict[str, Any]:
         return {name: {"value": or_none(value), "sigma": or_none(sigma)} for name, value, sigma, _ in values}

@@ -1,12 +1,12 @@
-"""The viewer embedded in a page, and the scenes of solutions and of what follows from them.
+"""The viewer embedded in a page, and the scenes of solutions, plans, measurements and epochs.
 
-A scene as text inside a page: names as JSON, numbers as arrays, gzip, base64.
+A scene is embedded in a page as text: names as JSON and numbers as arrays, compressed by gzip, as base64.
 
     4 bytes     length of the header, little-endian
-    header      JSON in UTF-8, filled up with spaces to a multiple of 8 bytes
-    arrays      one after the other, each from a multiple of 8 bytes on
+    header      JSON in UTF-8, padded with spaces to a multiple of 8 bytes
+    arrays      one after another, each starting at a multiple of 8 bytes
 
-The header names them as [type, first byte, values]. Its reader is viewer/src/data.js.
+The header describes each array as [type, first byte, number of values]. viewer/src/data.js reads it.
 
 Source: RFC 1952 (gzip), RFC 4648 (base64).
 """
@@ -59,10 +59,10 @@ if TYPE_CHECKING:
 
 MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 UNUSED = "measured, not part of the result"
-ALIGNED = 8  # bytes
+ALIGNED = 8  # bytes to which arrays are aligned
 TYPES = {"f8": "<f8", "f4": "<f4", "u4": "<u4", "u1": "|u1"}
 NO_CROP = "no picture: it is neither in this page nor beside it"
-NO_FILE = "the picture lies in the folder of the report, which is not beside this page"
+NO_FILE = "the picture is in the folder of the report, which is not beside this page"
 NO_PICTURE = "no photograph was read for this page"
 
 
@@ -70,11 +70,11 @@ NO_PICTURE = "no photograph was read for this page"
 class Viewer:
     """The parts of a viewer that a page embeds."""
 
-    script: Markup  # to the letter, since the policy allows it by its hash
+    script: Markup  # exact text, since the policy allows it by its hash
     style: Markup
     data: str  # base64
     pictures: str  # base64
-    notes: tuple[str, ...]  # what the page leaves out
+    notes: tuple[str, ...]  # what the page omits
 
 
 def viewer_of(scene: ViewerScene, pictures: Pictures) -> Viewer:
@@ -93,7 +93,7 @@ def sources() -> tuple[str, str]:
 
 
 def packed_scene(scene: ViewerScene, pictures: Pictures) -> str:
-    """Return a scene as base64 text, fit for an element of a page."""
+    """Return a scene as base64 text for an element of a page."""
     upper = np.triu_indices(3)
     rays, marks = scene.rays, scene.marks
     arrays: dict[str, tuple[str, AnyArray]] = {
@@ -170,7 +170,11 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
             "no_file": NO_FILE,
             "no_picture": NO_PICTURE,
             "covariance": "their correlation is not known here"
-            + (f", it is kept of at most {MAX_POINTS} points." if len(scene.points) > MAX_POINTS else "."),
+            + (
+                f", since it is kept for at most {MAX_POINTS} points."
+                if len(scene.points) > MAX_POINTS
+                else "."
+            ),
         },
     }
 
@@ -202,7 +206,7 @@ def _packed(header: dict[str, Any], arrays: dict[str, tuple[str, AnyArray]]) -> 
 
 
 def scene_of_result(findings: Findings) -> ViewerScene:
-    """Return what the viewer shows of a survey, with what was measured and rejected in its photographs."""
+    """Return the scene of a survey, with the measured and rejected candidates in its photographs."""
     result, a = findings.result, findings.result.adjustment
     names, check = a.network.points, result.control_check
     scene = scene_of_stored(
@@ -224,14 +228,14 @@ def scene_of_stored(
     seen_targets: SeenTargets | None = None,
     residuals: FloatArray | None = None,
 ) -> ViewerScene:
-    """Return what the viewer shows of a result; photographs and points without coordinates are left out.
+    """Return the scene of a stored result, without photographs and points that have no coordinates.
 
     Args:
-        stored: the result, rejected image points included where `rejected` names them.
-        w: Baarda's w of its image points, where known, (k, 2).
-        rejected: which of its image points took no part; none if not given, (k,).
-        seen_targets: outlines of its targets and what else was seen in its photographs, where known.
-        residuals: computed minus measured, px, (k, 2); by projection if not given.
+        stored: the result, including rejected image points if `rejected` marks them.
+        w: Baarda's w of its image points, if known, (k, 2).
+        rejected: which of its image points took no part; None for none, (k,).
+        seen_targets: outlines of its targets and other candidates in its photographs, if known.
+        residuals: computed minus measured, px, (k, 2); None to compute them by projection.
     """
     network, estimate = stored.network, stored.estimate
     seen = network.image_points
@@ -273,7 +277,7 @@ def scene_of_stored(
         ("points", determined, network.points),
     ):
         if len(found) < len(names):
-            notes.append(f"{len(names) - len(found)} of {len(names)} {kind} have no coordinates: left out.")
+            notes.append(f"{len(names) - len(found)} of {len(names)} {kind} have no coordinates: omitted.")
     return ViewerScene(
         stored.name,
         stored.unit or "object units",
@@ -310,7 +314,7 @@ def scene_of_stored(
 
 
 def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
-    """Return computed minus measured position of every image point, px; NaN where not known, (k, 2)."""
+    """Return computed minus measured position of every image point, px; NaN if not known, (k, 2)."""
     network, estimate = stored.network, stored.estimate
     computed = np.full(seen.xy.shape, np.nan)
     order = np.argsort(seen.image, kind="stable")
@@ -324,12 +328,12 @@ def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
 
 
 def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
-    """Return the ellipse of each image point, NaN without one, (k, 3), and what else was seen.
+    """Return the ellipse of each image point, NaN without one, (k, 3), and the other candidates.
 
     Args:
-        seen: in the same photographs.
+        seen: targets and candidates in the same photographs.
         image: photograph of each image point, (k,).
-        xy: where it is, px, (k, 2).
+        xy: position of each image point, px, (k, 2).
     """
     ellipse = np.full((len(xy), 3), np.nan)
     left = np.ones(len(seen.image), dtype=bool)
@@ -348,7 +352,7 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
 
 
 def displacements_viewer(found: EpochSeries) -> Viewer | None:
-    """Return the scene of the first epoch with the displacements to the last; None without photographs."""
+    """Return the viewer of the first epoch with displacements to the last; None without photographs."""
     if not found.first.result.estimate.oriented.any():
         return None
     scene = _scene_of_displacements(found.since_first[-1].displacements, found.first.result)
@@ -386,7 +390,7 @@ def _scene_of_displacements(found: Displacements, first: Solution) -> ViewerScen
 
 
 def measurement_viewer(found: Measurement, result: Solution) -> Viewer | None:
-    """Return the scene in the system of a measurement; None without photographs."""
+    """Return the viewer in the coordinate system of a measurement; None without photographs."""
     if not result.estimate.oriented.any():
         return None
     estimate, n = result.estimate, int(result.estimate.determined.sum())
@@ -413,7 +417,7 @@ def measurement_viewer(found: Measurement, result: Solution) -> Viewer | None:
 
 
 def _worst_deviation(found: Measurement) -> FloatArray:
-    """Return of each point its largest deviation from what tolerances, else shapes, say; NaN without any."""
+    """Return the largest deviation of each point from tolerances, or else from shapes; NaN without any."""
     worst = np.full(len(found.points.names), np.nan)
     judged: list[Deviations | ShapeFit] = [*found.tolerances] or [*found.shapes]
     for one in judged:
@@ -424,7 +428,7 @@ def _worst_deviation(found: Measurement) -> FloatArray:
 
 
 def plan_viewer(plan: Plan) -> Viewer:
-    """Return the scene of a plan: stations, rays and all points, those not determined included."""
+    """Return the viewer of a plan: stations, rays and all points, including undetermined ones."""
     p = plan.prediction
     a = p.adjustment
     m, n = np.nonzero(p.sight.seen)

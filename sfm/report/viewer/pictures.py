@@ -1,7 +1,7 @@
-"""Content of the viewer of a page: the scene as parallel arrays, and pictures within a budget.
+"""Content of the viewer of a page: the scene as parallel arrays, and pictures within a size budget.
 
-Thumbnails come first, then photographs, then crops, those of the largest residuals first. Files beside the
-page have what has no room in it: every photograph, and the crops of each in one picture of cells.
+Thumbnails have priority, then photographs, then crops, with the largest residuals first. Files beside the
+page contain what does not fit in it: every photograph, and its crops as the cells of one picture.
 """
 
 from __future__ import annotations
@@ -23,43 +23,43 @@ from sfm.report.figures.overlays import fitted_picture, jpeg_of, overlay_names
 from sfm.runtime.progress import SILENT, Progress
 
 BUDGET_MB = 15.0
-"""what the pictures of a page may take, 10^6 bytes of base64 text"""
+"""maximum size of the pictures of a page, 10^6 bytes of base64 text"""
 THUMBNAIL_PX = 160
 VIEW_PX = 1400  # longer side of an embedded photograph
-FILE_PX = 2400  # of one beside the page
+FILE_PX = 2400  # longer side of a photograph beside the page
 CROP_PX = 64  # side of a stored crop; larger ones are averaged
-COLUMNS = 32  # of the cells of a file of crops
+COLUMNS = 32  # columns of cells in a file of crops
 CROP_DIAMETERS = 2.2  # side of a crop over the target's larger diameter
 MIN_SIDE_PX, MAX_SIDE_PX = 20, 240  # of a crop in the photograph
-SIDE_PX = 40  # of a crop about a point without an outline
+SIDE_PX = 40  # of a crop around a point without an outline
 THUMBNAIL_QUALITY, VIEW_QUALITY, FILE_QUALITY, CROP_QUALITY = 70, 75, 85, 78
-MAX_CROP_BYTES = 4500  # of a stored crop, noise included
-THUMBNAILS_PART = 0.3  # of the budget at most
-VIEWS_PART = 0.6  # of what thumbnails leave
+MAX_CROP_BYTES = 4500  # of a stored crop of a noisy photograph
+THUMBNAILS_PART = 0.3  # maximum part of the budget
+VIEWS_PART = 0.6  # of the budget left by the thumbnails
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures inside a page, and the names of those beside it."""
+    """Pictures inside a page, and the names of those in files beside it."""
 
-    base64: str = ""  # all that are embedded, one after the other
+    base64: str = ""  # all embedded pictures, one after another
     count: int = 0  # photographs that were read
-    files: tuple[str, ...] = ()  # of each photograph beside the page, "" for none, (m,)
-    crop_files: tuple[str, ...] = ()  # of the crops of each photograph, likewise
+    files: tuple[str, ...] = ()  # file of each photograph beside the page, "" for none, (m,)
+    crop_files: tuple[str, ...] = ()  # file with the crops of each photograph, likewise
     beside: Mapping[str, bytes] = field(default_factory=dict)  # content of these files by name
     thumbnail: IntArray = field(
         default_factory=lambda: np.zeros((0, 2), np.int64)
     )  # start and length, (m, 2)
     view: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))  # likewise
-    ray: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # of each crop, (c,)
+    ray: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # image point of each crop, (c,)
     frame: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))  # left and top edge, side, px of the
     # photograph, and side of the stored crop, px, (c, 4)
     crop: IntArray = field(default_factory=lambda: _none(0))  # start and length, (c, 2)
-    cell: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # in the file of crops, (c,)
-    notes: tuple[str, ...] = ()  # what the page leaves out
+    cell: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # cell in the file of crops, (c,)
+    notes: tuple[str, ...] = ()  # what the page omits
 
     def arrays(self) -> dict[str, tuple[str, AnyArray]]:
-        """Return what `container` packs; starts and lengths count groups of four characters of base64."""
+        """Return the arrays to pack; starts and lengths count groups of four base64 characters."""
         return {
             **{
                 f"{name}.{part}": ("u4", values[:, k])
@@ -96,11 +96,11 @@ def cut_pictures(
     """Cut thumbnails, photographs and crops of a scene out of its photographs.
 
     Args:
-        scene: what is shown.
-        paths: files of the photographs by name; those that can no longer be read are left out.
-        budget_mb: what the embedded pictures may take, 10^6 bytes of the page.
+        scene: scene of the viewer.
+        paths: files of the photographs by name; files that can no longer be read are left out.
+        budget_mb: maximum size of the embedded pictures, 10^6 bytes of the page.
         beside: folder of the files beside the page, as the page names it; "" if there are none.
-        jobs: photographs cut at the same time.
+        jobs: photographs processed at the same time.
         progress: called for every photograph.
     """
     m, rays = len(scene.photographs), scene.rays
@@ -148,7 +148,7 @@ def _cut(
     crops: dict[int, bytes] = {}
     frames: dict[int, tuple[float, float, float, int]] = {}
     cells = []
-    scale = grey.shape[1] / width_px  # below 1 where a smaller picture stands for the photograph
+    scale = grey.shape[1] / width_px  # below 1 if a smaller picture replaces the photograph
     for k, (left, top, side) in zip(
         rows.tolist(), _frames(scene, rows, grey.shape, scale).tolist(), strict=True
     ):
@@ -173,7 +173,7 @@ def _cut(
 
 
 def _frames(scene: ViewerScene, rows: IntArray, shape: tuple[int, ...], scale: float) -> IntArray:
-    """Return first column, first row and side of the crops of rays, px of a picture, inside of it, (k, 3)."""
+    """Return first column, first row and side of the crops of rays, px, inside the picture, (k, 3)."""
     semi = scene.rays.ellipse[rows, 0]
     wanted = np.where(np.isfinite(semi), 2 * semi * CROP_DIAMETERS, SIDE_PX)
     side = np.minimum(np.rint(scale * np.clip(wanted, MIN_SIDE_PX, MAX_SIDE_PX)), min(shape[:2]))
@@ -194,7 +194,7 @@ def _sheet(patches: list[AnyArray]) -> bytes:
 def _embed(
     scene: ViewerScene, cuts: list[_Cut | None], order: IntArray, budget: int, beside: str
 ) -> Pictures:
-    """Choose what has room in the page, and name the rest."""
+    """Choose the pictures that fit in the page, and name the others."""
     m = len(cuts)
     store = _Store()
     read = [(i, one) for i, one in enumerate(cuts) if one is not None]
@@ -249,20 +249,20 @@ def _embed(
 
 
 def _left_out(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:
-    """Return in words what the page does not hold."""
-    rest = "the rest lies in the folder pictures beside it" if beside else "there was no room for the rest"
+    """Return in words what the page omits."""
+    rest = "the rest is in the folder pictures beside it" if beside else "there was no room for the rest"
     lines = []
     if read < m:
         lines.append(f"{m - read} of {m} photographs could not be read: they have no picture here.")
     if views < read:
-        lines.append(f"This page shows {views} of {read} photographs, those of the largest RMS; {rest}.")
+        lines.append(f"This page shows {views} of {read} photographs, those with the largest RMS; {rest}.")
     if crops < rays and read:
         lines.append(f"This page shows crops of {crops} of {rays} image points, the worst; {rest}.")
     return lines
 
 
 class _Store:
-    """Pictures one after the other, each filled up to whole groups of base64."""
+    """Pictures one after another, each padded to whole groups of base64."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -288,13 +288,13 @@ def _none(count: int) -> IntArray:
 class Rays:
     """The image points of a network, rejected ones included, in the order of their object points."""
 
-    point: IntArray  # index of the object point, never falling, (k,)
+    point: IntArray  # index of the object point, in ascending order, (k,)
     photo: IntArray  # index of the photograph, (k,)
     xy: FloatArray  # measured position, px, (k, 2)
-    v: FloatArray  # residual, computed minus measured, px; NaN where not known, (k, 2)
-    w: FloatArray  # Baarda's w of both coordinates; NaN where not known, (k, 2)
+    v: FloatArray  # residual, computed minus measured, px; NaN if not known, (k, 2)
+    w: FloatArray  # Baarda's w of both coordinates; NaN if not known, (k, 2)
     rejected: BoolArray  # whether it took no part, (k,)
-    ellipse: FloatArray  # semi-axes, larger first, px, and angle, rad; NaN where there is none, (k, 3)
+    ellipse: FloatArray  # semi-axes, larger first, px, and angle, rad; NaN without an ellipse, (k, 3)
 
     def __len__(self) -> int:
         return len(self.point)
@@ -305,19 +305,19 @@ class Rays:
         return np.asarray(np.linalg.norm(self.v, axis=1))
 
     def worst_first(self) -> IntArray:
-        """Return the rays by |w|, where that is not known by the residual; rejected ones first, (k,)."""
+        """Return the rays by falling |w|, or by residual if w is not known; rejected ones first, (k,)."""
         size = np.where(np.isfinite(self.w).any(axis=1), np.fmax(*np.abs(self.w).T), self.length)
         return np.lexsort((np.arange(len(self)), -np.nan_to_num(size), ~self.rejected))
 
 
 @dataclass(frozen=True)
 class Marks:
-    """Candidates seen in photographs that are not in the result."""
+    """Candidates in photographs that are not in the result."""
 
-    photo: IntArray  # index of the photograph, in rising order, (c,)
+    photo: IntArray  # index of the photograph, in ascending order, (c,)
     xy: FloatArray  # px, (c, 2)
     reason: IntArray  # index into `reasons`, (c,)
-    reasons: tuple[str, ...]  # in words, what matters most first
+    reasons: tuple[str, ...]  # in words, most important first
 
     @classmethod
     def none(cls) -> Marks:
@@ -339,16 +339,16 @@ class Bar:
 
 @dataclass(frozen=True)
 class ViewerScene:
-    """A result to look at."""
+    """A result to be explored in the viewer."""
 
     name: str
     unit: str  # of lengths
     cameras: tuple[Camera, ...]
     points: tuple[str, ...]  # names, n of them
     xyz: FloatArray  # object unit, (n, 3)
-    covariance: FloatArray  # of each point by itself, object unit^2; NaN where not known, (n, 3, 3)
-    rays_of_point: IntArray  # accepted, (n,)
-    angle_deg: FloatArray  # largest between two rays, deg; NaN with fewer than two, (n,)
+    covariance: FloatArray  # of each point alone, object unit^2; NaN if not known, (n, 3, 3)
+    rays_of_point: IntArray  # accepted rays, (n,)
+    angle_deg: FloatArray  # largest angle between two rays, deg; NaN with fewer than two, (n,)
     point_rms_px: FloatArray  # (n,)
     photographs: tuple[str, ...]  # names, m of them
     camera: IntArray  # index of the camera of each photograph, (m,)
@@ -356,21 +356,21 @@ class ViewerScene:
     rotation: FloatArray  # image to object axes, (m, 3, 3)
     exterior_sigma: FloatArray  # of X0 Y0 Z0 (object unit), omega phi kappa (deg); NaN if not known, (m, 6)
     photo_rms_px: FloatArray  # (m,)
-    points_of_photo: IntArray  # accepted, (m,)
+    points_of_photo: IntArray  # accepted image points, (m,)
     rays: Rays
     marks: Marks
     bars: tuple[Bar, ...]
     control: tuple[int, ...]  # indices of points
     distance_sigma: FloatArray | None  # of the distance of each pair of points i < j, by rows, object unit
     rms_px: float  # residual per coordinate over the accepted image points
-    notes: tuple[str, ...] = ()  # what the page leaves out, one line each
+    notes: tuple[str, ...] = ()  # what the page omits, one line each
     deviation: FloatArray | None = (
-        None  # of points from what is nominal, object unit; NaN where unknown, (n,)
+        None  # of points from their nominal shape, object unit; NaN if unknown, (n,)
     )
     displacement: FloatArray | None = (
         None  # of points since an earlier epoch, object unit; NaN likewise, (n, 3)
     )
-    state: tuple[str, ...] = ()  # what a test says of the displacement of each point, (n,)
+    state: tuple[str, ...] = ()  # outcome of the test of each displacement, (n,)
 
 
 def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -383,7 +383,7 @@ def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:
         covariance: of all coordinates together, object unit^2, (3 n, 3 n).
 
     Returns:
-        Of the pairs i < j, by rows, object unit; NaN where both points are in one place, (n (n - 1) / 2,).
+        Standard deviations of pairs i < j, by rows, object unit, (n (n - 1) / 2,); NaN for coincident points.
 
     Source: law of propagation of variances; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
     """
