@@ -1,10 +1,10 @@
-"""Targets in a photograph: found, measured with covariance and decoded.
+"""Targets in a photograph: detected, measured with covariance and decoded.
 
-- `find_targets`: begin here; all targets of a photograph, as `Targets`.
+- `find_targets`: start here; it returns all targets of a photograph as `Targets`.
 - `measure_edge_ellipses`: the ellipse through the edges of each target, with its covariance.
 
-Nothing here knows of cameras, surveys or files. `outlines` finds candidates, `measure` fits them (models in
-`fits/`), and `codes/` reads rings and square tags.
+This package knows nothing of cameras, surveys or files. `outlines` finds candidates, `measure` fits them
+(models in `fits/`), and `codes/` reads rings, square tags and plates.
 
     >>> import numpy as np
     >>> from sfm.targets import find_targets

@@ -1,4 +1,4 @@
-"""Finding, measuring and decoding the targets of one photograph: the entrance to this room."""
+"""Detection, measurement and decoding of the targets of one photograph: the entry point of this package."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CENTRES = ("model", "edges", *WEIGHTS)
 
 @dataclass(frozen=True)
 class Targets:
-    """The targets measured in one photograph, circles and corners of tags, and the rejected candidates."""
+    """The targets of one photograph, circles and corners of tags, and the rejected candidates."""
 
     xy: FloatArray
     """centres, px, (0, 0) is the centre of the top-left pixel, shape (k, 2)"""
@@ -51,13 +51,13 @@ class Targets:
     edge_covariance: FloatArray
     """covariance of (background, contrast, blur), units of the photograph and px, shape (k, 3, 3)"""
     semi_axes: FloatArray
-    """major and minor semi-axis of the ellipse, px; what is drawn for a corner of a tag, shape (k, 2)"""
+    """major and minor semi-axis of the ellipse, px; for a corner of a tag the drawn circle, shape (k, 2)"""
     angle: FloatArray
     """direction of the major axis from x (right) towards y (down), rad, shape (k,)"""
     code: IntArray
-    """code number, of a corner of a tag see codes.tags.TagCorners, -1 where uncoded, shape (k,)"""
+    """code number, for a corner of a tag see codes.tags.TagCorners, -1 if uncoded, shape (k,)"""
     confidence: FloatArray
-    """confidence of the code, 0 to 1, 0 where uncoded, shape (k,)"""
+    """confidence of the code, 0 to 1, 0 if uncoded, shape (k,)"""
     polarity: IntArray
     """+1 brighter, -1 darker than the surroundings, shape (k,)"""
     contrast: FloatArray
@@ -73,7 +73,7 @@ class Targets:
     rejected_xy: FloatArray
     """positions of rejected candidates, px, shape (m, 2)"""
     rejected_flag: IntArray
-    """their reasons, see sfm.targets.outlines.Flag, shape (m,)"""
+    """reasons for rejection, see sfm.targets.outlines.Flag, shape (m,)"""
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -95,27 +95,28 @@ def find_targets(
 ) -> Targets:
     """Find, measure and decode the targets of one photograph.
 
-    Candidates are the outlines of what differs from its local mean; those that resemble ellipses are fitted
-    with the model of a blurred ellipse, and what the model does not explain is rejected with a reason.
+    Candidates are outlines of regions that differ from their local mean. Those that resemble ellipses are
+    fitted with the model of a blurred ellipse; candidates that the model does not explain are rejected with a
+    reason.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
         polarity: dark, bright or auto (both).
         codes: a name in `sfm.targets.codes.plates.FAMILIES` (arcs, ring12, ring14, ring20, none, a family
-            of tags), the path of a code table, or a family, as that of a calibration plate.
-        centres: how centres are measured: model (least squares fit of a blurred ellipse, the most precise),
-            edges (ellipse through the edges on rays), or the centroid with binary, intensity or squared
-            weights.
-        min_diameter_px: least minor axis of a target.
-        max_diameter_px: largest major axis of a target, without: the width of the photograph.
+            of tags), the path of a code table, or a family such as that of a calibration plate.
+        centres: method of measuring centres: model (least squares fit of a blurred ellipse, the most
+            precise), edges (ellipse through the edges on rays), or the centroid with binary, intensity or
+            squared weights.
+        min_diameter_px: minimum minor axis of a target.
+        max_diameter_px: maximum major axis of a target; infinite for the width of the photograph.
 
     Returns:
         The targets in order of rows, and the rejected candidates.
 
     Raises:
         PhotographError: not a grey photograph of 8 or 16 bit.
-        SurveyFileError: neither a known code family nor a readable table.
-        KolinearError: unknown polarity or way to measure centres, or diameters that cannot be.
+        SurveyFileError: codes is neither a known code family nor a readable table.
+        KolinearError: unknown polarity or method for centres, or impossible diameters.
 
     Example:
         >>> y, x = np.mgrid[:60, :80]
@@ -247,7 +248,7 @@ def _joined(parts: list[Targets]) -> Targets:
 
 
 def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFamily) -> IntArray:
-    """Return which point of a plate each good target is; insides of rings are of the other polarity."""
+    """Return the plate point of each good target; insides of rings have the other polarity."""
     if not good.any():
         return np.zeros(0, dtype=np.int64)
     semi_axes, _ = axes_from_shape(fit.shape[good])
@@ -258,7 +259,7 @@ def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFam
 def _measure_centres(
     grey: AnyArray, fit: EllipseFit, sign: IntArray, noise: float, centres: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Return centres, px, (k, 2), and their covariance, (k, 2, 2), measured another way about a fit."""
+    """Return centres, px, (k, 2), and covariances, (k, 2, 2), measured by another method at a fit."""
     if centres == "edges":
         edges = measure_edge_ellipses(grey, fit.xy, fit.shape, sign, noise=noise)
         return edges.xy, edges.covariance
@@ -266,7 +267,7 @@ def _measure_centres(
 
 
 def _of_crossings(found: Saddles, code: IntArray) -> Targets:
-    """Return the crossings of a board; circles have no place on it."""
+    """Return the crossings of a board as targets; attributes of circles are nan or fixed values."""
     k = len(found.xy)
     return Targets(
         xy=found.xy,
@@ -289,7 +290,7 @@ def _of_crossings(found: Saddles, code: IntArray) -> Targets:
 
 
 def _with_concentric(targets: Targets, rings: ConcentricTags) -> Targets:
-    """Return circular targets and the centres of concentric tags behind them, drawn as their outer edges."""
+    """Return circular targets followed by the centres of concentric tags, drawn as their outer edges."""
     if not rings.fits:
         return targets
     theta = np.array([fit.theta for fit in rings.fits])
@@ -319,7 +320,7 @@ def _with_concentric(targets: Targets, rings: ConcentricTags) -> Targets:
 
 
 def _with_corners(targets: Targets, tags: TagCorners) -> Targets:
-    """Return circular targets and the corners of tags behind them."""
+    """Return circular targets followed by the corners of tags."""
     k = len(tags.xy)
     return Targets(
         xy=np.vstack([targets.xy, tags.xy]),

@@ -1,4 +1,4 @@
-"""Edges of a target on rays from its centre: a better outline, and how far its background reaches."""
+"""Edges of a target along rays from its centre: a better outline, and the extent of its background."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sfm.kernels.sampling import bilinear
 from sfm.kernels.small_algebra import solve_symmetric
 
 RAYS = 32
-# Spacing of the samples on a ray.
+# Spacing of the samples along a ray.
 STEP_PX = 0.5
-# A rise behind the edge by this share of the step, and by so many sigma of the noise, is no background.
+# A rise behind the edge by this part of the step, and by so many sigma of the noise, ends the background.
 _DISTURBANCE, _DISTURBANCE_SIGMAS = 0.3, 5.0
 _PHI = 2 * math.pi * np.arange(RAYS) / RAYS
 HARMONICS = np.column_stack([np.ones(RAYS), np.cos(_PHI), np.sin(_PHI), np.cos(2 * _PHI), np.sin(2 * _PHI)])
@@ -32,14 +32,14 @@ def trace_rays(
     limit: FloatArray,
     window: int = 0,
 ) -> float:
-    """Find the steepest edge on rays from the centre and how far out the background reaches.
+    """Find the steepest edge on rays from the centre, and how far the background extends beyond it.
 
-    It ends the skirt before the rise to a neighbour, at the margin at the latest.
+    The background ends one skirt before the rise to a neighbour, and at the margin at the latest.
 
-    The edge is the vertex of a parabola through the slopes at the steepest point or, where the caller takes
-    the surroundings for clean, the mean position of the slope over a window of samples to both sides.
-    Writes the normalised radius of the edge (nan: none) and the reach beyond it in px for each ray; returns
-    the median step of intensity.
+    The edge is the vertex of a parabola through the slopes at the steepest point. If the caller considers the
+    surroundings clean, it is the mean position of the slope over a window of samples on both sides. For each
+    ray the function writes the normalised radius of the edge (nan: none) and the reach beyond it in px. It
+    returns the median step of intensity.
     """
     h, w = image.shape
     x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
@@ -113,7 +113,7 @@ def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
     centre and shape of the ellipse to first order.
 
     Returns:
-        The share of the rays that agree with an ellipse, and the largest change in radii.
+        The part of the rays that agree with an ellipse, and the largest change in radii.
     """
     sound = edge[np.isfinite(edge)]
     if len(sound) < RAYS // 2:

@@ -1,4 +1,4 @@
-"""Measurement of circular targets by a blurred ellipse, and which candidates are none."""
+"""Measurement of circular targets by blurred ellipses, and rejection of other candidates."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from sfm.targets.fits.outline_noise import outline_shape
 from sfm.targets.fits.undamaged import MIN_RADIUS_PX, fit_undamaged, unlike_targets
 from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS, Flag
 
-# Reasons that are about the shape of a candidate and not about damage.
+# Reasons that concern the shape of a candidate and not damage.
 SHAPE_REASONS = (Flag.LOBED, Flag.THIN_BACKGROUND, Flag.POOR_FIT)
-# Centres nearer than this share of the smaller radius belong to concentric targets.
+# Centres nearer than this part of the smaller radius belong to concentric targets.
 MAX_CENTRE_FRACTION = 0.5
-# Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.
+# The centres of a ring are within this part of the radius, for perspective, plus so many sigmas.
 ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
-# Parts of an unreadable code are smaller than this share of its dot.
+# Parts of an unreadable code are smaller than this part of its dot.
 PART_OF_DOT = 0.75
-# Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
+# Softest edge: this part of the minor semi-axis, or this blur in px if it is larger.
 SOFTEST_EDGE, SOFTEST_EDGE_PX = 0.35, 1.3
-BLUR_SIGMAS = 3.0  # beyond which an edge is certainly softer: one target in 700 that is as soft as that
-# Share of the rays on which a stroke ends, and on which something else begins behind it. No ring of up to 20
-# cells is set on so much of the circumference: even parity leaves at least two of them clear.
+BLUR_SIGMAS = 3.0  # beyond which an edge is certainly softer: one in 700 targets that are exactly as soft
+# Part of the rays on which a stroke must end, and on which another object begins behind it. No ring of up to
+# 20 cells is set on so much of the circumference: even parity leaves at least two cells clear.
 CLOSED, CROWDED = 0.95, 0.08
-# Least median and largest width of the stroke, radii of the counter; rims of the retro-panel have up to 0.46.
+# Minimum median and maximum width of the stroke, in radii of the counter; rims of the retro-panel reach 0.46.
 MIN_STROKE, MAX_STROKE = 0.5, 1.75
-# So far behind a stroke its neighbours are looked for, radii; what is so many contrasts bright is glare.
+# Distance behind a stroke in which neighbours are searched, radii; brightness, in contrasts, that is glare.
 NEIGHBOURS, GLARE = 2.0, 1.5
 _STEP_PX, _RISE_PX = 0.5, 3.0
-# Variance of rounding to whole intensities.
+# Variance of rounding to integer intensities.
 QUANTISATION = 1 / 12
-# From so many targets on, the shading of a photograph is estimated from them; a target whose gain differs
-# from that by more than so many sigma keeps its own.
+# Number of targets from which the shading of a photograph is estimated from them. A target whose gain differs
+# from it by more than so many sigma keeps its own.
 MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
-# A halo is above this share of the contrast (9 of 10 of the retro-panel are below) and so many of its
-# sigmas. Flare is a background of which more than this share is saturated, that has glare behind it on more
-# than this share of the circumference, or that changes by more than this share of the contrast.
+# A halo exceeds this part of the contrast (9 of 10 of the retro-panel are below) and so many of its sigmas.
+# Flare means a background of which more than this part is saturated, that has glare behind it on more than
+# this part of the circumference, or that changes by more than this part of the contrast.
 HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
-# A gain per px below this is none.
+# A gain per px below this counts as zero.
 NO_GAIN = 1e-7
 
 
@@ -58,7 +58,7 @@ class EllipseFit:
     """centres, px, shape (k, 2)"""
     full_covariance: FloatArray
     """covariance of centre, shape, background, contrast and blur in this order from the fit, its
-    residuals and the outlines of the photograph, nan where it failed, shape (k, 8, 8)"""
+    residuals and the outlines of the photograph, nan if the fit failed, shape (k, 8, 8)"""
     shape: FloatArray
     """(p, q, r) of S, which turns image vectors into radii, 1/px, shape (k, 3)"""
     background: FloatArray
@@ -66,7 +66,7 @@ class EllipseFit:
     contrast: FloatArray
     """step of intensity A from background to target, positive for bright targets, shape (k,)"""
     blur: FloatArray
-    """standard deviation s of the edge, pixel box included, px, shape (k,)"""
+    """standard deviation s of the edge, including the pixel box, px, shape (k,)"""
     gain: FloatArray
     """relative change of the intensity per px in x and y, shape (k, 2)"""
     noise: FloatArray
@@ -76,15 +76,15 @@ class EllipseFit:
     lobes: FloatArray
     """amplitude of the third and fourth harmonic of the outline about the ellipse, radii, shape (k,)"""
     lobes_sigma: FloatArray
-    """standard deviation of one of their components that the given noise makes, radii, shape (k,)"""
+    """standard deviation of one of their components from the given noise, radii, shape (k,)"""
     strokes: FloatArray
-    """share of the circumference where the background is only a thin stroke, shape (k,)"""
+    """part of the circumference where the background is only a thin stroke, shape (k,)"""
     pixels: IntArray
     """number of intensities in the fit, shape (k,)"""
     iterations: IntArray
     """number of steps, shape (k,)"""
     flag: IntArray
-    """remarks and reasons of failure, see Flag, shape (k,)"""
+    """remarks and reasons for failure, see Flag, shape (k,)"""
 
     @property
     def covariance(self) -> FloatArray:
@@ -101,7 +101,7 @@ def fit_ellipse_model(
     noise: float = 1.0,
     saturation: float | None = None,
 ) -> EllipseFit:
-    """Fit the model of a blurred ellipse to every target, starting from roughly known outlines.
+    """Fit the model of a blurred ellipse to every target, starting from approximate outlines.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16 or float32.
@@ -109,10 +109,10 @@ def fit_ellipse_model(
         shape: approximate (p, q, r) of S, 1/px, shape (k, 3).
         sign: +1 for a target brighter than its surroundings, -1 for a darker one, shape (k,).
         noise: approximate standard deviation of the intensities; decides what counts as a disturbance.
-        saturation: intensities from here on are censored; default is the end of the integer scale.
+        saturation: intensities from this value on are censored; None for the end of the integer scale.
 
     Returns:
-        The fits; where `flag` is NO_CONVERGENCE or CUT_BY_BORDER the values are the last ones reached.
+        The fits; if `flag` is NO_CONVERGENCE or CUT_BY_BORDER the values are the last ones reached.
 
     Source: Gauss-Markov model with Levenberg-Marquardt steps; Ahn, Rauh, Kim, "Circular coded target for
     automation of optical 3D-measurement" (1997), for the least squares template of an ellipse.
@@ -169,7 +169,7 @@ def fit_ellipse_model(
 
 
 def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
-    """Return where the background changes across the target by a good part of the contrast, (k,)."""
+    """Return where the background changes across the target by a large part of the contrast, (k,)."""
     p, q, r, B, A = theta[:, 2:7].T
     with np.errstate(divide="ignore", invalid="ignore"):
         radius = np.abs(p * r - q * q) ** -0.5
@@ -180,17 +180,17 @@ def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
 def _shrink_gain(
     theta: FloatArray, cofactor: FloatArray, variance: FloatArray, length: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Use the shading that the targets of a photograph show together as prior for that of each target.
+    """Use the shading that the targets of a photograph show together as a prior for each target.
 
-    A gradient of the gain inside a target and a shift of its centre look alike, so that estimating the gain
-    costs up to a third of the precision of a bright target. The variance tau^2 of the gains over the targets
-    is estimated (minus that of their errors, weighted), and "gain = 0 with variance tau^2" is added to
-    each target as an observation: without shading this is the fit without gain, with shading the fit with it.
+    A gradient of the gain inside a target and a shift of its centre look alike, so estimating the gain costs
+    up to a third of the precision of a bright target. The variance tau^2 of the gains over the targets is
+    estimated (minus that of their errors, weighted). "gain = 0 with variance tau^2" is then added to each
+    target as an observation. Without shading this is the fit without gain, with shading the fit with it.
 
     Source: DerSimonian and Laird (1986), moment estimate of the variance between units; empirical Bayes.
 
     Returns:
-        Unknowns, shape (k, 10); covariance of all but the gains, shape (k, 8, 8); which gains are not zero.
+        Unknowns, (k, 10); covariance of all except the gains, (k, 8, 8); which gains differ from zero.
     """
     gains = slice(GAIN_X, UNKNOWNS)
     gain = theta[:, gains] / length[:, None]
@@ -256,17 +256,17 @@ def shape_from_axes(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
 def judge_fits(
     fit: EllipseFit, *, noise: float, scale: float, min_diameter_px: float, max_diameter_px: float
 ) -> IntArray:
-    """Return the first reason against each fitted candidate.
+    """Return the first reason for rejecting each fitted candidate.
 
     Args:
-        fit: the candidates as they were fitted.
+        fit: fits of the candidates.
         noise: standard deviation of the intensities of the photograph.
-        scale: largest intensity that the photograph can hold.
-        min_diameter_px: least minor axis of a target.
-        max_diameter_px: largest major axis of a target.
+        scale: largest intensity that the photograph can represent.
+        min_diameter_px: minimum minor axis of a target.
+        max_diameter_px: maximum major axis of a target.
 
     Returns:
-        Flags, see `sfm.targets.outlines.Flag`, 0 where nothing is against a candidate, shape (k,).
+        Flags, see `sfm.targets.outlines.Flag`, 0 for an accepted candidate, shape (k,).
     """
     a, b = np.full(len(fit.xy), np.nan), np.full(len(fit.xy), np.nan)
     defined = fit.shape[:, 0] * fit.shape[:, 2] > fit.shape[:, 1] ** 2
@@ -307,11 +307,11 @@ def judge_fits(
 
 
 def find_legible(fit: EllipseFit, reason: IntArray) -> BoolArray:
-    """Return which candidates are targets if a code is read about them, shape (k,).
+    """Return which candidates are targets if a code is read around them, shape (k,).
 
-    Those are the good ones and those against which only their shape is: a dot with a hole, sharpened or made
-    of the pixels of a screen resembles no blurred ellipse, but no letter has a code about it. A code does not
-    excuse an edge that is missing or that damage changed, nor a blob too small to show a shape.
+    They are the good candidates and those rejected only for their shape. A dot with a hole, a sharpened dot
+    or one made of screen pixels does not resemble a blurred ellipse, but no letter has a code around it. A
+    code does not excuse an edge that is missing or damaged, nor a blob too small to show a shape.
     """
     damaged = (fit.flag & (Flag.UNEVEN_EDGE | Flag.POOR_FIT)) != 0
     p, q, r = fit.shape.T
@@ -322,13 +322,14 @@ def find_legible(fit: EllipseFit, reason: IntArray) -> BoolArray:
 def find_duplicates(
     fit: EllipseFit, sign: IntArray, reason: IntArray, coded: BoolArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which of the good candidates are no targets because of what is about or inside of them.
+    """Return which good candidates are not targets because of what is around or inside them.
 
-    And how much farther holes are from the centres of what they are in than perspective puts them, (k, 2).
+    Also return by how much holes are farther from the centres of their surroundings than perspective
+    explains, (k, 2).
 
-    Of concentric ellipses the one with a code is kept, else the smallest: a retro-reflective dot with a dark
-    rim in glare is seen as bright dot and, larger, as the dark rim. A candidate inside another and not
-    shown to be concentric, of the polarity that fewer targets of the photograph have, is a stain.
+    Of concentric ellipses the one with a code is kept, or else the smallest: a retro-reflective dot with a
+    dark rim in glare appears as a bright dot and, larger, as the dark rim. A candidate inside another, not
+    shown to be concentric, and of the minority polarity in the photograph, is a stain.
     """
     duplicate, off_centre = np.zeros(len(fit.xy), dtype=bool), np.zeros((len(fit.xy), 2))
     p, q, r = fit.shape.T
@@ -372,11 +373,11 @@ def find_duplicates(
 def find_parts_of_codes(
     fit: EllipseFit, code: IntArray, confidence: FloatArray, family: CodeFamily
 ) -> BoolArray:
-    """Return which candidates lie in the code ring of another target, hence are parts of its code.
+    """Return which candidates lie in the code ring of another target and are therefore parts of its code.
 
-    Codes are taken from the most confident to those that could not be read, and a part of one code does not
-    count afterwards: an arc that resembles a dot does not take the dot of the same ring away. About a dot
-    whose code was not read only what is clearly smaller than the dot is a part.
+    Codes are processed from the most confident to those that could not be read, and a part of one code does
+    not count afterwards: an arc that resembles a dot does not remove the dot of the same ring. Around a dot
+    whose code was not read, only candidates clearly smaller than the dot are parts.
     """
     inside = np.zeros(len(fit.xy), dtype=bool)
     size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis
@@ -396,10 +397,10 @@ def find_parts_of_codes(
 def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray) -> BoolArray:
     """Return which candidates are counters: the white inside of letters such as o, e and 8.
 
-    It looks like a target on the stroke of the letter. The background of a counter is a closed stroke, behind
-    which the paper begins again, and next to a letter there are others. A target with a dark rim is
-    not like that: its rim is thinner than half its radius, or the surroundings of the rim are free. Nor is a
-    dot in the ring of a code, which always has clear cells.
+    A counter looks like a target on the stroke of the letter. Its background is a closed stroke, behind which
+    the paper begins again, and next to a letter there are others. A target with a dark rim differs: its rim
+    is thinner than half its radius, or the surroundings of the rim are free. A dot in the ring of a code
+    differs as well, since the ring always has clear cells.
 
     Args:
         image: intensities, shape (H, W).
@@ -431,7 +432,7 @@ def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: Fl
 def _stroke(
     image: AnyArray, xy: FloatArray, ux: float, uy: float, R: float, levels: FloatArray
 ) -> tuple[float, bool]:
-    """Return the width of the background on a ray, px, inf where it does not end, and if more is behind."""
+    """Return the width of the background on a ray, px, inf if it does not end, and whether more is behind."""
     h, w = image.shape
     left, width, highest, t = -1.0, math.inf, 0.0, 0.0
     while t < (MAX_STROKE + 1) * R + 1 if width == math.inf else t < left + width + NEIGHBOURS * R:

@@ -1,8 +1,8 @@
 """Outlines that resemble ellipses, the candidates for targets, and the quality flags.
 
-The quality flags are the one list of reasons, of targets and of rejected candidates. A measured target may
-carry several remarks (`SATURATED`, `CODE_UNREADABLE`, ...); a candidate that is not measured carries the
-first reason that excluded it.
+The quality flags are the one list of remarks on targets and of reasons against candidates. A measured target
+may have several remarks (`SATURATED`, `CODE_UNREADABLE`, ...). A candidate that is not measured has the first
+reason that excluded it.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 
-# The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is seen up to half of
-# it, whatever the target's size.
+# The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is detected up to half
+# of it, for any size of the target.
 CELL_PX = 4
 MEAN_CELLS = 3
-# The local step of intensity that makes a candidate: this many sigma of the smoothed noise (the mask
-# 1 2 1 x 1 2 1 leaves 3/8 of it), at least this share of the scale.
+# Local step of intensity for a candidate: this many sigma of the smoothed noise (the mask 1 2 1 x 1 2 1
+# leaves 3/8 of it), and at least this part of the scale.
 STEP_SIGMAS = 6.0
 SMOOTHED_NOISE = 3 / 8
 MIN_STEP = 4 / 255
-# Minor over major axis: 75 degrees of tilt give 0.26; room for perspective, and for blobs that are ellipses.
+# Minor over major axis: 75 degrees of tilt give 0.26; with allowance for perspective and for elliptic blobs.
 MIN_AXIS_RATIO = 0.14
 # Outlines farther than this from their ellipse (in radii, plus so many px for the grid) are not elliptic.
 OUTLINE_TOLERANCE, GRID_TOLERANCE_PX = 0.2, 1.5
-# Of a damaged target so many points of the outline are seen at least, on this share of the directions from
-# its centre; the points lie as far as this from the ellipse (radii, plus px for the grid). The hull of an
-# ellipse fills 1.00 of the ellipse in the box around it, with a nick or a splash of ink not much less.
+# Minimum number of outline points of a damaged target, in this part of the directions from its centre. The
+# points lie within this distance of the ellipse (radii, plus px for the grid). The hull of an ellipse fills
+# 1.00 of the ellipse in the box around it, and not much less with a nick or a splash of ink.
 MIN_OUTLINE_POINTS, MIN_AROUND, DIRECTIONS = 24, 0.6, 32
 BRIDGED_TOLERANCE, BRIDGED_GRID_PX, HULL_FILLS, BRIDGE_ROUNDS = 0.03, 0.8, (0.75, 1.12), 5
-# The noise is estimated from about so many rows.
+# The noise is estimated from about this many rows.
 NOISE_ROWS = 40
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """Outlines that resemble ellipses, and the reasons against the others."""
+    """Outlines that resemble ellipses, and the reasons against the other outlines."""
 
     xy: FloatArray
     """centres, px, shape (k, 2)"""
@@ -67,22 +67,22 @@ def find_outlines(
 ) -> Outlines:
     """Find outlines that resemble ellipses.
 
-    A pixel belongs to a candidate if the smoothed photograph there differs from the local mean. Along the
-    edge of a target this gives a closed band just inside of it, whatever the size of the target and the level
-    of the light, and the outer contour of the band is the edge itself.
+    A pixel belongs to a candidate if the smoothed photograph differs from the local mean there. Along the
+    edge of a target this gives a closed band just inside the edge, for any size of the target and any level
+    of light. The outer contour of the band is the edge itself.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
-        signs: +1 to look for bright, -1 for dark targets.
+        signs: +1 to find bright targets, -1 for dark targets.
         noise: standard deviation of the intensities.
-        scale: largest intensity that the photograph can hold.
-        min_diameter_px: least minor axis of a target.
-        max_diameter_px: largest major axis of a target.
+        scale: largest intensity that the photograph can represent.
+        min_diameter_px: minimum minor axis of a target.
+        max_diameter_px: maximum major axis of a target.
 
     Returns:
         The outlines.
     """
-    # Outlines need no more than 8 bits; the measurement uses all of them.
+    # Outlines need no more than 8 bits; the measurement uses all bits.
     image = as_bytes(photograph, scale)
     step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, MIN_STEP * scale)
     mean, band = _local_mean(image), np.empty_like(image)
@@ -112,7 +112,7 @@ def find_outlines(
 def estimate_noise(photograph: AnyArray) -> float:
     """Return the standard deviation of the noise of a photograph in its units.
 
-    Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 annuls planes; the
+    Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 cancels planes; the
     median over a part of the rows is used, so that edges do not count.
     """
     height = photograph.shape[0]
@@ -127,12 +127,12 @@ def estimate_noise(photograph: AnyArray) -> float:
 
 
 def as_bytes(photograph: AnyArray, scale: float) -> AnyArray:
-    """Return intensities of up to a scale as bytes, (H, W)."""
+    """Return intensities of a given scale as bytes, (H, W)."""
     return photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
 
 
 def scale_of(photograph: AnyArray) -> float:
-    """Return the largest intensity a photograph can hold: 255, or 2^bits - 1 of the bits that are in use."""
+    """Return the largest intensity a photograph can represent: 255, or 2^bits - 1 for the bits in use."""
     if photograph.dtype == np.uint8:
         return 255.0
     return float((1 << max(8, int(photograph.max()).bit_length())) - 1)
@@ -152,9 +152,9 @@ def _local_mean(image: AnyArray) -> AnyArray:
 def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: AnyArray) -> None:
     """Set band to 1 where the smoothed photograph is beyond the local mean by the step, elsewhere to 0.
 
-    The photograph is smoothed by 1 2 1 x 1 2 1, the mean interpolated between rows of cells: the four rows of
-    pixels of a cell lie 3/8 and 1/8 of it before and behind its middle. Sums are of 16 bit, so that many
-    pixels are worked on at once.
+    The photograph is smoothed by 1 2 1 x 1 2 1. The mean is interpolated between rows of cells: the four rows
+    of pixels of a cell lie 3/8 and 1/8 of it before and after its middle. Sums have 16 bits, so that many
+    pixels are processed at once.
     """
     height, width = image.shape
     last = len(mean) - 1
@@ -180,7 +180,7 @@ def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: An
 
 
 def _trace_contours(band: AnyArray) -> tuple[AnyArray, IntArray]:
-    """Return the points of the outer contours, int32, shape (n, 2), and where each begins, shape (k + 1,)."""
+    """Return the points of the outer contours, int32, (n, 2), and the start of each contour, (k + 1,)."""
     contours: Any
     contours, hierarchy = cv2.findContours(band, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     parent = np.zeros(0) if hierarchy is None else np.asarray(hierarchy).reshape(-1, 4)[:, 3]
@@ -239,7 +239,7 @@ def _ellipses_of_contours(
         a = 2 * math.sqrt(max((xx + yy) / 2 + half, 0.0)) + 0.5
         b = 2 * math.sqrt(max((xx + yy) / 2 - half, 0.0)) + 0.5
         ellipse[c, 0], ellipse[c, 1] = ox + x, oy + y
-        # The outline is shrunk by less than a pixel; the limits are applied exactly after the fit.
+        # The outline is smaller by less than a pixel; the limits are applied exactly after the fit.
         if 2 * b + 2 < smallest:
             reason[c] = Flag.TOO_SMALL.value
             continue
@@ -266,17 +266,17 @@ def _ellipses_of_contours(
 
 
 def _bridge_damage(points: AnyArray, first: IntArray, ellipse: FloatArray, reason: IntArray) -> None:
-    """Fit ellipses to the longest smooth part of outlines that a nick, a splash or a scratch interrupts.
+    """Fit ellipses to the longest smooth part of outlines interrupted by a nick, a splash or a scratch.
 
-    The outline of a large target is that of a thin band along its edge, into which a nick lets the contour
-    through. The hull leaves the inner side of the band behind, and what is far from the ellipse through the
-    rest is dropped step by step.
+    The outline of a large target is that of a thin band along its edge, and the contour enters the band
+    through a nick. The hull excludes the inner side of the band, and points far from the ellipse through the
+    rest are dropped step by step.
 
     Args:
-        points: of the contours, px, (n, 2).
-        first: where each contour begins, (k + 1,).
-        ellipse: x, y, p, q, r, improved where an outline is bridged, (k, 5).
-        reason: 0 there afterwards, (k,).
+        points: points of the contours, px, (n, 2).
+        first: start of each contour, (k + 1,).
+        ellipse: x, y, p, q, r, improved for a bridged outline, (k, 5).
+        reason: set to 0 for a bridged outline, (k,).
     """
     for c in np.flatnonzero(reason == Flag.NOT_ELLIPTIC.value):
         contour = points[first[c] : first[c + 1]]
@@ -293,7 +293,7 @@ def _bridge_damage(points: AnyArray, first: IntArray, ellipse: FloatArray, reaso
 
 
 def _trimmed_ellipse(contour: FloatArray, hull: FloatArray) -> FloatArray | None:
-    """Return x, y, p, q, r of the ellipse that most of an outline lies on; None without any."""
+    """Return x, y, p, q, r of the ellipse that fits most of an outline; None if there is none."""
     ahead = np.roll(hull, -1, axis=0) - hull
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
     inside = np.abs(np.einsum("eb,neb->ne", across, contour[:, None] - hull[None])).min(axis=1)
@@ -328,12 +328,12 @@ class Flag(IntFlag):
     # remarks: the target is measured and kept
     SATURATED = 1 << 0  # pixels at the end of the scale were censored
     CODE_UNREADABLE = 1 << 1  # something like a code surrounds the dot, but no valid code was read
-    SHADED = 1 << 2  # the gain changes by more than 3 sigma of it across the target
-    CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because something else is there
-    CORNER = 1 << 4  # the corner of a square tag, no circle
-    HALO = 1 << 5  # the background falls off from the edge: light scattered about a retro-reflective target
+    SHADED = 1 << 2  # the gain changes by more than 3 sigma across the target
+    CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because another object is there
+    CORNER = 1 << 4  # the corner of a square tag, not a circle
+    HALO = 1 << 5  # the background falls off from the edge: light scattered around a retro-reflective target
     FLARE = 1 << 6  # the background is saturated or changes strongly across the target: glare on its surface
-    CROSSING = 1 << 7  # a crossing of a checkerboard, no circle
+    CROSSING = 1 << 7  # a crossing of a checkerboard, not a circle
     # reasons for a rejection
     CUT_BY_BORDER = 1 << 8  # the border of the photograph cuts the target or its background
     TOO_SMALL = 1 << 9  # below min_diameter_px
@@ -347,16 +347,16 @@ class Flag(IntFlag):
     NO_CONVERGENCE = 1 << 17  # the least squares fit did not converge on this outline
     DUPLICATE = 1 << 18  # the same target was found twice
     PART_OF_CODE = 1 << 19  # inside the code ring of another target
-    LOBED = 1 << 20  # the outline deviates from the ellipse as bars and squares do
+    LOBED = 1 << 20  # the outline deviates from the ellipse like that of a bar or a square
     THIN_BACKGROUND = 1 << 21  # the background is only a thin stroke, as in a letter "o"
-    NOT_ON_PLATE = 1 << 22  # no dot of the calibration plate
+    NOT_ON_PLATE = 1 << 22  # not a dot of the calibration plate
     # other remarks
     DAMAGED = 1 << 23  # a nick, a scratch or a mark in the target was left out of the fit
     CONCENTRIC = 1 << 24  # the image of the common centre of rings, not eccentric
 
 
-# Reasons for a rejection, those first of which a candidate is most like a target: it has passed the tests of
-# those below, which `sfm.targets.measure` asks first. The last two are no targets lost.
+# Reasons for a rejection, from the most target-like candidates on: each has passed the tests of the reasons
+# after it, which `sfm.targets.measure` applies first. The last two do not mean a lost target.
 LIKEST_FIRST = (
     *(Flag.NOT_ON_PLATE, Flag.POOR_FIT, Flag.THIN_BACKGROUND, Flag.LOBED, Flag.UNEVEN_EDGE, Flag.BLURRED),
     *(Flag.LOW_CONTRAST, Flag.TOO_OBLIQUE, Flag.TOO_LARGE, Flag.NO_CONVERGENCE, Flag.CUT_BY_BORDER),
@@ -365,7 +365,7 @@ LIKEST_FIRST = (
 
 
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:
-    """Return (name of flag, number of entries that carry it), most frequent first, without zeros.
+    """Return pairs of the name of a flag and its number of entries, most frequent first, without zeros.
 
     Args:
         flags: flags of targets or of rejected candidates, shape (k,).

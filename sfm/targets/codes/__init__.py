@@ -1,1 +1,1 @@
-"""Codes of targets: `plates.code_family` finds one by its name, `rings` and `tags` read theirs."""
+"""Codes of targets: `plates.code_family` finds a family by name; `rings` and `tags` read their codes."""

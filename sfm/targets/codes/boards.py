@@ -1,22 +1,20 @@
-"""Boards as targets: checkerboards, whole or cut, ChArUco boards and AprilGrids.
+"""Boards as targets: checkerboards, whole or cut by the border, ChArUco boards and AprilGrids.
 
-A checkerboard may be cut by the border of the photograph on one of two opposite sides. How it is turned
-follows from its colours, the first square being the dark one. Of the turns that look alike (see
-`PlateFamily.turns`) the one that is upright in the photograph is taken.
+Crossings are saddles of the intensity: four sectors around a point that are alternately dark and bright. They
+form a lattice. Its orientation follows from the colours of the squares, since the first square is dark. Of
+the turns that look alike (see `PlateFamily.turns`), the one that is upright in the photograph is chosen.
 
-Checkerboards of which a photograph shows a part: named by the borders of the board that it does show.
+A checkerboard may be partly outside the photograph. On each side of the lattice either the board ends,
+because the next crossings would still be in the photograph, or the border cuts it. The crossings are named if
+the board ends on at least one side in both directions, and the colours of the squares agree. A board whose
+naming remains ambiguous is not used.
 
-Crossings are saddles of the intensity: four sectors about a point that are dark and bright by turns. They
-make a lattice. On each side of it the board ends where the next crossings would still be in the photograph,
-or the photograph cuts it. A board that ends on one side at least in both directions is named, with the
-colours of its squares; one whose naming stays uncertain is not.
-
-AprilGrids: tags in rows, numbered along them from the lower left, and black squares at their corners. A tag
-and the squares at its corners touch as squares of a checkerboard do, so that its corners are crossings. That
-hides the tags from finders of outlines: regions darker than where they touch are opened first, which parts
-them, and the tags are read where their measured corners place them. Kalibr prints tags with a border of two
-modules, other programs with one, and turned in different ways: the turn in which the corners of all tags are
-those of one plane is taken.
+AprilGrids are rows of tags, numbered along the rows from the lower left, with black squares at their corners.
+Tags and squares touch like the squares of a checkerboard, so the corners of tags are crossings. This hides
+the tags from outline detectors. Regions darker than these contacts are therefore opened first, which
+separates them, and the tags are read where their measured corners place them. Kalibr prints tags with a
+border of two modules, other programs with one, and they are rotated differently. The rotation for which the
+corners of all tags fit one plane is chosen.
 
 Source: the determinant of the Hessian as detector of saddles, Chen and Zhang (2005), ICMIT; Kalibr
 (github.com/ethz-asl/kalibr), calibration targets; Olson (2011), ICRA, for the tags.
@@ -37,25 +35,25 @@ from sfm.targets.fits.saddle import MAX_HALF_SPACINGS, Saddles, measure_saddles
 from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, as_bytes, estimate_noise
 
 OPENED_PX = (1, 3, 5)  # sides of the window that opens dark regions
-WINDOWS = (8, 24)  # of the threshold, parts of the larger side of the photograph
-# Of the range of intensities in the window, below which it is dark: midway to the half where squares touch.
+WINDOWS = (8, 24)  # sides of the threshold window, as divisors of the photograph's larger side
+# Part of the intensity range in the window below which it is dark: half way to the level where squares touch.
 DARK_FRACTION = 0.25
-MIN_MODULE_PX = 2.0  # of a tag that is read: no less separates one black module from one clear one (Nyquist)
-SPACING = 0.2  # of the side of a tag, between crossings at first
+MIN_MODULE_PX = 2.0  # of a readable tag: less cannot separate one black module from one clear one (Nyquist)
+SPACING = 0.2  # first estimate of the spacing of crossings, in sides of a tag
 CELL_PX = 8  # side of a module where a tag is read
-MIN_TAGS = 2  # that show how tags are turned
-SMOOTHING_PX = 2.0
-# Saddles below this share of the strong ones are none; the strong ones are those of this rank.
+MIN_TAGS = 2  # tags needed to determine their rotation
+SMOOTHING_PX = 2.0  # standard deviation of the smoothing before saddles are detected
+# Minimum strength of a saddle relative to the saddle of this rank.
 MIN_SADDLE, STRONG_RANK = 0.15, 20
-APART_PX = 9  # side of the window in which a saddle is the strongest
+APART_PX = 9  # side of the window in which a saddle must be the strongest
 RADIUS_PX, DIRECTIONS = 5.0, 32  # of the circle on which the four sectors are counted
 MIN_CROSSINGS = 12
-BORDER_PX = 8.0  # what is nearer to the border than this need not be found
-SHARE_INSIDE = 0.6  # of the next crossings are in the photograph where the board ends
-MIN_CONTRAST_SHARE = 0.15  # between dark and bright squares, of the range of the photograph
+BORDER_PX = 8.0  # crossings nearer to the border than this may be missed
+SHARE_INSIDE = 0.6  # part of the next crossings that must be in the photograph for the board to end there
+MIN_CONTRAST_SHARE = 0.15  # between dark and bright squares, of the intensity range of the photograph
 FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-# Larger side of the photograph in which a checkerboard is sought first. Squares of 9 px are found there, in a
-# tenth of the time that a photograph of 8 million px takes.
+# Larger side of the reduced photograph in which a checkerboard is searched first. It is found with squares of
+# 9 px, in a tenth of the time that a photograph of 8 million px takes.
 REDUCED_PX = 800
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
@@ -70,19 +68,18 @@ def find_crossings(
 def find_boards(
     photograph: AnyArray, plates: Sequence[PlateFamily], *, scale: float, noise: float
 ) -> list[tuple[Saddles, IntArray]]:
-    """Find, name and measure the crossings of boards in a photograph; tags of several are read once.
+    """Find, name and measure the crossings of boards in a photograph; tags are read once for all boards.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
         plates: the boards.
-        scale: largest intensity that the photograph can hold.
+        scale: largest intensity that the photograph can represent.
         noise: standard deviation of an intensity.
 
     Returns:
-        The crossings of each, and which point of the plate each is.
+        The crossings of each board, and the plate point of each crossing.
 
-    Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for place and name; measured by
-    `measure_saddles`.
+    Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for position and name; measured by
     """
     grey = as_bytes(photograph, scale)
     grids = {plate.dictionary for plate in plates if plate.name == "aprilgrid"}
@@ -94,7 +91,7 @@ def find_boards(
             half = windows_beside(xy, plate)
         elif plate.name == "charuco":
             xy, code = _charuco(grey, plate)
-            half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # as far as tags begin
+            half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # up to the tags
         else:
             xy, code = _checkerboard(grey, plate)
             half = MAX_HALF_SPACINGS * _spacing(xy)
@@ -107,8 +104,8 @@ def find_boards(
 def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
     """Return the crossings of a checkerboard and their points, upright or by the colours of its squares.
 
-    Sought in the reduced photograph first, then as one that the border may cut; in the photograph as it is
-    where squares are too small for that. OpenCV's older finder takes boards without a white rim.
+    The search starts in the reduced photograph, then allows for a board cut by the border, and then uses the
+    full photograph if the squares are too small. OpenCV's older finder accepts boards without a white rim.
     """
     size = plate.columns, plate.rows
     small, scale = reduced(grey, REDUCED_PX)
@@ -129,14 +126,14 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from behind
         xy = xy[:, ::-1]
     ways = [np.rot90(xy, k) for k in ((0, 2) if plate.rows != plate.columns else range(4))]
-    step = len(ways) // (1 + len(plate.turns))  # between those in which the first square has one colour
+    step = len(ways) // (1 + len(plate.turns))  # between ways in which the first square has the same colour
     alike = min((ways[k::step] for k in range(step)), key=lambda some: _first_squares(grey, some))
     xy = max(alike, key=lambda way: float((way[:, -1] - way[:, 0]).mean(axis=0)[0]))
     return xy.reshape(-1, 2), np.arange(plate.count)
 
 
 def reduced(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]:
-    """Return a photograph of at most this size, and its size in parts of that of the photograph."""
+    """Return a photograph reduced to a maximum size, and its scale relative to the original."""
     scale = min(1.0, largest_px / max(grey.shape))
     if scale == 1.0:
         return grey, scale
@@ -145,7 +142,7 @@ def reduced(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]:
 
 
 def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:
-    """Return the mean intensity in the middle of the first square inside the crossings, in some turns."""
+    """Return the mean intensity in the middle of the first square inside the crossings, over some turns."""
     middles = [way[:2, :2].reshape(-1, 2).mean(axis=0) for way in ways]
     return float(np.mean([cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean() for x, y in middles]))
 
@@ -154,16 +151,16 @@ def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
     """Return the crossings of a ChArUco board and their points."""
     for board in charuco_patterns(plate):
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-        if ids is not None and len(ids):  # none are found on a board whose tags are elsewhere
+        if ids is not None and len(ids):  # empty for a board with its tags in the other squares
             code = np.asarray(ids).reshape(-1).astype(np.int64)
             return np.asarray(corners, dtype=float).reshape(-1, 2), code
     return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
 
 
 def charuco_patterns(plate: PlateFamily) -> list[cv2.aruco.CharucoBoard]:
-    """Return the boards of these rows and columns: the tags begin in the second square, or in the first.
+    """Return the boards with these rows and columns: the tags begin in the second or in the first square.
 
-    The latter is that of OpenCV before 4.6 where rows of squares are even in number.
+    Tags beginning in the first square are those of OpenCV before 4.6, for an even number of rows of squares.
     """
     size = plate.columns + 1, plate.rows + 1
     numbers = plate.first_tag + np.arange(size[0] * size[1] // 2)
@@ -187,15 +184,15 @@ def _spacing(xy: FloatArray) -> FloatArray:
 
 
 def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray, IntArray]:
-    """Return the crossings of a checkerboard that is seen in part and which of the board they are.
+    """Return the crossings of a checkerboard that is partly visible, and their numbers on the board.
 
     Args:
         grey: photograph, uint8, shape (H, W).
         rows: rows of crossings of the whole board.
-        columns: columns of the same.
+        columns: columns of crossings of the whole board.
 
     Returns:
-        Places, px, (k, 2), and numbers row * columns + column, (k,); none where they are not certain.
+        Positions, px, (k, 2), and numbers row * columns + column, (k,); empty if the numbers are ambiguous.
     """
     none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
     xy = find_saddles(grey)
@@ -223,7 +220,7 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
 
 
 def find_saddles(grey: AnyArray) -> FloatArray:
-    """Return the places about which four sectors are dark and bright by turns, whole px, (k, 2)."""
+    """Return positions with four alternately dark and bright sectors around them, whole px, (k, 2)."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
     xx, yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
     xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1)
@@ -239,7 +236,7 @@ def find_saddles(grey: AnyArray) -> FloatArray:
 
 
 def _has_four_sectors(smooth: AnyArray, xy: FloatArray) -> BoolArray:
-    """Return about which places the intensity crosses its mean on a circle four times, (k,)."""
+    """Return around which positions the intensity crosses its mean four times on a circle, (k,)."""
     t = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     x = (xy[:, :1] + RADIUS_PX * np.cos(t)).astype(np.float32)
     y = (xy[:, 1:] + RADIUS_PX * np.sin(t)).astype(np.float32)
@@ -249,7 +246,7 @@ def _has_four_sectors(smooth: AnyArray, xy: FloatArray) -> BoolArray:
 
 
 def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
-    """Return the crossings at the corners of the dark squares, (m, 4); None where squares are all alike."""
+    """Return the crossings at the corners of dark squares, (m, 4); None if all squares look alike."""
     at = {(int(r), int(c)): k for k, (r, c) in enumerate(lattice.place)}
     squares: list[list[list[int]]] = [[], []]
     value: list[list[float]] = [[], []]
@@ -266,7 +263,7 @@ def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
 
 
 def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[tuple[bool, bool]]:
-    """Return for rows and columns whether the board ends before the first and behind the last of them."""
+    """Return for rows and columns whether the board ends before the first and after the last of them."""
     height, width = shape[:2]
     at = {(int(r), int(c)): k for k, (r, c) in enumerate(place)}
     found = []
@@ -289,7 +286,7 @@ def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[
 
 
 def _offset(seen: int, whole: int, ends: tuple[bool, bool]) -> int | None:
-    """Return which row or column of the board is the first that is seen; None where that is not certain."""
+    """Return the index of the first visible row or column of the board; None if it is ambiguous."""
     before, behind = ends
     if seen == whole:
         return 0
@@ -299,19 +296,19 @@ def _offset(seen: int, whole: int, ends: tuple[bool, bool]) -> int | None:
 
 
 def _is_upright(xy: FloatArray, column: IntArray) -> bool:
-    """Whether columns run to the right."""
+    """Return whether columns run to the right."""
     return float((xy[:, 0] - xy[:, 0].mean()) @ (column - column.mean())) > 0
 
 
 def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArray]:
-    """Return numbers (t,) and corners (t, 4, 2), px, of tags that squares touch, with the border most have.
+    """Return numbers (t,) and corners (t, 4, 2), px, of tags touched by squares, with the commonest border.
 
     Args:
         grey: intensities, uint8, (H, W).
-        dictionary: of the tags, a name in tags.DICTIONARIES.
+        dictionary: dictionary of the tags, a name in tags.DICTIONARIES.
 
     Returns:
-        Tags that were read once; their corners from any one on, the same of all tags.
+        Tags that were read exactly once; their corners start at any corner, the same for all tags.
     """
     modules = opencv_dictionary(dictionary).markerSize + 2 * min(APRIL_BORDERS)
     quads = _unique(np.array(list(_outlines(grey, MIN_MODULE_PX * modules))).reshape(-1, 4, 2))
@@ -333,9 +330,9 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
 
 
 def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
-    """Return the corners of dark regions of four sides, clockwise, px, each (4, 2).
+    """Yield the corners of dark regions with four sides, clockwise, px, each (4, 2).
 
-    How straight sides are is judged as OpenCV does where it looks for tags.
+    The tolerance for straight sides is OpenCV's for detecting tags.
     """
     smooth = cv2.GaussianBlur(grey, (3, 3), 0)
     min_range = max(STEP_SIGMAS * estimate_noise(grey), 255 * MIN_STEP)
@@ -361,7 +358,7 @@ def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
 
 
 def _unique(quads: FloatArray) -> FloatArray:
-    """Return quadrangles without those about the middle of an earlier one of the same size."""
+    """Return quadrilaterals without those that have about the centre and size of an earlier one."""
     kept: list[FloatArray] = []
     middles = np.zeros((0, 3))
     for quad in quads:
@@ -373,7 +370,7 @@ def _unique(quads: FloatArray) -> FloatArray:
 
 
 def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, border: int) -> tuple[int, int]:
-    """Return the number of a tag and its turn in quarters, -1 where it has none."""
+    """Return the number of a tag and its rotation in quarter turns; the number is -1 if it has none."""
     m = dictionary.markerSize + 2 * border
     end = m * CELL_PX - 0.5
     square = np.array([[-0.5, -0.5], [end, -0.5], [end, end], [-0.5, end]], dtype=np.float32)
@@ -392,11 +389,11 @@ def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, bo
 
 
 def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
-    """Return the corners of the tags of a grid, px, (k, 2), and which point of it each is, (k,).
+    """Return the corners of the tags of a grid, px, (k, 2), and the grid point of each corner, (k,).
 
     Args:
-        number: of the tags in a photograph, (t,).
-        quads: their corners, px, (t, 4, 2), from any one on, the same of all tags.
+        number: numbers of the tags in a photograph, (t,).
+        quads: their corners, px, (t, 4, 2), starting at any corner, the same for all tags.
         plate: the grid.
     """
     count = plate.rows * plate.columns // 4
@@ -425,9 +422,9 @@ def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tup
 
 
 def windows_beside(xy: FloatArray, plate: PlateFamily) -> FloatArray:
-    """Return half sides of windows at the corners of tags, four of each in turn, px, (k,).
+    """Return half sides of windows at the corners of tags, four per tag in order, px, (k,).
 
-    They see a part of the square, and of the tag no more than the narrowest border.
+    A window covers part of the square, and of the tag at most the narrowest border.
     """
     quads = xy.reshape(-1, 4, 2)
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)

@@ -1,9 +1,9 @@
-"""Concentric circle tags (CCTag): black rings about one centre whose widths are the code.
+"""Concentric circle tags (CCTag): black rings around one centre, with the code in their widths.
 
-The outer edge has the radius 1. Each following edge is one step within the one before; a step is narrow for a
-clear bit and wide for a set one, the first step is the highest bit. Rings are black and white in turn from
-the outside, and the disc in the middle is white. The point of a tag is the image of the common centre, not
-the centre of an ellipse.
+The outer edge has radius 1. Each following edge is one step further in. A step is narrow for a clear bit and
+wide for a set bit; the first step is the highest bit. Rings are alternately black and white from the outside,
+and the central disc is white. The point of a tag is the image of the common centre, not the centre of an
+ellipse.
 
 Source: Calvet, Gurdjos, Griwodz and Gasparini (2016), "Detection and accurate localization of circular
 fiducials under highly challenging conditions", CVPR; widths as published with alicevision/CCTag.
@@ -42,30 +42,32 @@ from sfm.targets.outlines import (
     scale_of,
 )
 
-# Number of steps, their least width and what a set bit adds, in outer radii.
+# Number of steps, their minimum width, and the additional width of a set bit, in outer radii.
 WIDTHS = {"cctag3": (5, 0.10, 0.05), "cctag4": (7, 0.08, 0.04)}
-# Rings wider than this are distinguished on every ray, as modules of tags are (`tags.MIN_MODULE_PX`).
+# Rings wider than this are resolved on every ray, like the modules of tags (`tags.MIN_MODULE_PX`).
 RESOLVED_PX = 3.0
-# Rays on which edges are looked for, samples per px on them, and the share of rays that must show all edges.
+# Number of rays for edge detection, samples per px on them, and the part of the rays that must show all
+# edges.
 RAYS, SAMPLES_PER_PX, MIN_RAYS = 64, 2.0, 0.5
-# Blurs, px, and errors of the outline's size with which profiles of the tags are compared, samples of these.
+# Blurs, px, and scale errors of the outline for which profiles of tags are compared, and samples of a
+# profile.
 PROFILE_BLURS, PROFILE_SIZES, PROFILE = (0.6, 0.9, 1.3, 1.8, 2.5), (0.96, 0.98, 1.0, 1.02, 1.04), 80
-# Of a profile so much may not be explained by a tag (0.05 of those of 48 tags of 15 to 60 px, and the right
-# one explained most), and so many of the most similar tags are fitted.
+# Maximum part of a profile that a tag may leave unexplained, and the number of most similar tags that are
+# fitted. On 48 tags of 15 to 60 px the unexplained part was 0.05, and the right tag explained the most.
 MAX_UNEXPLAINED_FRACTION, MAX_FITTED_TAGS = 0.1, 2
 # A code is read if the radii are within a quarter of the way to any other code, the ink spreads by no more
 # than a quarter of a bit, and half the way is at least so many standard deviations.
 QUARTER, CODE_SIGMAS = 0.25, 5.0
-# A priori sigma of a radius in print, outer radii: 0.05 mm on a tag of 40 mm, one dot of 600 dots per inch.
+# A priori sigma of a printed radius, outer radii: 0.05 mm on a tag of 40 mm, one dot at 600 dots per inch.
 PRINT_SIGMA = 0.0025
-# Largest root mean square residual on a sixteenth of the circumference, in steps of intensity. On tags of 15
-# to 40 px it is 1.05 times the noise, 0.074 with noise of 7 % of the step. More is what covers a tag.
+# Maximum RMS residual on a sixteenth of the circumference, in steps of intensity. On tags of 15 to 40 px it
+# is 1.05 times the noise: 0.074 with noise of 7 % of the step. More means that something covers the tag.
 MAX_SECTOR_RMS = 0.3
 
 
 @dataclass(frozen=True)
 class ConcentricFamily:
-    """The tags of one number of rings."""
+    """The tags with one number of rings."""
 
     name: str
     """a name in WIDTHS"""
@@ -74,7 +76,7 @@ class ConcentricFamily:
     narrow: float
     """width of the step of a clear bit, outer radii"""
     bit: float
-    """what a set bit adds, outer radii"""
+    """additional width of a set bit, outer radii"""
 
     @property
     def count(self) -> int:
@@ -82,7 +84,7 @@ class ConcentricFamily:
         return 1 << self.steps
 
     def radii(self, number: int) -> FloatArray:
-        """Return the radii of all edges from the outside inwards, the first is 1, shape (steps + 1,).
+        """Return the radii of all edges from the outside inwards, starting with 1, shape (steps + 1,).
 
         Raises:
             GeometryError: the family has no such tag.
@@ -100,23 +102,23 @@ class ConcentricTags:
     code: IntArray
     """ids, shape (k,)"""
     confidence: FloatArray
-    """1 where the radii are those of the code, 0.5 a quarter of the way to another one, shape (k,)"""
+    """1 if the radii are exactly those of the code, 0.5 a quarter of the way to another one, shape (k,)"""
     fits: tuple[ConcentricFit, ...]
     """the fit of each tag"""
 
     def inside(self, xy: FloatArray) -> BoolArray:
-        """Return which positions (n, 2) are on a tag or the paper close about it."""
+        """Return which positions (n, 2) are on a tag or on the paper close around it."""
         within = np.zeros(len(xy), dtype=bool)
         for fit in self.fits:
             geometry = fit.theta[:GEOMETRY]
-            reach = 2 * axes_from_shape(geometry[None, 2:5])[0][0, 0]  # rho is of the plane, not behind it
+            reach = 2 * axes_from_shape(geometry[None, 2:5])[0][0, 0]  # rho is valid in front of the plane
             near = np.hypot(*(xy - geometry[:2]).T) < reach
             within[near] |= rho_at(geometry, xy[near])[0] < SURROUNDINGS
         return within
 
 
 def concentric_family(name: str) -> ConcentricFamily:
-    """Return the family of a name in WIDTHS."""
+    """Return the family with a name in WIDTHS."""
     return ConcentricFamily(name, *WIDTHS[name])
 
 
@@ -133,10 +135,10 @@ def find_concentric(
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
-        family: the number of rings.
-        outlines: of which some are outer edges of tags.
+        family: family of the tags.
+        outlines: outlines of candidates, some of which are outer edges of tags.
         noise: standard deviation of the intensities.
-        scale: largest intensity that the photograph can hold; what reaches it is censored.
+        scale: largest intensity that the photograph can represent; intensities that reach it are censored.
 
     Returns:
         The tags, each once.
@@ -162,7 +164,7 @@ def find_concentric(
 
 
 def read_resolved(photograph: AnyArray) -> dict[str, IntArray]:
-    """Return the ids of the tags whose rings are distinguished on every ray, by family.
+    """Return the ids of the tags whose rings are resolved on every ray, by family.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
@@ -179,7 +181,7 @@ def read_resolved(photograph: AnyArray) -> dict[str, IntArray]:
 
 
 def _resembles_rings(grey: AnyArray, outlines: Outlines, least: float) -> BoolArray:
-    """Return within which outlines there is ink at the edge, and paper in the middle and outside, (k,)."""
+    """Return which outlines have ink inside the edge, and paper in the middle and outside, (k,)."""
     if not len(outlines.xy):
         return np.zeros(0, dtype=bool)
     p, q, r = outlines.shape.T[:, :, None]
@@ -209,7 +211,7 @@ def _read(
     noise: float,
     scale: float,
 ) -> tuple[int, float, ConcentricFit] | None:
-    """Return id, confidence and fit of the tag with about this outer edge; None if there is none."""
+    """Return id, confidence and fit of the tag with about this outer edge; None without one."""
     least = max(STEP_SIGMAS * noise, MIN_STEP * scale)
     length = mean_radius(start)
     found = _edges_on_rays(grey, start, sign, family)
@@ -237,10 +239,10 @@ def _read(
 
 
 def _confidence(fit: ConcentricFit, number: int, table: FloatArray, family: ConcentricFamily) -> float:
-    """Return how well the radii agree with the code, 0 where another code is not excluded.
+    """Return how well the radii agree with the code, 0 if another code is not excluded.
 
-    The line from this code to each other one is followed to the place where the photograph fits best: 0 is
-    this code, 1 the other. Errors of the radii in print and the spread of the ink are random, a priori.
+    On the line from this code (0) to each other one (1), the position that fits the photograph best is
+    computed. Errors of the printed radii and the spread of the ink are random with a priori variances.
     """
     others = np.delete(table, number, axis=0)[:, 1:] - table[number, 1:]
     n = family.steps
@@ -261,7 +263,7 @@ def _edges_on_rays(
 ) -> FloatArray | None:
     """Return the geometry through the edges on rays.
 
-    Where the rays do not show all edges of a small tag, the outermost alone gives the geometry.
+    If the rays do not show all edges of a small tag, the outermost edge alone determines the geometry.
     """
     edges = family.steps + 1
     angle = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)
@@ -304,7 +306,7 @@ def _most_similar(
 ) -> list[tuple[int, float, float]]:
     """Return the most similar tags, sizes of their outer edges and blurs, px, at most MAX_FITTED_TAGS."""
     size = np.array(PROFILE_SIZES)
-    # The tags share few radii: each edge is drawn once and added to the tags that have it.
+    # The tags share few radii: each edge is computed once and added to the tags that have it.
     radii, which = np.unique(np.round(table, 9), return_inverse=True)
     black = np.zeros((len(table), len(radii)))
     which = which.reshape(table.shape)

@@ -1,10 +1,10 @@
-"""Plates of dots: the lattice of dots in a photograph, and which dot of the plate each is.
+"""Plates of dots: the lattice of dots in a photograph, and the plate point of each dot.
 
-Dots make a lattice (see `find_lattice`). A placement puts it on the plate: turned by quarters, or for shifted
-rows one of the bases of the lattice, and moved. With marks each placement that overlaps the plate has a
-likelihood: dots are as large as perspective makes them but for errors, marks larger by one common ratio, and
-some dots may be anything (damage, shadows). The placement that is certain is taken; what lies beyond the
-plate gets no name. Without marks the whole plate must be seen, and nothing beside it.
+Dots form a lattice (see `find_lattice`). A placement puts it on the plate: rotated by quarter turns, or for
+shifted rows in one of the bases of the lattice, and translated. With marks, every placement that overlaps the
+plate has a likelihood. Dots have the size that perspective gives them, with errors; marks are larger by one
+common ratio; and some dots may have any size (damage, shadows). The placement that is certain is chosen, and
+dots beyond the plate get no name. Without marks the whole plate must be visible, with nothing beside it.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
 from sfm.targets.fits.outline_noise import BIWEIGHT, MAD, ROUNDS
 
-MAX_OFF_FRACTION = 0.25  # of the spacing, within which a dot must be where its neighbours predict it
-MAX_BOX_RATIO = 1.2  # times its dots, the places in the box of a lattice that needs no other beside it
-SEEDS = 8  # dots that are tried to begin with
+MAX_OFF_FRACTION = 0.25  # of the spacing, maximum distance of a dot from its predicted position
+MAX_BOX_RATIO = 1.2  # box of a lattice over its number of dots, below which no other lattice is tried
+SEEDS = 8  # dots from which a lattice is tried to grow
 MIN_SINE = 0.3  # of the angle between rows and columns
-MIN_DOTS, MIN_BENT_DOTS = 9, 20  # that show a plate, and the bend of the trend of their sizes
-MIN_SCATTER = 0.005  # of the logarithms of radii: below what printing does to dots
-# A dot is anything with this probability at least, spread over so many standard deviations, and where more of
-# them lie so far off, with theirs. A plate is larger than its table with the same probability.
+MIN_DOTS, MIN_BENT_DOTS = 9, 20  # dots needed for a plate, and for a quadratic trend of their sizes
+MIN_SCATTER = 0.005  # of the logarithms of radii: smaller than the effect of printing
+# Minimum probability that a dot has any size, uniform over a range of so many standard deviations. It is
+# raised to the part of dots that are farther off than OUTLYING_SIGMAS. The same probability applies to a
+# plate that is larger than its table.
 STRANGE_PROBABILITY, RANGE_SIGMAS, OUTLYING_SIGMAS = 0.01, 50.0, 5.0
-RING_SIGMAS = 10.0  # standard deviations of a ring: never taken for a dot
-MIN_CERTAINTY = 0.999  # probability of a placement
+RING_SIGMAS = 10.0  # size assigned to a ring, in standard deviations, so that it never counts as a dot
+MIN_CERTAINTY = 0.999  # minimum probability of the placement
 
 
 def name_dots(xy: FloatArray, radius: FloatArray, is_ring: BoolArray, plate: PlateFamily) -> IntArray:
-    """Return which point of a plate each dot is, UNCODED where none, (k,).
+    """Return the plate point of each dot, UNCODED for none, (k,).
 
     Args:
         xy: centres of the dots and of the insides of rings, px, (k, 2).
         radius: mean semi-axes, px, (k,).
-        is_ring: which are insides of rings, (k,).
+        is_ring: True for insides of rings, (k,).
         plate: the plate.
     """
     code = np.full(len(xy), UNCODED)
@@ -56,14 +57,14 @@ def name_dots(xy: FloatArray, radius: FloatArray, is_ring: BoolArray, plate: Pla
 
 
 def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> FloatArray:
-    """Return by how much each place of a lattice is larger than perspective makes it, in standard deviations.
+    """Return by how much each dot of a lattice is larger than perspective predicts, in standard deviations.
 
     The trend of the logarithms of the radii is fitted by Tukey's biweight, from least absolute residuals.
 
     Args:
         lattice: the dots.
         radius: mean semi-axes of all dots and rings, px, (k,).
-        is_ring: which are insides of rings, (k,); they are RING_SIGMAS standard deviations larger.
+        is_ring: True for insides of rings, (k,); they count as RING_SIGMAS standard deviations larger.
     """
     log, ring = np.log(radius[lattice.rows]), is_ring[lattice.rows]
     place = lattice.place - lattice.place.mean(axis=0)
@@ -84,7 +85,7 @@ def size_of_marks(lattice: Lattice, radius: FloatArray, is_ring: BoolArray) -> F
 
 
 def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
-    """Return the lattice as rows and columns of the plate in every way it can be turned, each (k, 2).
+    """Return the lattice as rows and columns of the plate in every possible orientation, each (k, 2).
 
     Columns of plates with shifted rows are counted in halves.
     """
@@ -95,12 +96,12 @@ def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
     return [
         lattice.place @ np.stack([down, across])
         for down, across in itertools.permutations(steps, 2)
-        if across[1] * down[0] - across[0] * down[1] == 2  # neighbours, and right-handed as the lattice is
+        if across[1] * down[0] - across[0] * down[1] == 2  # neighbours, and right-handed like the lattice
     ]
 
 
 def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> IntArray | None:
-    """Return the points of the plate at the places of a lattice; None where marks leave them uncertain."""
+    """Return the plate points at the places of a lattice; None if the marks leave them uncertain."""
     table = _table(plate)
     marked = np.zeros(plate.count + 1, dtype=bool)
     marked[[row * plate.columns + column for row, column in plate.marks]] = True
@@ -117,18 +118,18 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
                 continue
             larger = max(float(np.median(size[here])), 0.0)
             gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())
-            if (code == UNCODED).any():  # few plates are larger than stated
+            if (code == UNCODED).any():  # plates are rarely larger than stated
                 gain += math.log(STRANGE_PROBABILITY)
             found.append((gain, code))
     if not found:
         return None
     best, code = max(found, key=lambda one: one[0])
-    all_of_them = sum(math.exp(gain - best) for gain, _ in found) + math.exp(-best)  # or no mark is seen
+    all_of_them = sum(math.exp(gain - best) for gain, _ in found) + math.exp(-best)  # or no mark is visible
     return code if 1 / all_of_them > MIN_CERTAINTY else None
 
 
 def _placed_whole(lattice: Lattice, plate: PlateFamily) -> IntArray | None:
-    """Return the points of a plate without marks that is seen whole, turned as little as can be."""
+    """Return the points of a whole visible plate without marks, in the most upright orientation."""
     table = _table(plate)
     best: tuple[float, IntArray] | None = None
     for place in placements(lattice, plate):
@@ -139,14 +140,14 @@ def _placed_whole(lattice: Lattice, plate: PlateFamily) -> IntArray | None:
         if (code == UNCODED).any():
             continue
         x = lattice.xy[:, 0] - lattice.xy[:, 0].mean()
-        upright = float(x @ place[:, 1])  # columns to the right
+        upright = float(x @ place[:, 1])  # largest if columns run to the right
         if best is None or upright > best[0]:
             best = upright, code
     return None if best is None else best[1]
 
 
 def _table(plate: PlateFamily) -> IntArray:
-    """Return the point at each row and column (halves of them for shifted rows), UNCODED where none."""
+    """Return the point at each row and column (half columns for shifted rows), UNCODED for none."""
     places = plate.places
     table = np.full(places.max(axis=0) + 1, UNCODED)
     table[places[:, 0], places[:, 1]] = np.arange(plate.count)
@@ -154,7 +155,7 @@ def _table(plate: PlateFamily) -> IntArray:
 
 
 def _codes(place: IntArray, table: IntArray) -> IntArray:
-    """Return the points at rows and columns, UNCODED beyond the plate, (k,)."""
+    """Return the points at rows and columns, UNCODED outside the plate, (k,)."""
     inside = ((place >= 0) & (place < table.shape)).all(axis=1)
     code = np.full(len(place), UNCODED)
     code[inside] = table[place[inside, 0], place[inside, 1]]
@@ -162,38 +163,38 @@ def _codes(place: IntArray, table: IntArray) -> IntArray:
 
 
 def rings_among(polarity: IntArray) -> BoolArray:
-    """Return which circles are the insides of rings: those of the other polarity than most, (k,)."""
+    """Return which circles are insides of rings: those of the minority polarity, (k,)."""
     return np.asarray(polarity != (1 if (polarity > 0).sum() > len(polarity) / 2 else -1))
 
 
 def _log_likelihood(z: FloatArray, strange: float) -> FloatArray:
-    """Return the logarithm of the density of normal deviates of which this share are anything."""
+    """Return log densities of normal deviates, of which a given part may have any size."""
     normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
     return np.asarray(np.log((1 - strange) * normal + strange / RANGE_SIGMAS))
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Dots in rows and columns; which row is the first, and which way they run, is arbitrary."""
+    """Dots in rows and columns; the first row and the directions are arbitrary."""
 
-    rows: IntArray  # index of each dot that is in it, (k,)
+    rows: IntArray  # index of each dot in the lattice, (k,)
     place: IntArray  # row and column, right-handed as in the photograph (x right, y down), (k, 2)
     xy: FloatArray  # px, (k, 2)
 
     @property
     def box(self) -> int:
-        """Number of places between the first and last row and column."""
+        """Number of places in the bounding box of rows and columns."""
         return int((np.ptp(self.place, axis=0) + 1).prod())
 
 
 def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
     """Return the largest and most compact lattice that grows from a dot near the middle; None without any.
 
-    Where a neighbour is missing, rows may be taken for diagonals, which makes a lattice of a longer box.
+    If a neighbour is missing, rows may be mistaken for diagonals, which gives a lattice with a longer box.
 
     Args:
         xy: centres, px, (k, 2).
-        is_dot: what the lattice grows along; others take a place in it and end it there, (k,).
+        is_dot: circles along which the lattice grows; others take a place and end it there, (k,).
     """
     dots = np.flatnonzero(is_dot)
     if len(dots) < 4:
@@ -213,13 +214,13 @@ def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
 
 
 def _first_steps(xy: FloatArray, seed: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return the steps from a dot to the next column and row: two neighbours with one opposite each."""
+    """Return the steps from a dot to the next column and row: two neighbours, each with an opposite one."""
     away = xy - xy[seed]
     order = np.argsort(np.hypot(*away.T))[1:9]
     steps = [
         away[k]
         for k in order
-        if np.hypot(*(away[order] + away[k]).T).min() < MAX_OFF_FRACTION * np.hypot(*away[k])  # its opposite
+        if np.hypot(*(away[order] + away[k]).T).min() < MAX_OFF_FRACTION * np.hypot(*away[k])  # opposite dot
     ]
     for other in steps[1:]:
         first = steps[0]
@@ -230,7 +231,7 @@ def _first_steps(xy: FloatArray, seed: int) -> tuple[FloatArray, FloatArray] | N
 
 
 def _grown(xy: FloatArray, is_dot: BoolArray, seed: int, across: FloatArray, down: FloatArray) -> Lattice:
-    """Grow a lattice from a dot: from each to its four neighbours, those that are predicted best first."""
+    """Grow a lattice from a dot to the four neighbours of each dot, best predicted ones first."""
     place = {seed: (0, 0)}
     taken = {(0, 0): seed}
     waiting: list[tuple[float, int, int, int, FloatArray, FloatArray]] = []
@@ -255,7 +256,7 @@ def _grown(xy: FloatArray, is_dot: BoolArray, seed: int, across: FloatArray, dow
         if j in place:
             continue
         step = xy[j] - xy[k]
-        # which of the four steps it was, and the same step as it is here
+        # find which of the four steps it was, and update that step
         options = ((0, 1, across), (0, -1, -across), (1, 0, down), (-1, 0, -down))
         d_row, d_column, _ = min(options, key=lambda one: float(np.hypot(*(one[2] - step))))
         where = place[k][0] + d_row, place[k][1] + d_column

@@ -1,8 +1,8 @@
-"""Which calibration plate photographs show, when nothing is known of it but that the photographs show it.
+"""Search for the calibration plate in photographs, when it is only known that they show one.
 
-A plate is believed if two photographs show one of the same size whole, a checkerboard also if one shows it
-whole and another half of it or more, cut by the border. Larger dots or rings are marks if both
-photographs have them in the same places.
+A plate is accepted if two photographs show one of the same size completely. A checkerboard is also accepted
+if one photograph shows it completely and another shows at least half of it, cut by the border. Larger dots or
+rings are marks if both photographs have them in the same places.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from sfm.targets.codes.dot_plates import find_lattice, placements, rings_among, 
 from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
 
 MIN_SIDE, MIN_DOTS_OF_PLATE = 3, 20  # dots or crossings along a side, and dots of a plate
-MIN_FILLED_FRACTION = 0.8  # of the places of a plate hold dots
-# A dot so many standard deviations larger than those around it in two photographs is a mark.
+MIN_FILLED_FRACTION = 0.8  # of the places of a plate must contain dots
+# A dot is a mark if it is so many standard deviations larger than its surroundings in two photographs.
 MARK_SIGMAS = 5.0
-# Boards are sought in photographs of at most this size, px.
+# Maximum side of the reduced photographs in which boards are searched, px.
 SEARCHED_PX = 1600
-SMALLEST = (3, 3)  # board that OpenCV is asked for, and for any larger one
+SMALLEST = (3, 3)  # board that OpenCV is asked to find, or any larger one
 KALIBR_TAGS = "apriltag36h11"
-MIN_TAGS_OF_BOARD = 4  # that determine the homography from a photograph to a board
+MIN_TAGS_OF_BOARD = 4  # tags needed for the homography from a photograph to a board
 MAX_SQUARES = 40  # along a side of a ChArUco board
-# Crossings in rows and columns, and along which of them the border cuts the board.
+# Number of crossings in rows and columns, and in which of these directions the border cuts the board.
 Part = tuple[tuple[int, int], tuple[bool, bool]]
 _LARGER = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
 def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
-    """Return the checkerboard that photographs (uint8) show, the longer side as columns; None without.
+    """Return the checkerboard in photographs (uint8), with the longer side as columns; None without one.
 
     Source: Duda and Frese (2018), in OpenCV, for boards of any size.
     """
@@ -54,11 +54,11 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
 def checkerboard_of_parts(
     photographs: Sequence[AnyArray], found: Sequence[Part | None]
 ) -> PlateFamily | None:
-    """Return the checkerboard of which photographs (uint8) show parts, None without.
+    """Return the checkerboard of which photographs (uint8) show parts; None without one.
 
     Args:
         photographs: intensities, uint8, each (H, W).
-        found: in each of them, by `part_of_checkerboard`.
+        found: part in each photograph, from `part_of_checkerboard`.
     """
     whole, parts = Counter[tuple[int, int]](), [part for part in found if part is not None]
     for size, is_cut in parts:
@@ -73,7 +73,7 @@ def checkerboard_of_parts(
 
 
 def part_of_checkerboard(grey: AnyArray) -> Part | None:
-    """Return the crossings of a checkerboard in rows and columns, and along which of them the border cuts it.
+    """Return the number of crossings in rows and columns, and in which of them the border cuts the board.
 
     Args:
         grey: photograph, uint8, (H, W).
@@ -88,7 +88,7 @@ def part_of_checkerboard(grey: AnyArray) -> Part | None:
 
 
 def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
-    """Return whether crossings of this size, cut along these directions, are half of a board or more."""
+    """Return whether crossings of this size, cut in these directions, are at least half of a board."""
     if size[0] * size[1] < max(plate.count / 2, MIN_CROSSINGS):
         return False
     return any(
@@ -100,11 +100,11 @@ def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamil
 def search_charuco(
     photographs: Sequence[AnyArray], dictionary: str, tags: Sequence[tuple[IntArray, FloatArray]]
 ) -> PlateFamily | None:
-    """Return the ChArUco board that photographs show; None where their tags are on none.
+    """Return the ChArUco board in photographs; None if their tags are not on one.
 
     Args:
         photographs: intensities, uint8, each (H, W).
-        dictionary: of the tags, a name in tags.DICTIONARIES.
+        dictionary: dictionary of the tags, a name in tags.DICTIONARIES.
         tags: numbers (t,) and corners (t, 4, 2), px, of the tags in each photograph.
     """
     last = max((int(number.max()) for number, _ in tags if len(number)), default=0)
@@ -129,10 +129,10 @@ def search_charuco(
 
 
 def search_april_grids(tried: Sequence[AnyArray], others: Sequence[AnyArray] = ()) -> tuple[PlateFamily, ...]:
-    """Return the AprilGrids that photographs (uint8) show, of tags of Kalibr's family, by their numbers.
+    """Return the AprilGrids in photographs (uint8) with tags of Kalibr's family, by their numbers.
 
-    Others are read where one that is tried has tags. A grid beside those of lower numbers is one that a
-    photograph shows together with one of these.
+    The other photographs are read if one of the tried ones has tags. A further grid, with higher numbers, is
+    accepted if a photograph shows it together with one of the earlier grids.
     """
     seen = [read_april_tags(grey, KALIBR_TAGS) for grey in tried]
     if not any(len(number) >= MIN_TAGS_OF_BOARD for number, _ in seen):
@@ -153,13 +153,13 @@ def search_april_grids(tried: Sequence[AnyArray], others: Sequence[AnyArray] = (
 def _april_grid(
     photographs: Sequence[AnyArray], seen: Sequence[tuple[IntArray, FloatArray]]
 ) -> PlateFamily | None:
-    """Return the grid whose tags have the lowest numbers of those that photographs show, None without."""
+    """Return the grid with the lowest tag numbers in photographs; None without one."""
     numbers = np.unique(np.concatenate([number for number, _ in seen]))
     if not len(numbers):
         return None
     first = int(numbers[0])
     last = int(numbers[-1]) - first
-    sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # whole, or with other grids behind it
+    sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # the whole range, or with other grids after it
     sizes += sorted(
         ((m, n) for n in range(2, last) for m in range(2, last // n + 1)), key=lambda one: -one[0] * one[1]
     )
@@ -187,14 +187,14 @@ def _april_grid(
 
 
 def _shows_squares(grey: AnyArray, xy: FloatArray, code: IntArray, plate: PlateFamily) -> bool:
-    """Return whether squares between the corners of tags are as dark as the border of the tags."""
+    """Return whether the squares between corners of tags are as dark as the border of the tags."""
     if len(code) < 4 * MIN_TAGS_OF_BOARD:
         return False
     H, _ = cv2.findHomography(plate.plane(1.0)[code, :2], xy, cv2.LMEDS)
     if H is None:
         return False
     gap, corner = 1 - plate.tag_share, plate.plane(1.0)[code[code // plate.columns % 2 + code % 2 == 0], :2]
-    # right above and to the left of the corner, between this tag and the next one, and in its border
+    # upper right of the corner; between this tag and the next one; inside the border of the tag
     places = (
         (-gap / 2, gap / 2),
         (-gap / 2, -plate.tag_share / 2),
@@ -209,10 +209,10 @@ def _shows_squares(grey: AnyArray, xy: FloatArray, code: IntArray, plate: PlateF
 def search_dots(
     photographs: Sequence[tuple[FloatArray, FloatArray, IntArray]],
 ) -> PlateFamily | None:
-    """Return the plate of dots that photographs show whole; None without one.
+    """Return the plate of dots that photographs show completely; None without one.
 
     Args:
-        photographs: of each the centres of its circles, px, (k, 2), their mean radii, px, (k,), and their
+        photographs: for each, the centres of its circles, px, (k, 2), their mean radii, px, (k,), and their
             polarities, (k,).
     """
     seen: dict[tuple[str, int, int], list[tuple[IntArray, FloatArray]]] = {}
@@ -238,16 +238,16 @@ def search_dots(
 
 
 def shows_a_lattice(xy: FloatArray) -> bool:
-    """Return whether most of the circles of a photograph (px, (k, 2)) are in rows and columns."""
+    """Return whether most circles of a photograph (px, (k, 2)) are in rows and columns."""
     lattice = find_lattice(xy, np.ones(len(xy), dtype=bool))
     return lattice is not None and len(lattice.rows) > max(MIN_DOTS_OF_PLATE, len(xy) / 2)
 
 
 def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2) -> bool:
-    """Return whether two photographs, or as many as needed, show half of the crossings of a board or more."""
+    """Return whether enough photographs, at most two, show at least half of the crossings of a board."""
     found = 0
     for grey in photographs:
-        # the noise is of no consequence for what is found
+        # the noise does not affect which crossings are found
         saddles, _ = find_crossings(grey, plate, scale=255.0, noise=1.0)
         found += len(saddles.xy) >= max(plate.count / 2, MIN_CROSSINGS / 2)
         if found >= min(needed, 2):
@@ -256,7 +256,7 @@ def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2)
 
 
 def _tag_share(number: IntArray, quads: FloatArray, middle: FloatArray) -> float | None:
-    """Return the side of tags in squares if they are at their places on a board, whose middles are given."""
+    """Return the side of tags in squares, if the tags are at their places on a board with these centres."""
     if len(number) < MIN_TAGS_OF_BOARD:
         return None
     H, _ = cv2.findHomography(quads.mean(axis=1), middle[number])
@@ -270,7 +270,7 @@ def _tag_share(number: IntArray, quads: FloatArray, middle: FloatArray) -> float
 
 
 def _whole_plate(name: str, place: IntArray) -> PlateFamily | None:
-    """Return the plate that dots at rows and columns fill; None where they do not."""
+    """Return the plate that dots at rows and columns fill; None if they do not fill one."""
     place = place - place.min(axis=0)
     rows, steps = (int(n) for n in place.max(axis=0) + 1)
     shifted = PlateFamily(name, rows, 1).is_shifted
@@ -283,7 +283,7 @@ def _whole_plate(name: str, place: IntArray) -> PlateFamily | None:
 
 
 def _apart(plate: PlateFamily, place: IntArray, xy: FloatArray) -> str:
-    """Return the arrangement whose distance of rows comes nearest to what a photograph shows."""
+    """Return the arrangement whose row distance is nearest to that in a photograph."""
     if not plate.is_shifted:
         return plate.name
     place = place - place.mean(axis=0)
@@ -294,7 +294,7 @@ def _apart(plate: PlateFamily, place: IntArray, xy: FloatArray) -> str:
 
 
 def _with_marks(plate: PlateFamily, found: Sequence[tuple[IntArray, FloatArray]]) -> PlateFamily:
-    """Return a plate with the dots that are larger in two photographs as marks, if they show its turn."""
+    """Return a plate with marks at the dots that are larger in two photographs, if they define its turn."""
     tables = []
     for place, size in found:
         place = place - place.min(axis=0)

@@ -1,16 +1,17 @@
 """Calibration plates with their point numbers, and all code families by name.
 
-Point `row * columns + column` is the dot or crossing in that row and column, both from 0, rows downwards and
-columns to the right as the plate is printed. Any side may be called the upper one, as long as marks and the
-table of the points, if there is one, are counted from it.
+Point `row * columns + column` is the dot or crossing in that row and column, both counted from 0, rows
+downwards and columns to the right, as the plate is printed. Any side may be called the upper one, as long as
+marks and any table of the points are counted from it.
 
-The code families by name: what a survey file, a sheet or `find_targets` can ask for.
+The code families are those that a survey file, a target sheet or `find_targets` can name. To add one:
 
-A family of rings with a table in a file needs that file only. One that follows the rule of
-`ring_patterns` is a row in `rings.RINGS`, one of all necklaces in `rings.NECKLACES`, a dictionary of square
-tags a row in `tags.DICTIONARIES`, concentric rings a row in `concentric.WIDTHS`. Another kind of code is a
-module beside these with a type for its families, a row below, and its reading in `sfm.targets.detect`, behind
-that of rings (numbers for measured dots) or of tags (points that it defines).
+- a family of rings with a table needs only the table file;
+- rings by the rule of `ring_patterns` need a row in `rings.RINGS`, all necklaces one in `rings.NECKLACES`;
+- a dictionary of square tags needs a row in `tags.DICTIONARIES`, concentric rings one in `concentric.WIDTHS`;
+- another kind of code needs a module beside these with a type for its families, and a row below. Its reading
+  goes into `sfm.targets.detect`, after that of rings (numbers for measured dots) or of tags (points that it
+  defines).
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ Family = CodeFamily | TagFamily | ConcentricFamily
 
 
 class Grid(NamedTuple):
-    """How the dots of a plate are arranged."""
+    """The arrangement of the dots of a plate."""
 
     shift: float
-    """of every second row, in pitches"""
+    """shift of every second row, in pitches"""
     apart: float
     """distance of rows, in pitches"""
     turns: int
-    """in a full circle that the arrangement looks alike after"""
+    """turns in a full circle after which the arrangement looks alike"""
 
 
-# The pitch is that of the dots in a row; OpenCV counts that of its asymmetric grid in halves.
+# The pitch is the distance of dots in a row; OpenCV uses half of it for its asymmetric grid.
 GRIDS = {
     "grid": Grid(0.0, 1.0, 4),
     "asymmetric-grid": Grid(0.5, 0.5, 4),
@@ -56,9 +57,9 @@ TAGGED = ("charuco", "aprilgrid")
 APRIL_BORDERS = (2, 1)  # modules of the black border of the tags of an AprilGrid, Kalibr's first
 PLATES = (*GRIDS, *BOARDS)
 UNCODED = -1
-MAX_ROUNDING = 1e-6  # pitches, of rounding
-# How far a tag may be off its place behind the homography of its board, in the distance of tags or squares.
-# Distortion of 5 % at the corners of a photograph that 8 x 8 tags fill leaves 0.1; a misread tag is off by 1.
+MAX_ROUNDING = 1e-6  # pitches, for rounding errors
+# Maximum distance of a tag from its place under the homography of its board, in distances of tags or squares.
+# Distortion of 5 % at the corners of a photograph filled by 8 x 8 tags leaves 0.1; a misread tag is off by 1.
 MAX_OFF_PLACE = 0.15
 
 
@@ -69,19 +70,19 @@ class PlateFamily:
     name: str
     """one of PLATES"""
     rows: int
-    """rows of dots, or of crossings inside a board; of an AprilGrid two of corners for each row of tags"""
+    """rows of dots, or of crossings inside a board; an AprilGrid has two rows of corners per row of tags"""
     columns: int
-    """columns of the same"""
+    """columns, likewise"""
     marks: tuple[tuple[int, int], ...] = ()
     """row and column of the dots that are larger than the others, or rings"""
     dictionary: str = ""
-    """tags of a ChArUco board or AprilGrid, a name in tags.DICTIONARIES"""
+    """dictionary of the tags of a ChArUco board or AprilGrid, a name in tags.DICTIONARIES"""
     tag_share: float = 0.0
-    """side of these tags, in squares, or in the distance from a tag to the next one"""
+    """side of these tags, in squares or in distances from a tag to the next one"""
     first_tag: int = 0
-    """number of the first of them"""
+    """number of the first tag"""
     first_point: int = 0
-    """number of the first point, of a plate beside others"""
+    """number of the first point, if the plate is in a group"""
 
     @property
     def count(self) -> int:
@@ -101,16 +102,16 @@ class PlateFamily:
 
     @property
     def is_shifted(self) -> bool:
-        """Whether every second row is shifted by half the pitch."""
+        """Return whether every second row is shifted by half the pitch."""
         return self.name in GRIDS and GRIDS[self.name].shift > 0
 
     @cached_property
     def turns(self) -> tuple[IntArray, ...]:
-        """The turns after which the plate looks alike, none for most: the number each point then has, (n,).
+        """The point numbers after each turn for which the plate looks alike, (n,); empty for most plates.
 
-        The colours of its squares distinguish a checkerboard with an odd number of rows and columns from
-        one turned by 180 degrees, and one with an odd number of each, as many rows as columns, from one
-        turned by 90 degrees. Marks and tags show every turn.
+        The colours of its squares distinguish a checkerboard with an odd sum of rows and columns from the
+        same board turned by 180 degrees. They distinguish one with an odd number of rows, and as many columns
+        as rows, from the board turned by 90 degrees. Marks and tags distinguish every turn.
         """
         if self.marks or self.name in TAGGED:
             return ()
@@ -126,7 +127,7 @@ class PlateFamily:
         return tuple(found)
 
     def _has_colours_of(self, number: IntArray) -> bool:
-        """Return whether the first square inside the crossings has its colour where its corners are put."""
+        """Return whether the first square inside the crossings keeps its colour under a renumbering."""
         if self.name != "checkerboard":
             return True
         row, column = np.divmod(number[[0, self.columns + 1]], self.columns)
@@ -134,12 +135,12 @@ class PlateFamily:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the plate looks alike when it is turned, so that points have no identity."""
+        """Return whether the plate looks alike when turned, so that its points have no identity."""
         return len(self.turns) > 0
 
     @property
     def places(self) -> IntArray:
-        """Row and column of the points, (n, 2); where rows are shifted, columns are counted in halves."""
+        """Row and column of the points, (n, 2); columns count halves if rows are shifted."""
         row, column = np.divmod(np.arange(self.count), self.columns)
         return np.stack([row, 2 * column + row % 2 if self.is_shifted else column], axis=1)
 
@@ -156,24 +157,24 @@ class PlateFamily:
 
 @dataclass(frozen=True)
 class PlateGroup:
-    """Several plates that are fixed to one another, the points of each numbered on behind those before it."""
+    """Several plates fixed to one another; the point numbers of each follow those of the plates before it."""
 
     plates: tuple[PlateFamily, ...]
 
 
 def plates_of(family: object) -> tuple[PlateFamily, ...]:
-    """Return the plates that targets are on, none where they are others."""
+    """Return the plates of a code family; empty for other families."""
     if isinstance(family, PlateGroup):
         return family.plates
     return (family,) if isinstance(family, PlateFamily) else ()
 
 
 def points_of_plates(family: object, code: IntArray) -> tuple[IntArray, ...]:
-    """Return which of some points are on each plate.
+    """Return which points are on each plate.
 
     Args:
-        family: codes of a survey.
-        code: of each point, -1 without one, (n,).
+        family: code family of a survey.
+        code: code of each point, -1 without one, (n,).
     """
     return tuple(
         np.flatnonzero((code >= plate.first_point) & (code <= plate.last_point))
@@ -182,11 +183,11 @@ def points_of_plates(family: object, code: IntArray) -> tuple[IntArray, ...]:
 
 
 def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
-    """Return plates as a group, with the numbers that their points then have.
+    """Return plates as a group, with their point numbers in it.
 
     Raises:
-        GeometryError: one looks alike when it is turned, so that it has no place among the others, or two
-            cannot be distinguished.
+        GeometryError: a plate looks alike when turned, so that it has no defined position among the others,
+            or two plates cannot be distinguished.
     """
     first, grouped = 0, list[PlateFamily]()
     for plate in plates:
@@ -216,7 +217,7 @@ def _look_alike(one: PlateFamily, other: PlateFamily) -> bool:
 
 
 def refuse_unusable_plate(plate: PlateFamily) -> None:
-    """Raise GeometryError where marks are not on the plate, or look alike when it is turned."""
+    """Raise GeometryError if marks are not on the plate, or look alike when it is turned."""
     for row, column in plate.marks:
         if not (0 <= row < plate.rows and 0 <= column < plate.columns):
             raise GeometryError(
@@ -237,13 +238,13 @@ def refuse_unusable_plate(plate: PlateFamily) -> None:
 
 
 def quarter_turn(place: IntArray, quarters: int) -> IntArray:
-    """Return rows and columns turned by quarters, (k, 2)."""
+    """Return rows and columns rotated by quarter turns, (k, 2)."""
     row, column = place.T
     turned = ((row, column), (column, -row), (-row, -column), (-column, row))[quarters]
     return np.stack(turned, axis=1)
 
 
-TargetFamily = Family | PlateFamily | PlateGroup  # a plate has no name that describes all of it
+TargetFamily = Family | PlateFamily | PlateGroup  # a plate is not described by a name alone
 FAMILIES: dict[str, Callable[[], Family | None]] = {
     **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,
@@ -253,18 +254,18 @@ FAMILIES: dict[str, Callable[[], Family | None]] = {
 
 
 def is_table(codes: str) -> bool:
-    """Return whether what a survey states as its codes is the path of a table and no name."""
+    """Return whether the codes of a survey are the path of a table instead of a name."""
     return codes not in FAMILIES and codes not in PLATES
 
 
 def code_family(codes: str | Family) -> Family | None:
-    """Return the code family of a name or of a table file; None for "none".
+    """Return the code family for a name or a table file; None for "none".
 
     Args:
-        codes: a name in FAMILIES, the path of a table file, or a family, which is returned as it is.
+        codes: a name in FAMILIES, the path of a table file, or a family, which is returned unchanged.
 
     Returns:
-        The family, or None where targets are not coded.
+        The family, or None if targets are not coded.
 
     Raises:
         SurveyFileError: neither a known family nor a readable table.

@@ -1,4 +1,4 @@
-"""Levels of the cells of a code ring by least squares: a sample is a blurred mixture of cells."""
+"""Levels of the cells of a code ring by least squares; each sample is a blurred mixture of cells."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import bilinear
 from sfm.kernels.small_algebra import invert_symmetric
 
-# Samples along a cell, and positions of the first cell that are tried.
+# Samples per cell, and trial positions of the first cell.
 SAMPLES, PHASES = 12, 12
-# Radii of the samples in the ring, as fractions of its width, and beside it: in the clear ring between dot
-# and ring, and behind the ring, as fractions of the way from the dot and of the width.
+# Radii of the samples in the ring, as fractions of its width. Radii beside it: in the clear ring between dot
+# and ring, as a fraction of the way from the dot, and behind the ring, as a fraction of the width.
 IN_RING = (0.3, 0.5, 0.7)
 IN_GAP, BEHIND = 0.5, 1.4
 # Interpolation between pixels blurs by this variance, px^2 (mean of f (1 - f), f uniform).
 INTERPOLATION = 1 / 6
-# The position of the cells is judged by the residuals of the samples and by how far the levels of the cells
-# are from being two: their sigmas in units of the step to the dot.
+# Sigmas in units of the step to the dot, for judging the position of the cells: of the residuals of the
+# samples, and of the deviations of the cell levels from two values.
 _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
-# Every edge of what is printed lies outwards by the spread of the ink, in radii of the dot as it is measured.
-# Ink of 0.4 mm around a dot of 6 mm is 0.12. Every edge of a light mark lies outwards by that of the light,
-# in px: in an oblique ring that is more of its short radii. Both are negative where light eats into marks.
-# Half the part of the short semi-axis loses one of seven oblique rings on a screen; half or twice that
-# in px, for large dots, changes none of them.
+# Every printed edge is shifted outwards by the spread of the ink, in measured radii of the dot. Ink spread by
+# 0.4 mm around a dot of 6 mm gives 0.12. Every edge of a light mark is shifted outwards by the glow, in px;
+# in an oblique ring this is a larger part of its short radii. Both are negative if light eats into marks.
+# Half the part of the short semi-axis loses one of seven oblique rings on a screen; half or twice the limit
+# in px, which concerns large dots, changes none of them.
 MAX_SPREAD, MAX_GLOW_PX, MAX_GLOW = 0.14, 1.5, 0.25  # the last in short semi-axes
-# Prior values of the spreads and of the blur of the cells' ends over that of the dot: 0
-# and 1 with these standard deviations, the last of its logarithm.
-# That of the glow is in px; half or twice as much changes none of seven oblique rings on a screen.
+# Priors of the spreads (mean 0) and of the blur of cell ends over that of the dot (mean 1), as standard
+# deviations; that of the blur is of its logarithm. That of the glow is in px; half or twice as much changes
+# none of seven oblique rings on a screen.
 _SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25
-# First steps of the search for the place of the first cell (in cells), spread, glow and ln blur; halvings of
-# them, each where no step is an improvement; rounds at most.
+# First steps of the search for the position of the first cell (in cells), spread, glow and ln blur. Steps are
+# halved when none improves the fit, at most _HALVINGS times; the search ends after _ROUNDS rounds.
 _STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.3, 0.15, 4, 24
 _FIRST_STEPS = (_STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR)
 _SIGMAS = np.array([_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA])
-# Least jump from clear to set, in steps to the dot, of a ring that is worth the search.
+# Minimum jump from clear to set, in steps to the dot, for which the search is worthwhile.
 _WORTH = 0.25
 # Rows of the result after the levels.
 _RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, SPREAD, ROWS = 3, 4, 5, 6, 7, 8
@@ -54,12 +54,12 @@ def fit_cells(
     inner: float,
     outer: float,
 ) -> FloatArray:
-    """Return what is in the cells of the ring about each dot; nan where the photograph cuts the ring.
+    """Return the contents of the cells of the ring around each dot; nan if the photograph cuts the ring.
 
-    Samples on ellipses similar to that of the dot are modelled as sum of the cells' levels, each blurred as
-    the edge of the dot is. Of twelve places of the first cell the one is taken that explains them best by two
-    levels; then its place, the widening of the set cells along and across the ring, as ink and light spread,
-    and the blur are improved.
+    Samples on ellipses similar to that of the dot are modelled as a sum of cell levels, each blurred like the
+    edge of the dot. Of twelve positions of the first cell the one that is best explained by two levels is
+    chosen. Then four quantities are refined: this position, the widening of the set cells along and across
+    the ring by spreading ink and light, and the blur.
 
     Args:
         image: intensities, shape (H, W).
@@ -72,10 +72,11 @@ def fit_cells(
         outer: outer radius of the ring in radii of the dot.
 
     Returns:
-        For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell,
-        inside, middle and outside; RMS of the residuals in the cell; deviation from what is expected in the
-        clear ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the
-        ink in radii of the dot; (k, 8, cells).
+        For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell
+            (inner,
+        middle and outer); RMS residual in the cell; deviations from the expected level in the clear ring
+        before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink in
+        radii of the dot; (k, 8, cells).
     """
     m = cells * SAMPLES
     out = np.full((len(xy), ROWS, cells), math.nan)
@@ -100,7 +101,7 @@ def fit_cells(
         if least == math.inf:
             continue
         bits, step, jump = _two_levels(best_c)
-        # place, spread, glow, ln of the blur over that of the dot
+        # position, spread, glow, ln of the blur over that of the dot
         found, steps = np.array([place, 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
         if jump >= _WORTH * step and step >= _WORTH:
             halved = 0
@@ -156,10 +157,11 @@ def _model(
     dot_part: FloatArray,
     W: FloatArray,
 ) -> bool:
-    """Fill the samples of a ring and what its cells have of them; False where the photograph cuts it.
+    """Fill the samples of a ring and the contributions of its cells; False if the photograph cuts the ring.
 
-    `ring` is its place of the first cell, spread, glow, and ln of the blur over that of the dot; `bits` is
-    1.0 for set cells. The others are those of `fit_cells`, of one dot, of `_sample` and `_mixture`.
+    `ring` contains the position of the first cell, spread, glow, and ln of the blur over that of the dot;
+    `bits` is 1.0 for set cells. The other arguments are those of `fit_cells` for one dot, and of `_sample`
+    and `_mixture`.
     """
     s = blur * math.exp(ring[3])
     near, far = _spread_ring(inner, outer, ring[1])
@@ -172,7 +174,7 @@ def _model(
 
 @compiled
 def _largest_glow(shape: FloatArray) -> float:
-    """Return the largest glow about a dot, px."""
+    """Return the largest permitted glow around a dot, px."""
     p, q, r = shape[0], shape[1], shape[2]
     short = 1 / ((p + r) / 2 + math.hypot((p - r) / 2, q))
     return float(min(MAX_GLOW_PX, MAX_GLOW * short))
@@ -180,7 +182,7 @@ def _largest_glow(shape: FloatArray) -> float:
 
 @compiled
 def _without_glow(shape: FloatArray, glow: float) -> FloatArray:
-    """Return the (p, q, r) of a dot whose semi-axes are shorter by the glow, px: S (1 - glow S)^-1."""
+    """Return (p, q, r) of a dot with its semi-axes reduced by the glow, px: S (1 - glow S)^-1."""
     p, q, r = shape[0], shape[1], shape[2]
     det = (1 - glow * p) * (1 - glow * r) - (glow * q) ** 2
     e, f, g = (1 - glow * r) / det, glow * q / det, (1 - glow * p) / det
@@ -189,23 +191,23 @@ def _without_glow(shape: FloatArray, glow: float) -> FloatArray:
 
 @compiled
 def _spread_ring(inner: float, outer: float, spread: float) -> tuple[float, float]:
-    """Return the radii of the ring in radii of the dot as measured, all edges outwards by the spread."""
+    """Return the radii of the ring in measured dot radii, with all edges moved outwards by the spread."""
     return inner * (1 - spread) - spread, outer * (1 - spread) + spread
 
 
 @compiled
 def _shifts(bits: FloatArray, spread: float, glow: float, inner: float, outer: float) -> FloatArray:
-    """Return how far the beginning of each cell is turned where a set cell meets a clear one.
+    """Return the shift of the start of each cell where a set cell meets a clear one.
 
     Args:
         bits: 1.0 for set cells, (cells,).
-        spread: of the ink, in radii.
-        glow: in blurs.
-        inner: radius of the ring.
-        outer: radius of the ring.
+        spread: spread of the ink, in radii.
+        glow: glow, in blurs.
+        inner: inner radius of the ring.
+        outer: outer radius of the ring.
 
     Returns:
-        By the ink, in cells, and by the glow, in blurs, (2, cells).
+        Shifts by the ink, in cells, and by the glow, in blurs, (2, cells).
     """
     cells = len(bits)
     turn = spread / ((inner + outer) / 2) / (2 * math.pi / cells)
@@ -225,9 +227,9 @@ def _solve(
     N: FloatArray,
     c: FloatArray,
 ) -> float:
-    """Write the levels of the cells by least squares and their cofactors; return their cost.
+    """Write the least squares levels of the cells and their cofactors, and return their cost.
 
-    That is the sum of squares of the residuals and of the scatter of the levels, infinite without a solution.
+    The cost is the sum of squares of the residuals and of the scatter of the levels; infinite if singular.
     """
     m, cells = W.shape
     g = np.empty(cells)
@@ -260,7 +262,7 @@ def _solve(
 
 @compiled
 def _two_levels(c: FloatArray) -> tuple[FloatArray, float, float]:
-    """Return which cells are set (1.0), by the widest gap between their mean levels, the step and the gap."""
+    """Return which cells are set (1.0), split at the widest gap between mean levels, the step and the gap."""
     radii, cells = c.shape
     level = np.zeros(cells)
     for a in range(cells):
@@ -274,7 +276,7 @@ def _two_levels(c: FloatArray) -> tuple[FloatArray, float, float]:
 
 @compiled
 def _scatter(c: FloatArray) -> float:
-    """Return the sum of squares of the levels about the means of set and of clear cells, for all radii."""
+    """Return the sum of squares of the levels about the means of set and clear cells, over all radii."""
     radii, cells = c.shape
     bits, step, _ = _two_levels(c)
     high, number = 0.0, 0.0
@@ -310,7 +312,7 @@ def _sample(
     ring_part: FloatArray,
     dot_part: FloatArray,
 ) -> bool:
-    """Sample the rings; write the share of ring and dot in each sample and the blur of a cell's end, rad."""
+    """Sample the rings, and write the parts of ring and dot in each sample and the blur of cell ends, rad."""
     h, w = image.shape
     p, q, r = shape[0], shape[1], shape[2]
     det = p * r - q * q
@@ -346,13 +348,13 @@ def _sample(
 
 @compiled
 def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, W: FloatArray) -> None:
-    """Write the share of each cell in each sample.
+    """Write the part of each cell in each sample.
 
     Args:
-        sigma: blur of a cell's end at each sample, rad, (m,).
-        phase: where the first cell begins, in cells.
-        shift: how far the beginning of each cell lies behind its nominal place, see `_shifts`, (2, cells).
-        W: shares, (m, cells).
+        sigma: blur of a cell end at each sample, rad, (m,).
+        phase: start of the first cell, in cells.
+        shift: shift of the start of each cell from its nominal position, see `_shifts`, (2, cells).
+        W: parts, (m, cells).
     """
     m, cells = W.shape
     width = 2 * math.pi / cells
@@ -378,7 +380,7 @@ def _compare(
     c: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write levels, residuals, deviations beside the ring and sigma of each cell."""
+    """Write levels, residuals, deviations beside the ring, and sigma of each cell."""
     m, cells = W.shape
     gap_row, behind_row = len(IN_RING), len(IN_RING) + 1
     weight, seen, squares = np.full(cells, 1e-12), np.full(cells, 1e-12), np.zeros(cells)

@@ -1,4 +1,4 @@
-"""Ring codes: published patterns, tables in files, and how they are read around a dot."""
+"""Ring codes: published patterns, tables in files, and the reading of the ring around a dot."""
 
 from __future__ import annotations
 
@@ -16,37 +16,38 @@ from sfm.targets.codes.ring_cells import fit_cells
 UNCODED = -1
 UNREADABLE = -2
 # Sampling of the ring: angles, and radii as fractions between inner and outer radius of the ring. The first
-# lies in the gap between dot and ring, the last outside the ring, the others in the ring.
+# radius lies in the gap between dot and ring, the last outside the ring, and the others in the ring.
 ANGLES = 360
 RADII = np.array([-0.45, 0.25, 0.5, 0.75, 1.4])
-# Level between background (0) and dot (1) that separates set from clear, and the least distance from it
-# (both sides) that makes a reading of arcs certain.
+# Level between background (0) and dot (1) that separates set from clear, and the minimum distance from it on
+# both sides for a certain reading of arcs.
 HALF = 0.5
 MARGIN = 0.15
-# A dot has no code where nothing in the ring around it is above this level.
+# A dot has no code if nothing in the ring around it is above this level.
 MIN_SET = 0.3
-# Step from clear to set cells in units of that from background to dot, and the least gap between the levels
-# of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
+# Step from clear to set cells in units of that from background to dot, and the minimum gap between the levels
+# of set and clear cells, in steps. Codes of the retro-panel have 0.89 to 1.05 and 0.61.
 MIN_STEP, MAX_STEP, MIN_JUMP = 0.6, 1.5, 0.4
-# Largest deviations, in steps, and the worst of the retro-panel: of a clear cell from the background (0.08),
-# or under glare (0.18) from the mean of what is before and behind it (0.06); of what is beside the ring from
-# the background (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a
-# cell on one radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.04).
+# Maximum deviations, in steps, with the worst value of the retro-panel: of a clear cell from the background
+# (0.08), or under glare (0.18) from the mean before and behind it (0.06); beside the ring from the background
+# (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a cell on one
+# radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.04).
 CLEAR_TOLERANCE, GLARE, GLARE_TOLERANCE = 0.1, 0.25, 0.07
 GAP_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.1, 0.15
 RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
-# Part of the circle just behind the ring that other things may cover, and what there may be behind a set
-# cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
+# Part of the circle just behind the ring that other objects may cover, and the maximum level behind a set
+# cell, in steps (0.24 at the limit of resolution): objects that make a clear cell look set mostly extend
+# outwards.
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
-# Blur of the edge in a sharp photograph, px.
+# Blur of an edge in a sharp photograph, px.
 SHARP_PX = 0.8
-# A ring may be interrupted by less than this angle, and an arc must be longer.
+# Maximum angle of an interruption of the ring, and minimum angle of an arc.
 SHORTEST_ARC_DEG = 12
 
 
 @dataclass(frozen=True)
 class CodeFamily:
-    """Geometry and table of one family of coded targets."""
+    """Geometry and code table of one family of coded targets."""
 
     name: str
     """one of RING_NAMES or the name of a table file"""
@@ -65,13 +66,13 @@ class CodeFamily:
 # Radii of the ring in radii of the dot: AICON's rings, and the arcs of PhotoModeler's calibration sheet.
 RING_INNER, RING_OUTER = 2.0, 3.0
 ARCS_INNER, ARCS_OUTER = 2.4, 4.3
-MAX_CELLS = 32  # of a ring in a table file; the published codes end at 20
+MAX_CELLS = 32  # of a ring in a table file; the published codes end at 20 cells
 MAX_TABLE_BYTES = 10_000_000
-# The families of rings by name, and the cells of each; the number of arcs is a code itself.
+# The families of rings by name, and their number of cells; for arcs, the number of arcs is the code.
 RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20}
-# Rings of other makers that use all necklaces, without parity: a cell read wrong is another code.
+# Rings of other makers that use all necklaces, without parity: a misread cell gives another valid code.
 NECKLACES = {"necklace8": 8, "necklace10": 10, "necklace12": 12}
-MIRRORED = "-mirrored"  # behind a name: cells are counted counter-clockwise in the image
+MIRRORED = "-mirrored"  # suffix of a name: cells are counted counter-clockwise in the image
 RING_NAMES = (
     *RINGS,
     *NECKLACES,
@@ -80,9 +81,9 @@ RING_NAMES = (
 
 
 def ring_family(name: str) -> CodeFamily:
-    """Return the family of a name in RING_NAMES: numbers are places in its table of all patterns, from 1 on.
+    """Return the family with a name in RING_NAMES; numbers are positions in its pattern table, from 1.
 
-    A mirrored family has the numbers of its table for the patterns read the other way round.
+    A mirrored family has the numbers of its table for the patterns read in the opposite direction.
     """
     plain = name.removesuffix(MIRRORED)
     if plain == "arcs":
@@ -99,7 +100,7 @@ def ring_family(name: str) -> CodeFamily:
 
 
 def necklaces(cells: int) -> IntArray:
-    """Return all patterns of a ring that differ by more than a turn, ascending, but the empty and full one.
+    """Return all ring patterns that differ by more than a rotation, ascending, without empty and full ring.
 
     Args:
         cells: number of cells of the ring.
@@ -112,7 +113,7 @@ def necklaces(cells: int) -> IntArray:
 
 
 def mirrored_patterns(pattern: IntArray, cells: int) -> IntArray:
-    """Return the patterns with their cells in the opposite order, shape (m,)."""
+    """Return patterns with their cells in the opposite order, shape (m,)."""
     out = np.zeros_like(pattern)
     for k in range(cells):
         out |= ((pattern >> k) & 1) << (cells - 1 - k)
@@ -123,7 +124,7 @@ def ring_patterns(cells: int) -> IntArray:
     """Return the bit patterns of a ring code with an even number of cells, ascending.
 
     A pattern is the smallest number of its rotations, has even parity and at least one pair of opposite
-    cells set; the full ring is left out. Code number k is entry k - 1.
+    cells set; the full ring is excluded. Code number k is entry k - 1.
 
     Args:
         cells: number of cells of the ring, even.
@@ -142,7 +143,7 @@ def ring_patterns(cells: int) -> IntArray:
 
 
 def smallest_rotation(value: IntArray, cells: int) -> IntArray:
-    """Return the smallest number among all rotations of each pattern of the given number of cells."""
+    """Return the smallest number among all rotations of each pattern of a given number of cells."""
     mask = (1 << cells) - 1
     smallest = np.asarray(value).copy()
     rotated = smallest.copy()
@@ -155,8 +156,8 @@ def smallest_rotation(value: IntArray, cells: int) -> IntArray:
 def read_code_table(path: Path) -> CodeFamily:
     """Return the family of a table file with two columns, number and pattern.
 
-    The number of cells is one more than the bits of the largest pattern (a pattern is the smallest of its
-    rotations, so its first cell is clear); a line "# cells 14" states it where the table is only a part.
+    The number of cells is one more than the bits of the largest pattern, because a pattern is the smallest of
+    its rotations and its first cell is therefore clear. A line "# cells 14" states it for a partial table.
 
     Args:
         path: text file; empty lines and lines that start with # are skipped.
@@ -165,7 +166,7 @@ def read_code_table(path: Path) -> CodeFamily:
         The family with the ring radii of the 12, 14 and 20 bit codes.
 
     Raises:
-        SurveyFileError: no such file, or a line that is not a number and a pattern.
+        SurveyFileError: the file does not exist, or a line is not a number and a pattern.
     """
     try:
         if not path.is_file() or path.stat().st_size > MAX_TABLE_BYTES:
@@ -204,7 +205,7 @@ def read_code_table(path: Path) -> CodeFamily:
 
 
 def _is_number(word: str) -> bool:
-    """Whether a word is a number of at most 18 digits, which 64 bits hold."""
+    """Return whether a word is a number of at most 18 digits, which 64 bits can represent."""
     return word.isascii() and word.isdigit() and len(word) <= 18
 
 
@@ -220,8 +221,8 @@ def read_codes(
 ) -> tuple[IntArray, FloatArray]:
     """Read the code around each measured dot.
 
-    The ring is sampled on ellipses similar to the dot's, so that tilt and rotation drop out. Intensities are
-    scaled to 0 = background and 1 = dot, so that dark and bright targets read alike.
+    The ring is sampled on ellipses similar to the dot's, which removes tilt and rotation. Intensities are
+    scaled to 0 = background and 1 = dot, so dark and bright targets are read alike.
 
     Args:
         photograph: intensities, shape (H, W).
@@ -229,13 +230,13 @@ def read_codes(
         shape: (p, q, r) with (p q; q r) turning image vectors into dot radii, 1/px, shape (k, 3).
         levels: intensity of the background and its step to the dot, shape (k, 2).
         family: the family of codes.
-        blur_px: standard deviation of the edge of each dot, pixel box included, shape (k,); default is that
-            of a sharp photograph.
+        blur_px: standard deviation of the edge of each dot, including the pixel box, shape (k,); default is
+            that of a sharp photograph.
         noise: standard deviation of the intensities about the fit of each dot, shape (k,); default is 0.
 
     Returns:
-        Code numbers, `UNCODED` where nothing is around the dot and `UNREADABLE` where something is that is
-        no valid code, shape (k,); confidence of the reading, 0 to 1, shape (k,).
+        Code numbers, `UNCODED` if there is nothing around the dot and `UNREADABLE` if the ring is not a
+        valid code, shape (k,); confidence of the reading, 0 to 1, shape (k,).
     """
     radii = family.inner + RADII * (family.outer - family.inner)
     grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
@@ -260,7 +261,7 @@ def read_codes(
 def _sample_rings(
     image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray, radii: FloatArray, angles: int
 ) -> FloatArray:
-    """Return normalised intensities on rings about each dot, (k, radii, angles); nan outside the image."""
+    """Return normalised intensities on rings around each dot, (k, radii, angles); nan outside the image."""
     height, width = image.shape
     out = np.empty((len(xy), len(radii), angles))
     for k in range(len(xy)):
@@ -280,7 +281,7 @@ def _sample_rings(
 
 
 def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the number of arcs in each ring and the confidence."""
+    """Return the number of arcs in each ring, and the confidence."""
     count = np.full(len(polar), UNCODED, dtype=np.int64)
     confidence = np.zeros(len(polar))
     for k, rings in enumerate(polar):
@@ -313,12 +314,12 @@ def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
 def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
     """Return code number and confidence of one ring from the levels of its cells, see `fit_cells`.
 
-    Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
-    the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
-    clear cells, clear ring and what is behind set cells, but for the border of a label, are at the level of
-    the background, set cells at one level but for shading, and each cell is the same on all radii and over
-    its length. A misfit of the model at the dot (in steps), as by halos of sharpening, is a
-    misfit of the samples too.
+    Set and clear cells are separated at the widest gap between their sorted levels, so a shadow across the
+    ring does no harm. A ring that is partly covered, or an object that looks like a ring by chance, must not
+    be read. Therefore clear cells, the clear ring and the area behind set cells must have the level of the
+    background, except for the border of a label. Set cells must have one level, except for shading. Each cell
+    must have the same level on all radii and over its length. A misfit of the model at the dot (in steps),
+    for example from sharpening halos, is added to the tolerance for the samples.
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0
@@ -337,7 +338,7 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     prior = np.diag([0.0, 1.0, 1.0]) * (SET_TOLERANCE / SHADING) ** 2
     plane = A @ np.linalg.solve(A.T @ A + prior, A.T @ level[bits])
     noise = NOISE_SIGMAS * sigma * residual
-    # Glare across the ring is seen in a clear cell as it is before and behind it.
+    # Glare across the ring appears in a clear cell as it does before and behind it.
     glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
     uneven = np.minimum(np.abs(level), glare)
     uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
@@ -361,11 +362,11 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
 
 
 def _find_border(behind: FloatArray, step: float) -> BoolArray:
-    """Return which cells the border of a label is behind, (cells,): what is on all four sides of a square.
+    """Return which cells have the border of a label behind them, on all four sides of a square, (cells,).
 
-    It is about the dot, alike to half a step at each quarter of a turn, with free corners. Other things cover
-    one side or two, and an edge on four sides that reaches into the ring leaves no corner free behind it.
-    Rings whose number of cells is no multiple of four show no border.
+    A border surrounds the dot, is equal to half a step at each quarter turn, and leaves corners free. Other
+    objects cover one or two sides. An edge on four sides that reaches into the ring leaves no corner free
+    behind it. Rings whose number of cells is not a multiple of four show no border.
     """
     if len(behind) % 4:
         return np.zeros(len(behind), bool)

@@ -1,4 +1,4 @@
-"""Square tags (AprilTag, ArUco): found and read by OpenCV, their corners measured to sub-pixel as points.
+"""Square tags (AprilTag, ArUco): found and read by OpenCV, with corners measured to sub-pixel precision.
 
 A tag gives four named points: "7a" is the upper left corner of the black square of tag 7 as it is printed,
 "7b" the upper right, "7c" the lower right and "7d" the lower left one.
@@ -19,31 +19,33 @@ from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_
 from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.outlines import Flag, as_bytes, estimate_noise
 
-# OpenCV's dictionary behind each name that a survey file uses.
+# OpenCV's dictionary for each name used in survey files.
 DICTIONARIES = {
     **{f"apriltag{kind}": f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")},
     **{f"aruco{n}x{n}_{k}": f"DICT_{n}X{n}_{k}" for n in (4, 5, 6, 7) for k in (50, 100, 250, 1000)},
     "aruco_original": "DICT_ARUCO_ORIGINAL",
     "aruco_mip_36h12": "DICT_ARUCO_MIP_36h12",
 }
-# Without those that are the first tags of a larger one.
+# Without the dictionaries that are the first tags of a larger one.
 LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
-# A black module narrower than this is not distinguished from the code behind it: the whole tag is fitted.
-# Codes of larger tags are confirmed by the same fit, in a picture reduced to modules of this width.
+# A black module narrower than this is not resolved from the code behind it, and the whole tag is fitted. The
+# same fit confirms the codes of larger tags, in a picture reduced to modules of this width.
 MIN_MODULE_PX = 3.0
-# Such tags are looked for in the picture enlarged by this, down to this side.
+# Such tags are searched in a picture enlarged by this factor, down to this side.
 ENLARGED, MIN_SIDE_PX = 2, 6.0
-# Share of the bits that the dictionary could correct and that may be wrong where no fit confirms the code.
+# Part of the correctable bits that is corrected, and part of the border bits that may be wrong, for a code
+# that no fit confirms.
 CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
-# A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
-# share of a module, or if its contrast is less than this share of the tag's.
+# A corner is rejected if its residuals exceed this part of the contrast, if an edge is softer than this part
+# of a module, or if its contrast is less than this part of the tag's.
 POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST_SHARE = 0.1, 0.4, 0.3
-# Noise of undisturbed corners over that of the quarter with the least, at most; and how many px of the
-# residuals of others go together: without, their errors are 3 to 4 sigmas in shadows of 20 to 40 %.
+# Maximum noise of undisturbed corners over that of the best quarter, and the number of px over which the
+# residuals of other corners are correlated. Without it, their errors are 3 to 4 sigmas in shadows of 20 to
+# 40 %.
 MAX_NOISE_RATIO, TOGETHER_PX = 1.3, 16.0
 NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE | Flag.POOR_FIT)
-# Radius of the circle that marks a corner where outlines are drawn, px.
+# Radius of the circle drawn at a corner in place of an outline, px.
 DRAWN_PX = 4.0
 
 
@@ -54,14 +56,14 @@ class TagFamily:
     name: str
     """a name in DICTIONARIES"""
     modules: int
-    """modules along a side of the black square, its border included"""
+    """modules along a side of the black square, including its border"""
     count: int
     """number of tags; their ids begin with 0"""
 
 
 @dataclass(frozen=True)
 class TagCorners:
-    """Corners of the tags of one photograph, and those that could not be measured."""
+    """Corners of the tags of one photograph, measured and rejected ones."""
 
     xy: FloatArray
     """corners, px, shape (k, 2)"""
@@ -82,20 +84,20 @@ class TagCorners:
     rejected_xy: FloatArray
     """corners that could not be measured, px, shape (m, 2)"""
     rejected_flag: IntArray
-    """their reasons, shape (m,)"""
+    """reasons for their rejection, shape (m,)"""
     quads: FloatArray
-    """outlines of the tags whose code the fit of all modules confirmed, corners a to d as OpenCV gives them,
+    """outlines of the tags whose code was confirmed by the fit of all modules, corners a to d from OpenCV,
     px, shape (t, 4, 2)"""
 
 
 def tag_family(name: str) -> TagFamily:
-    """Return the family of a name in DICTIONARIES."""
+    """Return the family with a name in DICTIONARIES."""
     dictionary = opencv_dictionary(name)
     return TagFamily(name, dictionary.markerSize + 2, len(dictionary.bytesList))
 
 
 def tag_modules(family: TagFamily, number: int) -> BoolArray:
-    """Return which modules of a tag are black, border included, row by row from above, (modules, modules).
+    """Return which modules of a tag are black, with the border, by rows from the top, (modules, modules).
 
     Raises:
         GeometryError: the family has no such tag.
@@ -106,7 +108,7 @@ def tag_modules(family: TagFamily, number: int) -> BoolArray:
 
 
 def corner_name(code: int) -> str:
-    """Return the name of a corner by its code, such as 7a."""
+    """Return the name of a corner for its code, such as 7a."""
     return f"{code // 4}{CORNERS[code % 4]}"
 
 
@@ -117,7 +119,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
         photograph: intensities, shape (H, W), uint8 or uint16.
         family: the dictionary.
         polarity: dark (black border on white), bright (inverted) or auto (both).
-        scale: largest intensity that the photograph can hold; what reaches it is censored.
+        scale: largest intensity that the photograph can represent; intensities that reach it are censored.
 
     Returns:
         The corners, tag by tag.
@@ -125,7 +127,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
     """
     grey = as_bytes(photograph, scale)
-    # OpenCV's search for inverted tags loses upright ones, so that the photograph is inverted instead.
+    # OpenCV's search for inverted tags loses upright ones, so the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
     found = [_detect_all(picture, family) for picture in pictures]
     quads = np.concatenate([corners for corners, _ in found])
@@ -170,10 +172,10 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
 
 
 def _widening(noise: FloatArray) -> FloatArray:
-    """Return by what residuals that the fit does not explain widen the covariance of each corner, (k,).
+    """Return the factors that widen the covariance of each corner for unexplained residuals, (k,).
 
-    The edge of a shadow, or a stain, leaves residuals that go together in so many neighbouring px; what is
-    beyond the noise of undisturbed corners of the photograph is taken for such.
+    The edge of a shadow or a stain leaves residuals that are correlated over TOGETHER_PX neighbouring px.
+    Noise above that of the undisturbed corners of the photograph is attributed to such causes.
     """
     if not len(noise):
         return noise
@@ -190,11 +192,11 @@ def _modules_px(quads: FloatArray, family: TagFamily) -> FloatArray:
 def _fitted(
     photograph: AnyArray, quads: FloatArray, number: IntArray, family: TagFamily, scale: float
 ) -> tuple[CornerFits, BoolArray, BoolArray]:
-    """Fit the corners of tags twice, the second time with their codes where the first corners place them.
+    """Fit the corners of tags twice, the second time with their codes placed by the first corners.
 
     Returns:
-        The fits, which tags are so small that all their modules were fitted at once, and of which the fit of
-        all modules confirms the code, shape (t,); corners of the others are flagged as a poor fit.
+        The fits; which tags are so small that all their modules were fitted at once, (t,); and for which tags
+        the fit of all modules confirms the code, (t,). Corners of the others are flagged as a poor fit.
     """
     m, grey, noise = family.modules, as_grey(photograph), estimate_noise(photograph)
     clear = np.array([~tag_modules(family, int(one)) for one in number], dtype=bool).reshape(-1, m, m)
@@ -230,9 +232,9 @@ def _tag_from_pixel(quads: FloatArray, modules: int) -> FloatArray:
 
 
 def _reduced(grey: AnyArray, quad: FloatArray, family: TagFamily) -> tuple[AnyArray, FloatArray, float]:
-    """Return the picture of a tag reduced to modules of MIN_MODULE_PX, and its corners there, px, (4, 2).
+    """Return the picture of a tag reduced to modules of MIN_MODULE_PX, its corners (4, 2), and the scale.
 
-    Beyond the border of the photograph its last pixels are repeated.
+    Outside the photograph the pixels at its border are repeated.
     """
     scale = MIN_MODULE_PX / float(_modules_px(quad[None], family)[0])
     margin = np.ptp(quad, axis=0).max() / family.modules + 2 / scale
@@ -246,14 +248,14 @@ def _reduced(grey: AnyArray, quad: FloatArray, family: TagFamily) -> tuple[AnyAr
 
 
 def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatArray]]:
-    """Return the tags of every dictionary that a photograph shows, found at once and not measured.
+    """Return the tags of every dictionary in a photograph, detected in one pass and not measured.
 
     Args:
         photograph: intensities, uint8, shape (H, W).
 
     Returns:
-        Numbers (t,) and corners (t, 4, 2), px, of the tags by the name of their dictionary; of dictionaries
-        that are part of one another, by that of the largest.
+        Numbers (t,) and corners (t, 4, 2), px, of the tags by the name of their dictionary. A dictionary that
+        is part of another is listed under the largest.
     """
     detector = cv2.aruco.ArucoDetector(
         [opencv_dictionary(name) for name in LARGEST_DICTIONARIES], _reading_settings()
@@ -273,7 +275,7 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
 
 
 def smallest_dictionary(name: str, number: IntArray) -> str:
-    """Return the smallest dictionary that is part of one and has tags of these numbers."""
+    """Return the smallest part of a dictionary that contains these numbers."""
     kind, count = name.rsplit("_", 1)
     parts = (f"{kind}_{n}" for n in (50, 100, 250, 1000)) if count == "1000" else (name,)
     return next(part for part in parts if tag_family(part).count > number.max(initial=0))
@@ -289,12 +291,12 @@ def _reading_settings() -> cv2.aruco.DetectorParameters:
 def _detect_all(picture: AnyArray, family: TagFamily) -> tuple[FloatArray, IntArray]:
     """Return corners a to d (t, 4, 2) and ids (t,) of the tags that OpenCV finds.
 
-    They are read at OpenCV's rate of correction: the fit of all their modules confirms the code. Tags of
-    narrow modules are read from the enlarged picture, too.
+    They are read with OpenCV's default rate of correction, as the fit of all modules confirms each code. Tags
+    with narrow modules are also read from an enlarged picture.
     """
     dictionary, settings = opencv_dictionary(family.name), cv2.aruco.DetectorParameters()
     longest = max(picture.shape)
-    # OpenCV counts the pixels of an outline: along a diagonal there are fewer
+    # OpenCV counts the pixels of an outline; along a diagonal there are fewer
     settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / math.sqrt(2) / longest
     quads, number = _detect(cv2.aruco.ArucoDetector(dictionary, settings), picture)
     for enlarged in (ENLARGED, 1):
@@ -315,14 +317,14 @@ def _detect_all(picture: AnyArray, family: TagFamily) -> tuple[FloatArray, IntAr
 
 
 def _detect(detector: cv2.aruco.ArucoDetector, picture: AnyArray) -> tuple[FloatArray, IntArray]:
-    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that a detector finds."""
+    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that one detector finds."""
     corners, ids, _ = detector.detectMarkers(picture)
     number = np.zeros(0) if ids is None else np.asarray(ids)
     return np.array(corners, dtype=float).reshape(-1, 4, 2), number.reshape(-1).astype(np.int64)
 
 
 def inside_tags(xy: FloatArray, tags: TagCorners, family: TagFamily) -> BoolArray:
-    """Return which positions lie on a tag or within one module around it, (k,)."""
+    """Return which positions are on a tag or within one module around it, (k,)."""
     inside = np.zeros(len(xy), dtype=bool)
     for quad in tags.quads if len(xy) else ():
         middle = quad.mean(axis=0)
@@ -332,5 +334,5 @@ def inside_tags(xy: FloatArray, tags: TagCorners, family: TagFamily) -> BoolArra
 
 
 def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of a name in DICTIONARIES."""
+    """Return OpenCV's dictionary for a name in DICTIONARIES."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[name]))

@@ -1,1 +1,1 @@
-"""Least squares fits and centroids of single targets, compiled; models in `blurred_ellipse`, `corner`."""
+"""Least squares fits and centroids of single targets, compiled; models in `blurred_ellipse` and `corner`."""

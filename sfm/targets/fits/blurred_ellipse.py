@@ -1,12 +1,12 @@
 """Model of a circular target: a blurred ellipse on a background, with its derivatives, compiled.
 
-Model of the intensity at pixel (x, y), with d the signed distance from the edge of the ellipse (negative
-inside), s the blur of the edge, B the background, A the step to the target, g the change of the gain over L:
+Let d be the signed distance of pixel (x, y) from the edge of the ellipse (negative inside), s the blur of the
+edge, B the background, A the step to the target, and g the change of the gain over L. The intensity is
 
     I = (B + A Phi(-d / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
 
-The ellipse is |S (x - x0, y - y0)| = 1 with a symmetric S = (p q; q r), which is regular for circles too, and
-rho = |S dx|, d = rho (rho - 1) / |S S dx|. The box of the pixel is part of s: it adds 1/12 to s^2.
+The ellipse is |S (x - x0, y - y0)| = 1 with a symmetric S = (p q; q r), which is regular for circles as well.
+With rho = |S dx|, d = rho (rho - 1) / |S S dx|. The box of the pixel is part of s: it adds 1/12 to s^2.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from sfm.kernels.compiling import compiled_fast, inlined_fast
 # Unknowns of the fit in their order: x0, y0, p, q, r, B, A, s, gx, gy.
 UNKNOWNS = 10
 X0, Y0, P, Q, R, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
-# So many pixels are worked on together. A block contains the derivatives by one unknown after the other, and
-# behind them the residuals and the weights.
+# Pixels are processed in blocks of this size. A block contains the derivatives by one unknown after another,
+# followed by the residuals and the weights.
 BLOCK = 256
 RESIDUAL, WEIGHT = UNKNOWNS * BLOCK, (UNKNOWNS + 1) * BLOCK
 BLOCK_SIZE = (UNKNOWNS + 2) * BLOCK
@@ -30,7 +30,7 @@ _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 
 @inlined_fast
 def edge_profile(t: float) -> tuple[float, float]:
-    """Return Phi(t), the normal distribution, and exp(-t^2 / 2), without branches.
+    """Return Phi(t) of the normal distribution, and exp(-t^2 / 2), without branches.
 
     Source: Abramowitz and Stegun (1964), 7.1.26, error below 1.5e-7; exp(y) = exp(y / 64)^64 by its series.
     """
@@ -49,10 +49,10 @@ def edge_profile(t: float) -> tuple[float, float]:
 def linearise(
     pixels: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
 ) -> None:
-    """Write the derivatives, the residuals and the weights of a block of pixels into J, one after the other.
+    """Write the derivatives, residuals and weights of a block of pixels into J.
 
     The loop has no branches, so that it runs on several pixels at a time. A pixel at the end of the scale has
-    no weight where the model lies beyond the scale, too: no more is known of it (censored observation).
+    no weight if the model is also beyond the scale, since nothing more is known of it (censored observation).
     """
     x0, y0, p, q, r = theta[X0], theta[Y0], theta[P], theta[Q], theta[R]
     B, A, s, gx, gy = (
@@ -108,15 +108,15 @@ def normal_equations(
 ) -> tuple[float, int]:
     """Sum up N = J'J (lower triangle) and g = J'v of one target.
 
-    The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
+    The pixels are processed in blocks, so that the sums run over contiguous numbers in the cache.
 
     Args:
         pixels: x, y and intensity of the pixels, shape (3, >= n).
         n: number of pixels.
         theta: unknowns, shape (10,).
         length: L, px.
-        saturation: intensities from here on are censored.
-        J: work space of BLOCK_SIZE.
+        saturation: intensities from this value on are censored.
+        J: work space of size BLOCK_SIZE.
         N: receives the normal equations, shape (10, 10).
         g: receives their right-hand side, shape (10,).
 

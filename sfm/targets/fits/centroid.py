@@ -15,36 +15,37 @@ from sfm.kernels.sampling import as_grey
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 
 WEIGHTS = ("binary", "intensity", "squared")
-# The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
-# first part, where the blur of the edge has died away.
+# The window extends this far beyond the outline, px. The background is the mean outside the second distance,
+# where the blur of the edge has died away.
 MARGIN_PX, BLURRED_PX = 4.0, 2.5
-# Intensities that differ from the background by less than so many sigma are background.
+# Intensities that differ from the background by fewer sigma than this are background.
 THRESHOLD_SIGMAS = 3.0
-# The edges are traced from the ellipse found last; three times do from a start that is half a radius off.
+# The edges are traced this often, each time from the last ellipse; three suffice from a start half a radius
+# off.
 TRACES = 3
 # Unknowns of an ellipse.
 UNKNOWNS = 5
-# Share of the rays that must agree with the ellipse.
+# Part of the rays that must agree with the ellipse.
 MIN_AGREEMENT = 0.7
-# Edges are looked for this far beyond the ellipse, px.
+# Edges are searched this far beyond the ellipse, px.
 EDGE_MARGIN_PX = 3.0
 # Edges farther from the ellipse than this, in radii, do not count.
 TOLERANCE = 0.15
-# Harmonics of the edge that follow those of the ellipse (0, 1, 2).
+# Harmonics of the edge next to those of the ellipse (0, 1, 2).
 NEXT_HARMONICS = slice(3, 6)
-# Samples to both sides of the edge over which its position is averaged.
+# Samples on each side of the edge over which its position is averaged.
 WINDOW = 5
-# Variance of the position of an edge in its pixel, px^2: uniformly distributed.
+# Variance of the position of an edge within its pixel, px^2: a uniform distribution.
 EDGE_VARIANCE = 1 / 12
 
 
 class Centroids(NamedTuple):
-    """Centroids of k targets; nan where the window is cut or nothing rises above the background."""
+    """Centroids of k targets; nan if the window is cut or nothing rises above the background."""
 
     xy: FloatArray
     """px, shape (k, 2)"""
     covariance: FloatArray
-    """from noise (binary: the pixel grid), px^2, shape (k, 2, 2)"""
+    """covariance from noise (for binary weights, from the pixel grid), px^2, shape (k, 2, 2)"""
 
 
 def measure_centroids(
@@ -60,8 +61,8 @@ def measure_centroids(
 
     With g the intensity above the background (below it for dark targets), the weights are 1 where g exceeds
     half of the step to the target (binary), or g - 3 sigma or its square where that is positive. A shaded
-    background, a neighbour in the window or a start that is off by more than 2 px shifts a centroid; the fit
-    of an ellipse tolerates all of them.
+    background, a neighbour in the window, or a start off by more than 2 px shifts a centroid. The fit of an
+    ellipse tolerates all of them.
 
     Args:
         photograph: intensities, shape (H, W).
@@ -154,12 +155,12 @@ def _centroids(image: AnyArray, outline: FloatArray, sign: IntArray, noise: floa
 
 
 class EdgeEllipses(NamedTuple):
-    """Ellipses through the edges of k targets; nan where fewer than 70 % of the edges lie on one."""
+    """Ellipses through the edges of k targets; nan if fewer than 70 % of the edges lie on one."""
 
     xy: FloatArray
     """centres, px, shape (k, 2)"""
     covariance: FloatArray
-    """from the residuals of the edges and the correlation of neighbouring rays, px^2, shape (k, 2, 2)"""
+    """covariance from the edge residuals and the correlation of neighbouring rays, px^2, shape (k, 2, 2)"""
     shape: FloatArray
     """(p, q, r) of S, 1/px, shape (k, 3)"""
 
@@ -184,8 +185,9 @@ def measure_edge_ellipses(
     used = np.isfinite(residual).sum(axis=1)
     v = np.nan_to_num(residual)
     squares = (v**2).sum(axis=1)
-    # Neighbouring rays share pixels, so the errors have more power at low harmonics, where the centre is,
-    # than on average; it is taken from the harmonics next to those of the ellipse, over all targets.
+    # Neighbouring rays share pixels, so the errors have more power at low harmonics, which affect the centre,
+    # than on average. This power is estimated from the harmonics next to those of the ellipse, over all
+    # targets.
     low = (np.abs(np.fft.rfft(v, axis=1)[:, NEXT_HARMONICS]) ** 2).mean(axis=1) / RAYS
     white = squares / (RAYS - UNKNOWNS)
     inflation = max(1.0, low.sum() / white.sum()) if white.sum() > 0 else 1.0

@@ -1,19 +1,19 @@
-"""Concentric rings by the least squares fit of all their edges at once.
+"""Concentric rings measured by a least squares fit of all their edges at once.
 
-A plane in perspective maps circles of radius k about one centre to the curves rho = k of
+A plane in perspective maps circles of radius k around one centre to the curves rho = k of
 
     rho(x, y) = |S dx| / (1 + l dx),   dx = (x - x0, y - y0),   S = (p q; q r)
 
-where (x0, y0) is the image of the common centre: the seven unknowns are all that a homography changes in
-circles about one point. With the radii r_i from the outside inwards, e the spread of the ink, B the paper, A
-the step to the ink, s the blur and c_i the curvature of the edges (1/px), the intensity is
+where (x0, y0) is the image of the common centre. These seven unknowns are all that a homography changes in
+circles around one point. Let r_i be the radii from the outside inwards, e the spread of the ink, B the paper,
+A the step to the ink, s the blur and c_i the curvature of the edges (1/px). The intensity is
 
     I = (B + A sum_i (-1)^i Phi(z_i)) (1 + gx dx + gy dy)
     z_i = (r_i + (-1)^i e - rho) / (s |grad rho|) - s c_i / 2
 
-with dx and dy of the gain in units of L, the mean radius. The last term is the shift of a bent edge by the
+with dx and dy of the gain in units of L, the mean radius. The last term is the shift of a curved edge by the
 blur, to first order. The box of the pixel is part of s. A camera that sharpens adds a times what a mask of
-standard deviation h takes away: Phi(z_i) becomes (1 + a) Phi(z_i) - a Phi(z_i'), with s' = sqrt(s^2 + h^2).
+standard deviation h removes: Phi(z_i) becomes (1 + a) Phi(z_i) - a Phi(z_i'), with s' = sqrt(s^2 + h^2).
 
 Source: Kim, Gurdjos and Kweon (2005), "Geometric and algebraic constraints of projected concentric circles
 and their applications to camera calibration", IEEE PAMI 27(4), for the pencil of conics; motion of edges by
@@ -36,12 +36,12 @@ from sfm.targets.outlines import Flag
 # Unknowns in their order: x0, y0, p, q, r, two of l, B, A, s, e, gx, gy, a.
 UNKNOWNS, GEOMETRY = 14, 7
 BACKGROUND, CONTRAST, BLUR, SPREAD, GAIN_X, GAIN_Y, SHARPENING = range(7, 14)
-# Paper about the rings is fitted up to this radius; nothing else may be there.
+# Paper around the rings is fitted up to this radius; there must be nothing else on it.
 SURROUNDINGS = 1.15
-# A priori sigma of the spread of the ink in outer radii: 0.1 mm on a tag of 40 mm. It only matters where the
-# blur makes spread and contrast look alike.
+# A priori sigma of the spread of the ink in outer radii: 0.1 mm on a tag of 40 mm. It only matters if the
+# blur makes spread and contrast indistinguishable.
 SPREAD_SIGMA = 0.005
-# Largest change of scale by the perspective over a radius: the plane seen edge-on is not far then.
+# Largest change of scale by the perspective over a radius: beyond it the plane is nearly seen edge-on.
 STEEPEST = 0.5
 MIN_BLUR, MAX_BLUR, MAX_STEPS, LAST_STEP_PX = 0.25, 4.0, 40, 1e-3
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
@@ -54,22 +54,22 @@ class ConcentricFit:
     theta: FloatArray
     """unknowns, shape (14,)"""
     covariance: FloatArray
-    """their covariance from the residuals, shape (14, 14)"""
+    """covariance of the unknowns from the residuals, shape (14, 14)"""
     noise: float
     """standard deviation of the intensities about the fit"""
     radius_information: FloatArray
-    """normal equations of corrections of the radii within the first, in units of the noise, with all other
-    unknowns but the spread eliminated, shape (n, n)"""
+    """normal equations of corrections of the radii inside the first, in units of the noise, with all other
+    unknowns except the spread eliminated, shape (n, n)"""
     radius_gradient: FloatArray
-    """their right-hand side, shape (n,)"""
+    """right-hand side of these equations, shape (n,)"""
     sectors: FloatArray
     """root mean square residual in each of 16 directions from the centre, shape (16,)"""
     flag: int
-    """remarks and reasons of failure, see Flag"""
+    """remarks and reasons for failure, see Flag"""
 
 
 def rho_at(geometry: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rho, shape (n,), and its derivatives by the unknowns of the geometry, (7, n).
+    """Return rho, shape (n,), and its derivatives by the unknowns of the geometry, shape (7, n).
 
     Args:
         geometry: x0, y0, p, q, r and two of l, shape (7,).
@@ -97,7 +97,7 @@ def rho_at(geometry: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def positions_at(geometry: FloatArray, rho: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return the positions of some rho (m,) on rays from the centre at angles (k,), px, shape (k, m, 2)."""
+    """Return positions with given rho (m,) on rays from the centre at angles (k,), px, shape (k, m, 2)."""
     x0, y0, p, q, r, lx, ly = geometry
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     det = p * r - q * q
@@ -107,16 +107,16 @@ def positions_at(geometry: FloatArray, rho: FloatArray, angle: FloatArray) -> Fl
 
 
 def fit_edges(geometry: FloatArray, xy: FloatArray, ring: IntArray, rings: int) -> FloatArray | None:
-    """Return the geometry of concentric circles of unknown radii through points on their edges.
+    """Return the geometry of concentric circles with unknown radii through points on their edges.
 
     Args:
         geometry: approximate values, shape (7,).
         xy: points on the edges, px, shape (n, 2).
-        ring: which edge each is on, 0 is the outermost and has the radius 1, shape (n,).
-        rings: number of edges; with one the perspective is not found and stays.
+        ring: edge of each point, 0 for the outermost, whose radius is 1, shape (n,).
+        rings: number of edges; with one edge the perspective is not estimated but kept.
 
     Returns:
-        x0, y0, p, q, r and two of l, shape (7,); None where no circles pass through the points.
+        x0, y0, p, q, r and two of l, shape (7,); None if no circles pass through the points.
     """
     theta = np.append(geometry, [np.median(rho_at(geometry, xy)[0][ring == i]) for i in range(rings)])
     theta[GEOMETRY] = 1.0
@@ -128,7 +128,7 @@ def fit_edges(geometry: FloatArray, xy: FloatArray, ring: IntArray, rings: int) 
         A[:, :GEOMETRY] = by.T
         A[np.arange(len(xy)), GEOMETRY + ring] = -1.0
         v = (theta[GEOMETRY + ring] - rho) * scale
-        # A ray may meet something else than the edges: what is far off loses its weight (Huber).
+        # A ray may meet objects other than the edges: points that are far off lose weight (Huber).
         limit = 3 * max(1.4826 * float(np.median(np.abs(v))), 0.05)
         weight = np.sqrt(np.minimum(1.0, limit / np.maximum(np.abs(v), 1e-12)))
         step = np.linalg.lstsq(A[:, free] * (scale * weight)[:, None], v * weight, rcond=None)[0]
@@ -157,15 +157,15 @@ def fit_concentric(
     """Fit rings of known radii.
 
     Args:
-        image: whole intensities, shape (H, W).
+        image: integer intensities, shape (H, W).
         geometry: approximate x0, y0, p, q, r and two of l, shape (7,).
-        radii: of the edges from the outside inwards, the first is 1, shape (n + 1,).
+        radii: radii of the edges from the outside inwards, starting with 1, shape (n + 1,).
         blur: approximate standard deviation of the edges, px.
         noise: approximate standard deviation of the intensities; weights spread of the ink and sharpening.
-        saturation: intensities from here on are censored.
+        saturation: intensities from this value on are censored.
 
     Returns:
-        The fit; None where it does not converge or leaves the photograph.
+        The fit; None if it does not converge or leaves the photograph.
 
     Source: Gauss-Markov model with Levenberg-Marquardt steps.
     """
@@ -201,7 +201,7 @@ def fit_concentric(
             damping /= 10
         elif np.hypot(step[0], step[1]) >= LAST_STEP_PX:
             damping *= 10
-        # The derivatives are approximate: the last steps, far below the sigma, may lead up again.
+        # The derivatives are approximate, so the last steps, far below the sigma, may increase the cost.
         if np.hypot(step[0], step[1]) < LAST_STEP_PX and damping <= 1e-3:
             settled = True
             break
@@ -212,7 +212,7 @@ def fit_concentric(
     variance = max(float(v @ v) / max(used - UNKNOWNS, 1), QUANTISATION)
     cofactor = _inverse(J @ J.T + np.diag(prior))
     covariance = variance * cofactor
-    # Corrections of the radii within the first, after all other unknowns but the spread are eliminated.
+    # Corrections of the radii inside the first, after all other unknowns except the spread are eliminated.
     others = np.delete(J, SPREAD, axis=0)
     shared = edges[1:] @ others.T @ _inverse(others @ others.T)
     information = (edges[1:] @ edges[1:].T - shared @ (others @ edges[1:].T)) / variance
@@ -227,13 +227,13 @@ def fit_concentric(
 
 
 def _inverse(N: FloatArray) -> FloatArray:
-    """Return the inverse of normal equations whose unknowns are of different size."""
+    """Return the inverse of normal equations whose unknowns differ in magnitude."""
     scale = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     return np.asarray(np.linalg.pinv(N * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
 
 
 def _pixels(image: AnyArray, geometry: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return position and intensity of the pixels on the rings and the paper about them."""
+    """Return position and intensity of the pixels on the rings and on the paper around them."""
     angle = np.linspace(0, 2 * math.pi, 64, endpoint=False)
     outline = positions_at(geometry, np.array([SURROUNDINGS]), angle)[:, 0]
     low, high = np.floor(outline.min(axis=0)).astype(int), np.ceil(outline.max(axis=0)).astype(int)
@@ -255,9 +255,9 @@ def _linearise(
     length: float,
     saturation: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
-    """Return derivatives by the unknowns (14, n), residuals (n,), which count, and derivatives by radii.
+    """Return derivatives by the unknowns (14, n), residuals (n,), which pixels count, derivatives by radii.
 
-    The scale of the blur, |grad rho|, is taken as constant: its change is felt away from the edges only.
+    The scale of the blur, |grad rho|, is treated as constant, as its change matters only away from the edges.
     """
     _, _, p, q, r = theta[:5]
     B, A, s, e, gx, gy, a = theta[GEOMETRY:]
@@ -268,7 +268,7 @@ def _linearise(
     u, v = p * dx + q * dy, q * dx + r * dy
     wx, wy = p * u + q * v, q * u + r * v
     w = np.hypot(wx, wy) + 1e-12
-    # An edge through this direction has the curvature |S t|^2 / |S S dx| where its radius is rho, t along it.
+    # An edge in this direction has curvature |S t|^2 / |S S dx| where its radius is rho, with t along it.
     bent = ((p * wy - q * wx) ** 2 + (q * wy - r * wx) ** 2) / w**3 * rho
     ink, by_rho, by_blur, by_spread, by_sharpening = (np.zeros(len(xy)) for _ in range(5))
     edges = np.zeros((len(radii), len(xy)))
@@ -278,7 +278,7 @@ def _linearise(
         for part, way, blur in (
             (1 + a, 1.0, s),
             (-a, -1.0, masked),
-        ):  # sharpened; taken away
+        ):  # sharpened part; part removed by the mask
             z = (radius + sign * e - rho) / (blur * slope) - blur * curvature / 2
             density = part * _DENSITY_0 * np.exp(-z * z / 2)
             smooth = sign * ndtr(z)

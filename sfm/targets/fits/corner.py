@@ -1,17 +1,17 @@
-"""Corner of a square tag by the least squares fit of two blurred edges, compiled.
+"""Corner of a square tag measured by a least squares fit of two blurred edges, compiled.
 
-Model of the intensity at pixel (x, y), with d1, d2 the signed distances from two lines through the corner
-(x0, y0), negative on the side of the tag, s the blur of the edges, B the intensity around the tag, A the step
-to its border, g the change of the gain over L:
+Let d1, d2 be the signed distances of pixel (x, y) from two lines through the corner (x0, y0), negative on the
+side of the tag, s the blur of the edges, B the intensity around the tag, A the step to its border, and g the
+change of the gain over L. The intensity is
 
     I = (B + A ((1 + a) P(s) - a P(t))) (1 + gx (x - x0) / L + gy (y - y0) / L)
     P(s) = Phi(-d1 / s) Phi(-d2 / s) - C(s),    t^2 = s^2 + h^2
 
-a is the sharpening of the camera (unsharp masking), whose halo would else be taken for a change of the gain
-and shift the edge. C is what the clear modules behind the border add, as blurred rectangles at their places
-in the tag; it is computed anew with the blur and the corners that were found. The tip, where both edges act
-and other print may touch the tag, is left out: the corner is where the two edges meet. The fit stays so near
-to it that distortion does not bend the edges.
+a is the sharpening of the camera (unsharp masking). Without it, its halo would be mistaken for a change of
+the gain and shift the edge. C is the contribution of the clear modules behind the border, modelled as blurred
+rectangles at their places in the tag; it is recomputed with the estimated blur and corners. The tip, where
+both edges act and other print may touch the tag, is left out: the corner is the intersection of the two
+edges. The fit stays so near to the corner that distortion does not bend the edges.
 """
 
 from __future__ import annotations
@@ -30,19 +30,20 @@ from sfm.targets.outlines import Flag
 # Unknowns of the fit in their order: x0, y0, directions of the two normals, B, A, s, gx, gy, a.
 UNKNOWNS = 10
 X0, Y0, NORMAL_1, NORMAL_2, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y, SHARPENING = range(UNKNOWNS)
-# What is not farther than this behind one of the edges is the tip, shorter for small tags (share of a side).
+# Distance from both edges within which the tip is left out, shorter for small tags (as a part of a side).
 TIP_PX, TIP_SHARE, MIN_TIP_PX = 4.0, 0.1, 2.5
-# Farther than this from an edge nothing is learnt; at first the code is kept away from, its blur is unknown.
+# Pixels farther from an edge than this are not used. In the first round the code is avoided: its blur is
+# unknown.
 BAND_PX, MIN_BAND_PX, CODE_PX = 4.0, 1.5, 2.5
-# Edges are followed for this share of a side, at most so far: distortion bends them by less than 0.01 px.
+# Part of a side along which edges are used, and its maximum: distortion bends them by less than 0.01 px.
 REACH_SHARE, REACH_PX = 0.45, 20.0
-CODE_SIGMAS = 3.5  # of the blur beyond which a module does not act
+CODE_SIGMAS = 3.5  # blurs beyond which a module has no effect
 ROUNDS = 3
 # A priori sigma of the change of gain over L, as for circular targets; it only keeps the fit regular.
 GAIN_SIGMA = 0.3
-# The same of the sharpening, and the width h of its mask, px; cameras use 0.5 to 2 px.
+# A priori sigma of the sharpening, and the width h of its mask, px; cameras use 0.5 to 2 px.
 SHARPENING_SIGMA, MASK_PX = 0.5, 1.5
-# Blur at the start and its limits; the last step; the farthest that a corner is from where it was expected.
+# Initial blur and its limits; the last step; the maximum distance of a corner from its expected position.
 BLUR_START, MIN_BLUR, MAX_BLUR, LAST_STEP_PX, MAX_STEPS, FARTHEST_PX = 0.9, 0.25, 4.0, 1e-3, 30, 4.0
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 _CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
@@ -56,11 +57,11 @@ class CornerFits(NamedTuple):
     theta: FloatArray
     """unknowns, shape (k, 4, 10)"""
     covariance: FloatArray
-    """their covariance, nan where the fit failed, shape (k, 4, 10, 10)"""
+    """covariance of the unknowns, nan if the fit failed, shape (k, 4, 10, 10)"""
     noise: FloatArray
     """standard deviation of the intensities about the fit, shape (k, 4)"""
     flag: IntArray
-    """remarks and reasons of failure, see Flag, shape (k, 4)"""
+    """remarks and reasons for failure, see Flag, shape (k, 4)"""
 
 
 @compiled
@@ -71,11 +72,11 @@ def fit_corners(
 
     Args:
         image: intensities, shape (H, W).
-        quads: approximate corners of the black squares in turn, px, shape (k, 4, 2).
+        quads: approximate corners of the black squares in order, px, shape (k, 4, 2).
         tag_from_pixel: homographies from pixels to modules, from the first corner along the first two
             sides, shape (k, 3, 3).
-        clear: modules of each tag that are not of the colour of its border, row by row, (k, m, m).
-        saturation: intensities from here on are censored.
+        clear: modules of each tag that do not have the colour of its border, row by row, (k, m, m).
+        saturation: intensities from this value on are censored.
     """
     k = len(quads)
     theta = np.zeros((k, 4, UNKNOWNS))
@@ -105,7 +106,7 @@ def _fit_one(
     theta: FloatArray,
     covariance: FloatArray,
 ) -> tuple[int, float]:
-    """Fit one corner; theta and covariance are filled, flag and noise are returned."""
+    """Fit one corner; fill theta and covariance, and return flag and noise."""
     theta[X0], theta[Y0] = corner[0], corner[1]
     depth = math.inf
     for k, (end, other) in enumerate(((following, previous), (previous, following))):
@@ -123,7 +124,7 @@ def _fit_one(
     pixels = np.empty((5, int((2 * FARTHEST_PX + 2 * (reach + BAND_PX) * 4) ** 2) + 16))
     flag, noise = 0, math.nan
     theta[BLUR] = BLUR_START
-    for round_ in range(ROUNDS):  # the pixels are chosen anew about the corner that was found
+    for round_ in range(ROUNDS):  # each round chooses the pixels around the corner found before
         band = min(BAND_PX, max(MIN_BAND_PX, depth / len(clear) - CODE_PX)) if round_ == 0 else BAND_PX
         n, censored = _collect(image, theta, band, reach, tip, saturation, pixels)
         if n < 0:
@@ -156,7 +157,7 @@ def _collect(
     saturation: float,
     pixels: FloatArray,
 ) -> tuple[int, bool]:
-    """Collect x, y and intensity along the two edges; return how many, -1 where the border cuts them off."""
+    """Collect x, y and intensity along the two edges, and return their number, -1 if the border cuts them."""
     h, w = image.shape
     x0, y0 = theta[X0], theta[Y0]
     c1, s1, c2, s2 = (
@@ -189,7 +190,7 @@ def _collect(
 def _add_code(
     pixels: FloatArray, n: int, H: FloatArray, clear: BoolArray, blur: float, parts: FloatArray
 ) -> None:
-    """Fill the part of the clear modules in each pixel, 0 to 1."""
+    """Set the part of the clear modules in each pixel, 0 to 1."""
     modules = len(clear)
     for k in range(n):
         x, y = pixels[0, k], pixels[1, k]
@@ -210,7 +211,7 @@ def _add_code(
 
 @compiled
 def _start_levels(pixels: FloatArray, n: int, theta: FloatArray) -> None:
-    """Set B and A to the mean intensities beside the tag and on its border, s and g to their start values."""
+    """Set B and A to the mean intensities beside the tag and on its border; set s and g to start values."""
     c1, s1, c2, s2 = (
         math.cos(theta[NORMAL_1]),
         math.sin(theta[NORMAL_1]),
@@ -235,7 +236,7 @@ def _iterate(
     """Improve theta by Levenberg-Marquardt steps and set the cofactors.
 
     Returns:
-        Sum of squared residuals, and the number of pixels used, 0 where it did not converge.
+        Sum of squared residuals, and the number of pixels used, 0 without convergence.
     """
     N, g = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     N_trial, g_trial = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -304,7 +305,7 @@ def _normal_equations(
         level = B + A * profile
         model = level * gain
         if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
-            continue  # no more is known of it (censored observation)
+            continue  # nothing more is known of it (censored observation)
         # dI / d d1 and d2, by the edges and by the mask
         scale = -A * _DENSITY_0 * gain
         f1, f2 = scale * (1 + a) * e1 * phi2 / s, scale * (1 + a) * e2 * phi1 / s

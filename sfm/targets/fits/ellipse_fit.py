@@ -1,4 +1,4 @@
-"""Least squares fit of the model of a blurred ellipse (see blurred_ellipse) to circular targets, compiled."""
+"""Least squares fit of the model in `blurred_ellipse` to circular targets, compiled."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from sfm.targets.outlines import Flag
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
 GAIN_SIGMA = 0.3
 MAX_STEPS = 30
-# A step below this is the last one; as Gauss-Newton steps shrink by a factor of ten or more, what is left is
-# far below the precision of any target.
+# The iteration ends with a step below this. Gauss-Newton steps shrink by a factor of ten or more, so the
+# remaining error is far below the precision of any target.
 LAST_STEP_PX = 5e-3
-# Background taken into the fit: so many px and this share of the mean semi-axis, at most.
+# Background used in the fit: so many px plus this part of the mean semi-axis, up to the maximum.
 MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
-# Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest adds nothing.
+# For targets larger than this (mean semi-axis) only a band inside the edge is used; the rest adds nothing.
 LARGE_PX, BAND_PX = 25.0, 15.0
-# Blur of the edge at the start and its limits.
+# Initial blur of the edge, and its minimum.
 BLUR_START, MIN_BLUR = 0.9, 0.25
-# A rise to a neighbour shows at three tenths of its step, half a blur before its edge.
+# A rise to a neighbour is detected at three tenths of its step, half a blur before its edge.
 RISE_BLURS = 0.5
-# The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
+# The outline is traced again if it changed by more than this part of the radius; so many rays must agree.
 MAX_TRACES, SMALL_CHANGE, MIN_AGREEMENT = 2, 0.08, 0.7
 _NONE = int(Flag.NONE)
 _SATURATED = int(Flag.SATURATED)
@@ -45,13 +45,13 @@ class EllipseFits(NamedTuple):
     theta: FloatArray
     """unknowns in the order of `blurred_ellipse`, shape (k, 10)"""
     cofactor: FloatArray
-    """their cofactor matrices, nan where the fit failed, shape (k, 10, 10)"""
+    """cofactor matrices of the unknowns, nan if the fit failed, shape (k, 10, 10)"""
     statistics: FloatArray
     """in the columns of `goodness`, shape (k, STATISTICS)"""
     flag: IntArray
-    """remarks and reasons of failure, see Flag, shape (k,)"""
+    """remarks and reasons for failure, see Flag, shape (k,)"""
     sectors: FloatArray
-    """of each sector of the edge the sums of v J and of J^2, J the derivative of an intensity by the radius
+    """sums of v J and of J^2 in each sector of the edge, with J the derivative of an intensity by the radius
     of the outline, in radii, shape (k, 2, RAYS)"""
     shape: FloatArray
     """equations of the harmonics of the outline, see `goodness.shape_equations`,
@@ -75,9 +75,9 @@ def fit_ellipses(
         start: x0, y0, p, q, r, shape (k, 5).
         sign: +1 bright, -1 dark target, shape (k,).
         noise: approximate standard deviation of the intensities.
-        saturation: intensities from here on are censored.
-        keep: sectors of each target, between a ray and the next, that take part, shape (k, RAYS).
-        depth: so far inside the edge the intensities are used, px, shape (k,).
+        saturation: intensities from this value on are censored.
+        keep: sectors of each target, from one ray to the next, that take part, shape (k, RAYS).
+        depth: distance inside the edge up to which intensities are used, px, shape (k,).
     """
     k = len(start)
     theta = np.zeros((k, model.UNKNOWNS))
@@ -121,7 +121,7 @@ def _fit_one(
     sectors: FloatArray,
     shape: FloatArray,
 ) -> int:
-    """Fit one target; theta, cofactor, statistics and sectors are filled, the flag is returned."""
+    """Fit one target; fill theta, cofactor, statistics, sectors and shape, and return the flag."""
     flag = _NONE
     edge, limit = np.empty(RAYS), np.empty(RAYS)
     mean, margin = 0.0, 0.0
@@ -155,7 +155,8 @@ def _fit_one(
     N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
     steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
     if steps > 0 and theta[model.CONTRAST] * sign > 0:
-        # the edges of neighbours are as soft: their skirts begin farther away from them than the rays show
+        # The edges of neighbours are as soft: their skirts begin farther from them than the rays first
+        # showed.
         wide = np.empty(RAYS)
         trace_rays(image, theta, sign, noise, margin, _skirt(theta[model.BLUR]), edge, wide)
         nearer = False
@@ -192,9 +193,10 @@ def _fit_one(
 
 @compiled
 def _skirt(blur: float) -> float:
-    """Return how far before the rise to a neighbour the background is undisturbed, px.
+    """Return the distance before the rise to a neighbour at which the background is undisturbed, px.
 
-    As beside the edge itself, few thousandths of the step are left there. Rays find a rise up to a step late.
+    As beside the target's own edge, a few thousandths of the step remain there. Rays find a rise up to a step
+    late.
     """
     return (goodness.EDGE_ENDS_BLURS - RISE_BLURS) * blur + STEP_PX
 
@@ -210,10 +212,10 @@ def _iterate(
     J: FloatArray,
     N: FloatArray,
 ) -> int:
-    """Improve theta by Levenberg-Marquardt steps; N is its normal equations, without the prior.
+    """Improve theta by Levenberg-Marquardt steps; N receives its normal equations, without the prior.
 
     Returns:
-        The number of steps, negative or 0 where they did not converge.
+        The number of steps, negative or 0 without convergence.
     """
     mean = (theta[model.P] * theta[model.R] - theta[model.Q] ** 2) ** -0.5
     N_trial = np.empty((model.UNKNOWNS, model.UNKNOWNS))
@@ -273,7 +275,7 @@ def _collect(
     keep: BoolArray,
     pixels: FloatArray,
 ) -> int:
-    """Collect x, y and intensity of the target and its undisturbed background; return how many."""
+    """Collect x, y and intensity of the target and its undisturbed background, and return their number."""
     h, w = image.shape
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
     disturbed, cut = limit.min() < margin, not keep.all()
@@ -301,7 +303,7 @@ def _collect(
 
 @compiled
 def _start_levels(pixels: FloatArray, n: int, theta: FloatArray, saturation: float) -> int:
-    """Set B and A to the mean intensities out- and inside the outline, s and g to their start values."""
+    """Set B and A to the mean intensities outside and inside the outline; set s and g to start values."""
     outside, inside, n_out, n_in = 0.0, 0.0, 0, 0
     flag = _NONE
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Goodness of fit of a blurred ellipse: what it leaves unexplained, and how wide its background is."""
+"""Goodness of fit of a blurred ellipse: what it leaves unexplained, and the width of its background."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX
 from sfm.targets.fits import blurred_ellipse as model
 
-# Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, share
-# of strokes, halo and its sigma, saturated share of the background, share of the circumference behind which
-# glare is, the largest sum of residuals that lie together, inside and anywhere, over the root of their number
-# (see `judge_coherence`), and the robust standard deviation of residuals.
+# Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, part
+# of the circumference with strokes, halo and its sigma, saturated part of the background, part of the
+# circumference with glare behind it, the largest sum of adjacent residuals, inside and anywhere, over the
+# root of their number (see `judge_coherence`), and the robust standard deviation of residuals.
 STATISTICS = 13
 PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS = range(5)
 STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE, TOGETHER, SPREAD = range(5, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
-# Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
+# Distance that is examined behind a stroke, and the level, in contrasts from the background, that is glare.
 _BEHIND_PX, _GLARE = 2.5, 1.5
-# The background begins so many blurs from the edge, where 0.6 % of the step are left; a halo is looked for in
+# The background begins this many blurs from the edge, where 0.6 % of the step remains. A halo is searched in
 # this width of it.
 EDGE_ENDS_BLURS, HALO_PX = 2.5, 2.0
 # Harmonics 3 to 6 of the outline, cosine and sine of each.
 SHAPES = 8
 # Standard deviation of rounding intensities.
 ROUNDING = 12**-0.5
-# Residuals of the edge are taken from this far in units of its blur, and at least so many px.
+# Residuals of the edge are used within this many blurs of it, plus so many px.
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
 
 @compiled
 def _beside_outline(theta: FloatArray, x: float, y: float) -> tuple[float, float, float, float]:
-    """Return the place of a pixel in the frame of the unit circle, u, v and rho, and the slope of rho^2 / 2.
+    """Return the position of a pixel relative to the unit circle, u, v and rho, and the slope of rho^2 / 2.
 
     Its distance from the outline is rho (rho - 1) over that slope, px, to first order.
     """
@@ -60,8 +60,9 @@ def judge_residuals(
 ) -> None:
     """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
 
-    The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
-    An eighth without any background is uneven, unless what is damaged was left out there.
+    The unevenness is the largest mean residual of an eighth of the edge, inside or outside, over the
+    contrast.
+    An eighth without any background is uneven, unless damage was left out there.
     """
     A, band = theta[model.CONTRAST], _BAND_PX + _BAND_BLURS * theta[model.BLUR]
     mean, count = np.zeros(16), np.zeros(16)
@@ -92,7 +93,7 @@ def judge_residuals(
 
 @compiled
 def _edge_slope(A: float, s: float, d: float, px: float) -> float:
-    """Return the change of intensity by a radius of so many px: that of A Phi(-d / s), with d = .. - h px."""
+    """Return the derivative of A Phi(-d / s) by a radius that moves the edge by `px` px."""
     return A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * px
 
 
@@ -106,7 +107,7 @@ def sum_sectors(
     J: FloatArray,
     sectors: FloatArray,
 ) -> None:
-    """Sum up v H and H^2 of each sector of the edge, H being the derivative by the radius, into (2, RAYS)."""
+    """Sum up v H and H^2 in each sector of the edge into (2, RAYS), with H the derivative by the radius."""
     A, s = theta[model.CONTRAST], theta[model.BLUR]
     band = _BAND_PX + _BAND_BLURS * s
     sectors[:] = 0.0
@@ -134,11 +135,12 @@ def judge_coherence(
     J: FloatArray,
     statistics: FloatArray,
 ) -> None:
-    """Set the largest sums of residuals that lie together, inside and anywhere, and their robust deviation.
+    """Set the largest sums of adjacent residuals, inside and anywhere, and the robust standard deviation.
 
-    They lie in a square of two blurs: a photograph shows nothing smaller. Half of it or more is in the fit,
-    and not so far outside that neighbours begin. Inside is what can be left out of the fit. The
-    largest residual of a square counts as much as the others together at most: a hot pixel is alone.
+    A sum is over a square with a side of two blurs, because a photograph shows nothing smaller. At least half
+    of the square must be in the fit, and not so far outside that neighbours begin. Inside means deep enough
+    to be left out of the fit. The largest residual of a square counts at most as much as the others together,
+    since a hot pixel is isolated.
     """
     statistics[INSIDE], statistics[TOGETHER], statistics[SPREAD] = 0.0, 0.0, max(noise, ROUNDING)
     if n == 0:
@@ -147,7 +149,7 @@ def judge_coherence(
     side = max(2, round(2 * theta[model.BLUR]))
     left, top = int(pixels[0, :n].min()), int(pixels[1, :n].min())
     right, bottom = int(pixels[0, :n].max()), int(pixels[1, :n].max())
-    # sums of residuals, of weights and of pixels that are not deep inside over all rows and columns before
+    # Sums over all rows and columns before, of residuals, of weights, and of pixels that are not deep inside.
     sums, size = np.zeros((3, bottom - top + 2, right - left + 2)), np.empty(n)
     residuals = np.zeros((bottom - top + 1, right - left + 1))
     for first in range(0, n, model.BLOCK):
@@ -191,7 +193,7 @@ def judge_coherence(
 
 @compiled
 def _within(sums: FloatArray, i: int, j: int, side: int) -> float:
-    """Return the sum over a square that ends before row i and column j from the sums over all before."""
+    """Return the sum over a square that ends before row i and column j, from cumulative sums."""
     return float(sums[i, j] - sums[i - side, j] - sums[i, j - side] + sums[i - side, j - side])
 
 
@@ -206,18 +208,18 @@ def shape_equations(
     J: FloatArray,
     shape: FloatArray,
 ) -> None:
-    """Set the reduced normal equations of the harmonics of an outline that no ellipse follows.
+    """Set the reduced normal equations of the harmonics of an outline that no ellipse can follow.
 
     Args:
         pixels: x, y and intensity of the pixels in the fit, shape (3, >= n).
         n: number of pixels.
         theta: unknowns of the model, shape (10,).
         length: L, px.
-        saturation: intensities from here on are censored.
-        cofactor: of the unknowns, shape (10, 10).
-        J: work space of BLOCK_SIZE.
+        saturation: intensities from this value on are censored.
+        cofactor: cofactor matrix of the unknowns, shape (10, 10).
+        J: work space of size BLOCK_SIZE.
         shape: receives the normal equations of the harmonics, their right-hand side, and the change of the
-            centre by each, px per radius, shape (SHAPES + 3, SHAPES).
+            centre by each harmonic, px per radius, shape (SHAPES + 3, SHAPES).
     """
     A, s = theta[model.CONTRAST], theta[model.BLUR]
     band = _BAND_PX + 2 * _BAND_BLURS * s
@@ -253,11 +255,11 @@ def shape_equations(
 
 @compiled
 def judge_background(image: AnyArray, theta: FloatArray, length: float, statistics: FloatArray) -> None:
-    """Set the shares of the circumference where the background is only a thin stroke, and where glare is.
+    """Set the parts of the circumference where the background is only a thin stroke, and where glare is.
 
-    The stroke of a letter "o" is one: the intensity comes back to that of the target nearer to the edge than
-    any ring of a code. Intensities much farther from the background than the target are glare about the rim
-    of a retro-reflective target.
+    The stroke of a letter "o" is an example: the intensity returns to that of the target nearer to the edge
+    than any ring of a code. Intensities much farther from the background than the target's are glare around
+    the rim of a retro-reflective target.
     """
     h, w = image.shape
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
@@ -297,9 +299,9 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
 def judge_glow(
     pixels: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
 ) -> None:
-    """Set by how much the background beside the edge is nearer to the target than farther away, in contrasts.
+    """Set the halo: how much nearer to the target the background beside the edge is than farther away.
 
-    And the standard deviation of that, and the share of the background that is saturated.
+    It is set in contrasts, with its standard deviation, and with the saturated part of the background.
     """
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
     B, A, s = theta[model.BACKGROUND], theta[model.CONTRAST], theta[model.BLUR]

@@ -1,13 +1,15 @@
-"""Outlines of targets: their noise, and damage against the shape that they share.
+"""Noise of the outlines of targets, and damage relative to the shape that they have in common.
 
-Harmonics 3 to 6 of an outline follow no ellipse. They are estimated jointly with it on what is left of the
-edge. Deviations common to the targets of a photograph are shape. The rest shows the variance of the first
-harmonic, which is the centre, whatever makes it: rough printing, compression, correlated noise.
+No ellipse can follow harmonics 3 to 6 of an outline. They are estimated jointly with the ellipse from the
+undamaged part of the edge. Deviations common to the targets of a photograph are shape. The rest shows the
+variance of the first harmonic, which is the centre, whatever its cause: rough printing, compression or
+correlated noise.
 
-Damage is found against that shape. The edge of a target is divided into sectors. The deviation h of the
-outline in a sector, in radii, follows from the residuals of the blurred ellipse there. The median over the
-targets of a photograph is shape: polygonal printing or sharpening, which moves all of them alike. A place is
-damaged where the rest is significant against the scatter along the edge, of this target and of the others.
+Damage is detected relative to that shape. The edge of a target is divided into sectors. The deviation h of
+the outline in a sector, in radii, follows from the residuals of the blurred ellipse there. The median over
+the targets of a photograph is shape, such as polygonal printing or sharpening, which shifts all of them
+alike. A place is damaged if the rest is significant relative to the scatter along the edges of this target
+and of the others.
 """
 
 from __future__ import annotations
@@ -22,40 +24,40 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.goodness import SHAPES
 
-# Level of the tests of a photograph, divided by their number.
+# Level of significance for a photograph, divided by the number of tests.
 LEVEL = 0.01
-# Numbers of neighbouring sectors that are tested together; an ellipse follows much of wider damage.
+# Numbers of neighbouring sectors that are tested together; an ellipse follows most of any wider damage.
 WIDTHS = (1, 2, 4)
-# From so many sound targets on a photograph shows what they have in common.
+# Number of sound targets from which a photograph shows their common shape.
 MIN_POPULATION = 8
 # Median over circles of the largest scan statistic, by simulation (tests/targets/test_outline_noise.py).
 USUAL_SCAN = 2.18
-# Scatter along an edge, and the largest scan statistic, are excused up to so many times the usual; more is
-# damage in many places or of many targets.
+# Factor over the usual up to which scatter along an edge, and the largest scan statistic, are tolerated; more
+# means damage in many places or on many targets.
 MAX_LEVEL = 3.0
-# Where few others show what is shape, damage is in at most so many places; a scratch is in two.
+# If too few other targets show what is shape, damage is in at most so many places; a scratch is in two.
 MAX_PLACES = 2
 # Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
 ROUNDS, BIWEIGHT = 10, 4.685
 MAD = 1.4826
 _PHI = 2 * np.pi * (np.arange(RAYS) + 0.5) / RAYS
-# The spectrum of outlines is that of harmonics 3 to this one, of which blur leaves this share at least.
+# The spectrum of outlines covers harmonics 3 to this one, if blur leaves at least this part of their power.
 MAX_HARMONIC, MIN_DAMPED = 12, 0.2
-# Its exponent is used where it is so many sigmas above 0, and up to this.
+# The exponent of the spectrum is used if it is so many sigmas above 0, and up to this value.
 EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
 # Larger than any degree of freedom that a population can show.
 _MAX_HALF_FREEDOM = 1e4
 
 
 class OutlineShape(NamedTuple):
-    """Harmonics 3 to 6 of the outlines of k targets, which no ellipse follows."""
+    """Harmonics 3 to 6 of the outlines of k targets, which no ellipse can follow."""
 
     harmonics: FloatArray
-    """cosine and sine of each, radii, shape (k, SHAPES)"""
+    """cosine and sine of each harmonic, radii, shape (k, SHAPES)"""
     normal: FloatArray
     """their normal equations, shape (k, SHAPES, SHAPES)"""
     effect: FloatArray
-    """change of the centre by each, px per radius, shape (k, 2, SHAPES)"""
+    """change of the centre by each component, px per radius, shape (k, 2, SHAPES)"""
     lobes: FloatArray
     """amplitude of harmonics 3 and 4 together, radii, shape (k,)"""
     lobes_cofactor: FloatArray
@@ -66,9 +68,9 @@ class OutlineNoise(NamedTuple):
     """Noise of the outlines of k targets."""
 
     factor: FloatArray
-    """ratio of the variances to those by the noise of the intensities, shape (k,)"""
+    """ratio of the variances to those from the noise of the intensities, shape (k,)"""
     gap_covariance: FloatArray
-    """what gaps in the edges add to the covariance of the centres, px^2, shape (k, 2, 2)"""
+    """covariance of the centres added by gaps in the edges, px^2, shape (k, 2, 2)"""
 
 
 def outline_shape(equations: FloatArray) -> OutlineShape:
@@ -91,22 +93,22 @@ def judge_outlines(
 ) -> OutlineNoise:
     """Return the noise of outlines.
 
-    A nick moves all harmonics of an outline alike, and its blur leaves little of the high ones. They show the
-    first one by the share that is left of them: where an outline is stranger than noise, the excess of its
-    variance is divided by that.
+    A nick affects all harmonics of an outline alike, and its blur leaves little of the high ones. They show
+    the first harmonic by the part of their power that is left: if an outline is stranger than noise, the
+    excess of its variance is divided by that part.
 
     Args:
-        outlines: their harmonics.
-        variance: of the intensities, shape (k,).
-        sound: targets that show what is usual, shape (k,).
+        outlines: harmonics of the outlines.
+        variance: variance of the intensities, shape (k,).
+        sound: targets that represent the usual, shape (k,).
         softness: blur of the edges over the radius, which leaves little of high harmonics, shape (k,).
         rise: power of the first harmonic over that of harmonics 3 to 6, see `rise_to_first`.
     """
     shape, N, effect = outlines[:3]
     rest = shape - np.median(shape[sound], axis=0) if sound.sum() >= MIN_POPULATION else shape
-    softness = np.minimum(softness, 1.0)[:, None]  # more where a fit failed
+    softness = np.minimum(softness, 1.0)[:, None]  # larger if a fit failed
     damping = np.repeat(damping_of(np.arange(3, 3 + SHAPES // 2), softness), 2, axis=1)
-    damping = np.where(damping[:, :1] > MIN_DAMPED, damping, 1.0)  # softer edges show none
+    damping = np.where(damping[:, :1] > MIN_DAMPED, damping, 1.0)  # softer edges show no harmonics
     seen, squares = damping.sum(axis=1), (damping**2).sum(axis=1)
     weighted = np.sqrt(damping) * rest
     ratio = np.maximum(np.einsum("ka,kab,kb->k", weighted, N, weighted), 0.0) / (
@@ -123,10 +125,10 @@ def judge_outlines(
 
 
 def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[FloatArray, BoolArray]:
-    """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,).
+    """Return ratios of variances with a common degree of freedom, shrunk to those of the population, (k,).
 
-    Ratios too large for the population are not drawn to it; a mask of them is returned second. Few targets
-    are drawn half way to 1.
+    Ratios too large for the population are not shrunk; their mask is returned second. A few targets are
+    shrunk half way to 1.
 
     Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression" (2004);
     Phipson et al., "Robust hyperparameter estimation protects against hypervariable genes" (2016).
@@ -144,7 +146,7 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[Float
 
 
 def damping_of(k: IntArray, softness: FloatArray | float) -> FloatArray:
-    """Return the share of the power of these harmonics of outlines that so soft edges leave."""
+    """Return the part of the power of these harmonics that remains in outlines with soft edges."""
     return np.asarray(np.exp(-((k * softness) ** 2)))
 
 
@@ -161,12 +163,12 @@ def _inverse_trigamma(value: float) -> float:
 def rise_to_first(h: FloatArray, weight: FloatArray, softness: float) -> float:
     """Return the power of the first harmonic of random outlines over the mean of harmonics 3 to 6.
 
-    The power of harmonic k falls as a power of k, which the population shows.
+    The power of harmonic k falls as a power of k, which is estimated from the population.
 
     Args:
         h: deviations of sound outlines in each sector without the common shape, radii, shape (k, RAYS).
-        weight: 1 / variance of them by the noise of the intensities, shape (k, RAYS).
-        softness: blur of the edges over the radius, damps harmonics as the width of the sectors does.
+        weight: 1 / variance of these deviations from the noise of the intensities, shape (k, RAYS).
+        softness: blur of the edges over the radius; like the width of the sectors, it damps harmonics.
     """
     k = np.arange(3, MAX_HARMONIC + 1)
     damped = damping_of(k, softness) * np.sinc(k / RAYS) ** 2
@@ -190,25 +192,25 @@ def rise_to_first(h: FloatArray, weight: FloatArray, softness: float) -> float:
 
 
 def harmonics(first: int, last: int) -> FloatArray:
-    """Return cosine and sine of these harmonics in the middle of each sector, shape (RAYS, 2 n)."""
+    """Return cosine and sine of harmonics in the middle of each sector, shape (RAYS, 2 n)."""
     return np.column_stack([f(k * _PHI) for k in range(first, last + 1) for f in (np.cos, np.sin)])
 
 
 _ELLIPSE = np.column_stack([np.ones(RAYS), harmonics(1, 2)])
-_PRODUCTS = (_ELLIPSE[:, :, None] * _ELLIPSE[:, None, :]).reshape(-1, 25)  # of these, (RAYS, 25)
+_PRODUCTS = (_ELLIPSE[:, :, None] * _ELLIPSE[:, None, :]).reshape(-1, 25)  # products of these, (RAYS, 25)
 
 
 def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: FloatArray) -> BoolArray:
     """Return which sectors of the edges are damaged.
 
-    The largest scan statistic is cut first and the rest is tested again: a wide window about damage is
-    significant, too, but not its other sectors.
+    The sectors of the largest scan statistic are removed first, and the rest is tested again: a wide window
+    around damage is also significant, but its other sectors are not.
 
     Args:
         h: deviations of the outlines from their ellipses and the common shape, radii, shape (k, RAYS).
-        weight: 1 / variance of them by the noise of the intensities, shape (k, RAYS).
-        sound: targets that show what is usual, shape (k,).
-        skirt: so many sectors to both sides of damage are as blurred as it, shape (k,).
+        weight: 1 / variance of these deviations from the noise of the intensities, shape (k, RAYS).
+        sound: targets that represent the usual, shape (k,).
+        skirt: number of sectors on each side of damage that are blurred with it, shape (k,).
 
     Returns:
         Damaged sectors with their skirts, shape (k, RAYS).
@@ -241,20 +243,20 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
 
 
 def common_shape(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
-    """Return the median deviation of the sound outlines in each sector, radii, (RAYS,); 0 for few of them."""
+    """Return the median deviation of sound outlines in each sector, radii, (RAYS,); 0 if they are few."""
     seen = sound[:, None] & (weight > 0)
     enough = seen.sum(axis=0) >= MIN_POPULATION
     return np.array([np.median(h[seen[:, j], j]) if enough[j] else 0.0 for j in range(RAYS)])
 
 
 def gap_shifts(common: FloatArray, weight: FloatArray, keep: BoolArray) -> FloatArray:
-    """Return by how much gaps in the edges make the common shape shift the centres, radii, shape (k, 2)."""
+    """Return the shifts of the centres by the common shape due to gaps in the edges, radii, shape (k, 2)."""
     h = np.broadcast_to(common, weight.shape)
     return (_fit_harmonics(h, weight * keep) - _fit_harmonics(h, weight))[:, 1:3]
 
 
 def _fit_harmonics(h: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the harmonics 0 to 2 of outlines, which ellipses follow to first order, radii, shape (k, 5)."""
+    """Return harmonics 0 to 2 of outlines, which ellipses follow to first order, radii, shape (k, 5)."""
     N = (weight @ _PRODUCTS).reshape(-1, 5, 5)
     N += 1e-9 * (1 + np.trace(N, axis1=1, axis2=2))[:, None, None] * np.eye(5)
     return np.asarray(np.linalg.solve(N, ((weight * h) @ _ELLIPSE)[..., None])[..., 0])
@@ -279,7 +281,7 @@ def _robust_residuals(h: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _scan(z: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the sums of so many residuals from each sector on, in sigmas, shape (k, len(WIDTHS), RAYS)."""
+    """Return the sums of WIDTHS residuals starting at each sector, in sigmas, (k, len(WIDTHS), RAYS)."""
     total, norm = z * np.sqrt(weight), weight
     scans = np.empty((len(z), len(WIDTHS), RAYS))
     for k, width in enumerate(WIDTHS):

@@ -1,9 +1,9 @@
-"""Crossings of a checkerboard: the point that all edges around it run through, with its covariance.
+"""Crossings of a checkerboard: the point on all edges around it, with its covariance.
 
-Every pixel of an edge shows that the crossing lies on the line through it across its gradient. Their
-intersection, weighted by the squared gradient, is the crossing; blur, which is the same on both sides of an
-edge, does not move it. The covariance is that of the noise of the intensities, carried through the filters
-and the window, which moves with the crossing.
+Every pixel of an edge shows that the crossing lies on the line through the pixel perpendicular to its
+gradient. The crossing is the intersection of these lines, weighted by the squared gradient. Blur is the same
+on both sides of an edge and does not move it. The covariance is that of the noise of the intensities,
+propagated through the filters and through the window, which moves with the crossing.
 
 Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken (precise location of corners,
 and their roundness, the squared sine of the angle between the edges).
@@ -20,16 +20,16 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 
-# Largest half side of the window, in the distance of the nearest crossing. On 14 photographs of a printed
-# board residuals are 0.128, 0.125, 0.128 and 0.134 px RMS with 0.25, 0.35, 0.43 and 0.5: distortion bends
-# edges, print is uneven, and smaller windows have more noise.
+# Largest half side of the window, in distances to the nearest crossing. On 14 photographs of a printed board
+# residuals are 0.128, 0.125, 0.128 and 0.134 px RMS with 0.25, 0.35, 0.43 and 0.5: distortion bends edges,
+# print is uneven, and smaller windows have more noise.
 MAX_HALF_SPACINGS = 0.35
 MIN_HALF_PX, MAX_HALF_PX = 3, 15
 ROUNDS, LAST_STEP_PX = 20, 1e-3
-MAX_OFF_FRACTION = 1.0  # of the half window, by which a crossing may be off where it was expected
-MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; one edge has 0
+MAX_OFF_FRACTION = 1.0  # maximum distance of a crossing from its expected position, in half windows
+MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; a single edge has 0
 SMOOTHING_PX = 0.7  # of the gradients
-MIN_BLUR_PX = 0.1  # that is distinguished from that of the filters
+MIN_BLUR_PX = 0.1  # smallest blur distinguishable from that of the filters
 REACH_PX = 4  # of the filters
 
 
@@ -37,23 +37,24 @@ REACH_PX = 4  # of the filters
 class Saddles:
     """Measured crossings."""
 
-    xy: FloatArray  # px, NaN where it failed, (k, 2)
+    xy: FloatArray  # px, NaN if the measurement failed, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
     contrast: FloatArray  # between dark and bright squares, units of the photograph, (k,)
-    blur: FloatArray  # of the edges, standard deviation, px; too small from a fifth of the window on, (k,)
+    blur: FloatArray  # standard deviation of the edges, px; underestimated above a fifth of the window, (k,)
 
     def select(self, rows: BoolArray) -> Saddles:
-        """Return some of them."""
+        """Return some of the crossings."""
         return Saddles(self.xy[rows], self.covariance[rows], self.contrast[rows], self.blur[rows])
 
 
 def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, noise: float) -> Saddles:
-    """Measure crossings near approximate places.
+    """Measure crossings near approximate positions.
 
     Args:
         image: intensities, shape (H, W).
-        start: approximate places, px, (k, 2).
-        half_px: half sides of the windows, which see no edge but those of the crossing, px, (k,).
+        start: approximate positions, px, (k, 2).
+        half_px: half sides of the windows, which must contain no other edges than those of the crossing, px,
+            (k,).
         noise: standard deviation of an intensity.
     """
     k = len(start)
@@ -79,7 +80,7 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
 
 
 def _taps() -> tuple[FloatArray, FloatArray]:
-    """Return the weights by which a derivative is smoothed along it, and across it, 2 REACH_PX + 1 each."""
+    """Return the weights of a derivative's smoothing along and across it, 2 REACH_PX + 1 each."""
     smoothing = cv2.getGaussianKernel(2 * REACH_PX - 1, SMOOTHING_PX)[:, 0]
     return np.convolve(smoothing, [-0.5, 0.0, 0.5]), np.convolve(smoothing, [0.25, 0.5, 0.25])
 
@@ -101,16 +102,16 @@ def _measure_all(
     contrast: FloatArray,
     blur: FloatArray,
 ) -> None:
-    """Fill places, covariances, contrasts and blurs of crossings, those of failed ones left as they are.
+    """Fill positions, covariances, contrasts and blurs of crossings; failed ones remain unchanged.
 
     Args:
         smooth: smoothed intensities, (H, W).
-        gx: their derivative along x, per px, (H, W).
-        gy: the same along y.
-        start: approximate places, px, (k, 2).
+        gx: derivative along x, per px, (H, W).
+        gy: derivative along y, per px, (H, W).
+        start: approximate positions, px, (k, 2).
         half_px: half sides of the windows, px, (k,).
         noise: standard deviation of an intensity.
-        xy: receives the places, (k, 2).
+        xy: receives the positions, (k, 2).
         covariance: receives their covariance, (k, 2, 2).
         contrast: receives their contrast, (k,).
         blur: receives the blur of their edges, px, (k,).
@@ -131,10 +132,10 @@ def _measure_all(
 
 @compiled
 def _blur(gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: float, contrast: float) -> float:
-    """Return the blur of the edges about a crossing, px, too small where they fill the window, or NaN.
+    """Return the blur of the edges around a crossing, px, too small if they fill the window, or NaN.
 
     Across an edge of contrast C and blur s the squared gradient adds up to C^2 / (2 sqrt(pi) s) on each px of
-    its length. Two edges in a circle of radius r are 4 r long; where they cross, 2.257 s of each show none.
+    its length. Two edges in a circle of radius r are 4 r long; at their intersection 2.257 s of each is lost.
     """
     squares, count = 0.0, 0
     for row in range(round(y) - half, round(y) + half + 1):
@@ -147,15 +148,15 @@ def _blur(gx: AnyArray, gy: AnyArray, x: float, y: float, half: int, noise: floa
         return math.nan
     C2 = contrast * contrast
     s = 4 * half * C2 / (2 * math.sqrt(math.pi) * squares + 4.514 * C2)
-    of_edge = s * s - SMOOTHING_PX**2 - 1 / 3  # without that of the filters
+    of_edge = s * s - SMOOTHING_PX**2 - 1 / 3  # without the blur of the filters
     return math.sqrt(max(of_edge, MIN_BLUR_PX**2))
 
 
 @compiled
 def _weight(dx: float, dy: float, half: int) -> float:
-    """Return the weight of a pixel: a round window about the point itself, cut off gradually.
+    """Return the weight of a pixel: a round window around the point itself, with a gradual cut-off.
 
-    No step of the point, however small, may change the weights by more than a little: it would not settle.
+    No small step of the point may change the weights abruptly, because the iteration would not converge.
     """
     inside_x, inside_y = half + 0.5 - abs(dx), half + 0.5 - abs(dy)
     if inside_x <= 0 or inside_y <= 0:
@@ -165,14 +166,14 @@ def _weight(dx: float, dy: float, half: int) -> float:
 
 @compiled
 def _falloff(d: float, half: int) -> float:
-    """Return by what share the weight of a pixel at this distance grows as the window moves towards it."""
+    """Return the relative growth of a pixel's weight per px that the window moves towards it."""
     inside = half + 0.5 - abs(d)
     return 4.0 * d / (half * half) + (math.copysign(1.0, d) / inside if inside < 1.0 else 0.0)
 
 
 @compiled
 def _crossing(gx: AnyArray, gy: AnyArray, x0: float, y0: float, half: int) -> tuple[float, float]:
-    """Return a crossing; NaN where there is none, or the border cuts it off."""
+    """Return a crossing; NaN if there is none, or if the border cuts it."""
     height, width = gx.shape
     margin, x, y = half + REACH_PX + 1, x0, y0
     for _ in range(ROUNDS):
@@ -209,8 +210,9 @@ def _propagate(
 ) -> None:
     """Fill the covariance of a crossing, px^2, (2, 2).
 
-    By how much each intensity moves it are the filters of the gradient, the other way round. Lines of pixels
-    beside the middle of a blurred edge miss the crossing, and the window changes their weights as it moves.
+    The effect of each intensity on the crossing follows from the gradient filters, applied in reverse. Lines
+    of pixels beside the middle of a blurred edge miss the crossing, and the window changes their weights as
+    it moves.
     """
     column, row = round(x), round(y)
     side, reach = 2 * (half + REACH_PX) + 1, half + REACH_PX
@@ -249,7 +251,7 @@ def _propagate(
 def _add_filtered(
     image: FloatArray, along_x: FloatArray, along_y: FloatArray, rows: FloatArray, out: FloatArray
 ) -> None:
-    """Add an image (n, n) filtered by two rows of weights; it is zero near its border."""
+    """Add an image (n, n) filtered by two rows of weights to `out`; the image is zero near its border."""
     n = len(image)
     rows[:] = 0.0
     for k in range(2 * REACH_PX + 1):

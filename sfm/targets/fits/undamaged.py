@@ -1,4 +1,4 @@
-"""Fit of blurred ellipses to what is not damaged of the targets of a photograph."""
+"""Fit of blurred ellipses to the undamaged parts of the targets of a photograph."""
 
 from __future__ import annotations
 
@@ -31,30 +31,32 @@ from sfm.targets.fits.outline_noise import (
 )
 from sfm.targets.outlines import Flag
 
-# Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
-# share of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.
+# Limits of a sound target: the mean residual on an eighth of the edge over the contrast, and its contrast as
+# a part of that which a tenth of the targets exceeds, since compression produces faint blobs by the hundred.
 UNEVEN_EDGE, MIN_CONTRAST_SHARE = 0.18, 0.2
-# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
-# only half of it where the background is a thin stroke, as in letters, on this share of the circumference.
+# Largest lobes of an outline, in radii, plus so many sigma of a component for noise (four components are
+# seen).
+# Only half of it is permitted if the background is a thin stroke, as in letters, on this part of the
+# circumference.
 LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
 # Largest RMS of the residuals over the contrast.
 POOR_FIT = 0.12
-# Damage is sought so often; each fit shows more of it.
+# Number of rounds in which damage is searched; each fit shows more of it.
 ROUNDS = 3
-# So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
+# Intensities are changed up to so many blurs beside damage in the edge, by up to 7 % of the step.
 SKIRT_BLURS = 1.5
-# Residuals larger than usual by so many robust sigmas of the logarithms over the photograph are unlike
-# the others. Their scatter is that of the variance of 200 pixels at least.
+# Residuals larger than usual by so many robust sigmas of their logarithms over the photograph stand out. The
+# scatter is at least that of the variance of 200 pixels.
 POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
-# Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
+# If an edge is more curved than this, the model of its blur is not exact, and shape is not taken as damage.
 MIN_CURVATURE_BLURS = 2.0
-# Mean residual that it leaves in a square of two blurs, over the contrast, at most: for each blur over that
-# curvature and each part of 1 that the short axis is shorter than the long one. It is exact for circles.
-# Rendered ellipses with a ratio of the axes of 0.26 to 0.4 and blurs of 0.77 to 3.6 px need 0.032 to 0.042.
+# Largest mean residual that this leaves in a square of two blurs, over the contrast: for each blur over the
+# radius of curvature, and in proportion to the flattening of the ellipse. It is exact for circles. Rendered
+# ellipses with a ratio of the axes of 0.26 to 0.4 and blurs of 0.77 to 3.6 px need 0.032 to 0.042.
 MISFIT = 0.045
 # Smaller targets have too few pixels to separate damage from another shape.
 MIN_RADIUS_PX = 4.0
-# Sizes are apart where no targets lie within this of the logarithm: 15 % of the radius.
+# Classes of size are separate if no targets lie within this of the logarithm: 15 % of the radius.
 SIZE_STEP = 0.14
 # Fewer targets than this are not worth a thread.
 TARGETS_PER_THREAD = 100
@@ -63,19 +65,19 @@ TARGETS_PER_THREAD = 100
 def fit_undamaged(
     image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least_variance: float
 ) -> tuple[EllipseFits, FloatArray, OutlineNoise]:
-    """Fit ellipses to what is not damaged of their edges and inside them.
+    """Fit ellipses to the undamaged parts of their edges and of their insides.
 
     Args:
         image: intensities, shape (H, W).
         start: x0, y0, p, q, r, shape (k, 5).
         sign: +1 bright, -1 dark target, shape (k,).
         noise: approximate standard deviation of the intensities.
-        saturation: intensities from here on are censored.
-        least_variance: that of rounding the intensities.
+        saturation: intensities from this value on are censored.
+        least_variance: variance from rounding the intensities.
 
     Returns:
-        The fits, flagged DAMAGED where something was left out and UNEVEN_EDGE where too little of the edge
-        agrees with one ellipse; the variances of the intensities, shape (k,); the noise of the outlines.
+        The fits, flagged DAMAGED if something was left out and UNEVEN_EDGE if too little of the edge agrees
+        with one ellipse; the variances of the intensities, shape (k,); the noise of the outlines.
     """
 
     def fit(begin: FloatArray, signs: IntArray, keep: BoolArray, depth: FloatArray) -> EllipseFits:
@@ -109,19 +111,19 @@ def unlike_targets(
     contrast: FloatArray,
     noise: float,
 ) -> list[tuple[Flag, BoolArray]]:
-    """Return what shows candidates to be no targets, whatever else is in the photograph.
+    """Return the reasons why candidates are not targets, without regard to the rest of the photograph.
 
     Args:
         unevenness: largest mean residual on an eighth of the edge over the contrast, shape (k,).
         lobes: amplitude of harmonics 3 and 4 of the outline, radii, shape (k,).
-        lobes_sigma: standard deviation of one of their components by the noise, radii, shape (k,).
-        strokes: share of the circumference where the background is only a thin stroke, shape (k,).
+        lobes_sigma: standard deviation of one of their components from the noise, radii, shape (k,).
+        strokes: part of the circumference where the background is only a thin stroke, shape (k,).
         noise_of_fit: standard deviation of the intensities about the fit, shape (k,).
         contrast: step of intensity, positive, shape (k,).
         noise: standard deviation of the intensities of the photograph.
 
     Returns:
-        Each reason and which candidates it is against, shape (k,).
+        Each reason with a mask of the candidates that it rejects, shape (k,).
     """
     limit = LOBES + LOBES_SIGMAS * lobes_sigma
     return [
@@ -138,13 +140,14 @@ def _some_of(fits: EllipseFits, some: IntArray) -> EllipseFits:
 
 
 def sizes_apart(radius: FloatArray) -> list[IntArray]:
-    """Return targets in classes of size, between which no others lie: letters and targets of one sheet.
+    """Return targets in classes of size separated by gaps, such as letters and targets on one sheet.
 
-    The effect of blur, sharpening and compression on an outline depends on its size, and targets of one make
-    differ by perspective in all steps. Classes that are no population by themselves join the nearest one.
+    The effect of blur, sharpening and compression on an outline depends on its size. Targets of one make
+    differ continuously in size by perspective. A class too small to be a population joins its nearest
+    neighbour.
 
     Args:
-        radius: of the targets, px, shape (k,).
+        radius: radii of the targets, px, shape (k,).
     """
     order = np.argsort(radius, kind="stable")
     log = np.log(np.maximum(radius[order], 1e-6))
@@ -168,14 +171,14 @@ def _repaired(
     variance_of_noise: float,
     least_variance: float,
 ) -> tuple[EllipseFits, FloatArray, OutlineNoise]:
-    """Return fits of targets of about one size without damage, variances and the noise of outlines.
+    """Return the fits of targets of about one size without damage, variances, and the noise of outlines.
 
     Args:
-        fits: of all of each target; changed.
+        fits: fits of whole targets, which are changed.
         sign: +1 bright, -1 dark target, shape (k,).
-        fit: fits targets from start values, with their sectors and depths that take part.
-        variance_of_noise: approximate one of the intensities.
-        least_variance: that of rounding the intensities.
+        fit: fits targets from start values, with the sectors and depths that take part.
+        variance_of_noise: approximate variance of the intensities.
+        least_variance: variance from rounding the intensities.
     """
     k = len(sign)
     keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
@@ -230,11 +233,10 @@ def _variances(fits: EllipseFits, least: float) -> FloatArray:
 def _deviations(
     fits: EllipseFits, keep: BoolArray, variance_of_noise: float, least_variance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, OutlineShape]:
-    """Return deviations of outlines without the common shape, their weights, the common shape, sound targets.
+    """Return deviations of outlines without the common shape, weights, the common shape, sound targets.
 
-    The harmonics of the outlines come last.
-
-    Damage that was not left out makes the variance of a target larger; it counts up to the usual one.
+    The harmonics of the outlines are returned last. Damage that was not left out increases the variance of a
+    target; the variance is therefore limited to the usual one.
     """
     fitted, contrast = np.isfinite(fits.cofactor[:, 0, 0]), np.abs(fits.theta[:, CONTRAST])
     variance = _variances(fits, least_variance)
@@ -263,11 +265,11 @@ def _deviations(
 
 
 def _has_marks(fits: EllipseFits, column: int, sound: BoolArray) -> BoolArray:
-    """Return where residuals that lie together are significant and larger than in sound targets, shape (k,).
+    """Return where adjacent residuals are significant and larger than in sound targets, shape (k,).
 
-    The level is divided by the number of squares of one blur in all targets. Misfits of the model are no
-    marks. The usual spread is that of most targets: damage makes that of a target larger, compression here
-    and there smaller.
+    The level is divided by the number of squares of one blur in all targets. Misfits of the model do not
+    count. The usual spread is that of most targets: damage increases that of a target, compression reduces it
+    locally.
     """
     blur, contrast = np.maximum(fits.theta[:, BLUR], 1.0), np.maximum(np.abs(fits.theta[:, CONTRAST]), 1e-9)
     spread = fits.statistics[:, goodness.SPREAD]
@@ -281,7 +283,7 @@ def _has_marks(fits: EllipseFits, column: int, sound: BoolArray) -> BoolArray:
 
 
 def _model_misfit(theta: FloatArray) -> FloatArray:
-    """Return the largest mean residual of whole ellipses in a square of two blurs, in contrasts, (k,)."""
+    """Return the largest mean residual of undamaged ellipses in a square of two blurs, in contrasts, (k,)."""
     p, q, r = theta[:, P : R + 1].T
     mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
     flattened = 2 * half / np.maximum(mean + half, 1e-12)
@@ -289,7 +291,7 @@ def _model_misfit(theta: FloatArray) -> FloatArray:
 
 
 def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
-    """Return which positive values are larger than those of sound targets, by the logarithms, shape (k,)."""
+    """Return which positive values exceed those of sound targets significantly, by logarithms, (k,)."""
     if sound.sum() < MIN_POPULATION:
         return np.ones(len(value), bool)
     z = np.log(np.maximum(value, 1e-12))
@@ -304,7 +306,7 @@ def _radii(theta: FloatArray) -> FloatArray:
 
 
 def _least_curvature(theta: FloatArray) -> FloatArray:
-    """Return the least radius of curvature of ellipses, at the ends of their long axes, px, shape (k,)."""
+    """Return the smallest radius of curvature of ellipses, at the ends of their long axes, px, (k,)."""
     p, q, r = theta[:, P : R + 1].T
     mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
     return np.asarray((mean - half) / np.maximum(mean + half, 1e-12) ** 2)

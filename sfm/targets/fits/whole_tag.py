@@ -1,15 +1,15 @@
-"""Small square tag by the least squares fit of all its modules at once.
+"""Small square tag measured by a least squares fit of all its modules at once.
 
-Where modules are hardly wider than the blur, the two edges at a corner cannot be distinguished from the code
-behind them, but the whole code is known once it is read. Model of the intensity at pixel (x, y) with the
-homography (u, v) = h(x, y) into modules, B the intensity of clear modules, A the step to black ones, s the
-blur, and c(i, j) = 1 for black modules:
+If modules are hardly wider than the blur, the two edges at a corner cannot be separated from the code behind
+them, but the whole code is known once it is read. Let (u, v) = h(x, y) be the homography from pixels into
+modules, B the intensity of clear modules, A the step to black ones, s the blur, and c(i, j) = 1 for black
+modules. The intensity at pixel (x, y) is
 
     I = B + A sum_ij c(i, j) W_i(u) W_j(v),   W_i(u) = Phi((u - i) / s_u) - Phi((u - i - 1) / s_u)
 
 s_u = s |grad u| is the blur in modules. Distortion does not bend edges of so few px. Uneven light (shadows,
-highlights) is estimated with them as a random field, by its values in the middle of modules. The fit confirms
-the reading as well: the code in uneven light must be far likelier than clutter of the same contrast.
+highlights) is estimated jointly as a random field, by its values in the middle of modules. The fit also
+confirms the reading: the code in uneven light must be far likelier than clutter of the same contrast.
 
 Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, chapters 2 and 5, for the
 field and its likelihood; Kass and Raftery (1995), Journal of the American Statistical Association 90(430),
@@ -40,27 +40,28 @@ from sfm.targets.fits.corner import (
 )
 from sfm.targets.outlines import Flag
 
-# Tags are printed with one clear module around them. What is behind it acts up to so many blurs into it.
+# Tags are printed with one clear module around them. Objects behind it affect so many blurs of it.
 BEHIND_BLURS = 2.0
-# Light on a tag is a random field that forgets itself over so many modules: it changes what is reflected by a
-# share, that of levels of 1 and 0.6 about their mean (a shadow of 40 %), and adds one of the step (glare).
+# Light on a tag is a random field whose correlation falls to 1/e over so many modules. It changes reflected
+# light by a factor, like levels of 1 and 0.6 about their mean (a shadow of 40 %), and adds a part of the step
+# (glare).
 LIGHT_SIGMA, GLARE_SIGMA, LIGHT_MODULES = 0.25, 0.05, 3.0
-# Light that modules do not resolve, in steps, for each pixel; the likeliest of these strengths is estimated.
+# Light that modules do not resolve, in steps, for each pixel; the likeliest of these strengths is chosen.
 PIXEL_SIGMA, STRENGTHS = 0.1, (1.0, 0.3, 0.1, 0.03)
-LIGHT_ROUNDS = 2  # of estimating it, each with the levels of the one before
-MIN_SEEN = 0.3  # share of the usual weight of a module with which one beside the tag counts
-# How uneven print may be, in steps. Clutter is a random field of black and clear, half the step about their
-# middle, whose strokes are a module wide.
+LIGHT_ROUNDS = 2  # rounds of estimating it, each with the levels of the round before
+MIN_SEEN = 0.3  # part of the usual weight of a module from which a module beside the tag counts
+# Unevenness of print, in steps. Clutter is a random field of black and clear, half the step about their
+# middle, with strokes one module wide.
 PRINT_SIGMA, CLUTTER_SIGMA, CLUTTER_MODULES = 0.03, 0.5, 1.0
-# Least logarithm of the likelihood of the code over that of clutter. It must exceed the number of codes and
-# placements tried: about 8 for 1000 codes in 4 turns, 16 for positions in 1 MP and 20 for shapes. Largest of
-# 66 letters that OpenCV reads in 40 pages: 31; least of 160 tags of 15 to 60 px under shadows and highlights:
-# 56; of 530 tags of 10 to 23 px: 59.
+# Minimum log likelihood of the code over that of clutter. It must exceed the log number of codes and
+# placements tried: about 8 for 1000 codes in 4 rotations, 16 for positions in 1 MP and 20 for shapes. The
+# maximum of 66 letters that OpenCV reads in 40 pages is 31. The minimum of 160 tags of 15 to 60 px under
+# shadows and highlights is 56, and of 530 tags of 10 to 23 px 59.
 MIN_EVIDENCE = 43.0
-# Largest number of steps; the last one is less than this for each corner, px.
+# Maximum number of steps; the last step moves each corner by less than this, px.
 STEPS, LAST_STEP_PX = 200, 1e-3
 # In a tilted tag the blur acts on u and v with a correlation. That part is a blur along one direction, summed
-# up at the nodes of Gauss and Hermite (Abramowitz and Stegun 1964, table 25.10, n = 5, for a unit variance).
+# over the nodes of Gauss and Hermite (Abramowitz and Stegun 1964, table 25.10, n = 5, for a unit variance).
 NODES = (-2.85697001, -1.35562618, 0.0, 1.35562618, 2.85697001)
 WEIGHTS = (0.01125741, 0.22207592, 0.53333333, 0.22207592, 0.01125741)
 _H, _B, _A, _S = slice(0, 8), 8, 9, 10
@@ -76,11 +77,11 @@ def fit_whole_tags(
 ) -> CornerFits:
     """Fit all modules of every tag; arguments and results are those of `corner.fit_corners`.
 
-    Also given is the standard deviation of an intensity, against which modules are judged.
-    The four corners of a tag share background, step, blur and noise. Gains and sharpening are 0.
+    In addition, `noise` is the standard deviation of an intensity, relative to which modules are judged. The
+    four corners of a tag share background, step, blur and noise. Gains and sharpening are 0.
 
     Source: Gauss-Markov model with Levenberg-Marquardt steps; covariance of the corners by propagation, wider
-    where modules scatter more than their pixels show.
+    if modules scatter more than their pixels show.
     """
     k = len(quads)
     fits = CornerFits(
@@ -106,7 +107,7 @@ def _fit_tag(
     fits: CornerFits,
     i: int,
 ) -> int:
-    """Fit one tag, write what is found into row i, and return its flag."""
+    """Fit one tag, write the result into row i, and return its flag."""
     modules, (height, width) = len(black), image.shape
     middle, scale = quad.mean(axis=0), float(np.ptp(quad, axis=0).max())
     if not np.isfinite(scale) or scale <= 0:
@@ -123,7 +124,7 @@ def _fit_tag(
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = uv[:, :2] / uv[:, 2:]
     inside = ((uv > -margin) & (uv < modules + margin)).all(axis=1)
-    inside &= ((uv > 0) & (uv < modules)).any(axis=1)  # at the corners of an AprilGrid's tags are squares
+    inside &= ((uv > 0) & (uv < modules)).any(axis=1)  # the tags of an AprilGrid have squares at the corners
     outer = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * margin + _square(modules)
     around = _pixels_of(H, outer) * scale + middle
     if not ((around >= 0) & (around <= (width - 1, height - 1))).all():
@@ -173,22 +174,22 @@ def _fit_tag(
 
 @dataclass(frozen=True)
 class _Light:
-    """Uneven light on a tag: a random field, seen by its pixels and by its modules."""
+    """Uneven light on a tag: a random field, observed by its pixels and its modules."""
 
     pixels: FloatArray
-    """covariances of the light at pixels with that at modules, (n, q)"""
+    """covariances of the light at pixels with the light at modules, (n, q)"""
     weights: FloatArray
-    """what takes residuals summed over `pixels` to the coefficients of the most probable field, (q, q)"""
+    """matrix from residuals summed over `pixels` to the coefficients of the most probable field, (q, q)"""
 
     def without(self, values: FloatArray) -> FloatArray:
-        """Return values at pixels, (n,) or (n, k), without the most probable light in them."""
+        """Return values at pixels, (n,) or (n, k), without their most probable light."""
         return np.asarray(values - self.pixels @ (self.weights @ (self.pixels.T @ values)))
 
 
 def _scatter_of_modules(seen: _Modules, J: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the scatter over modules of what each contributes to the right-hand side, (11, 11).
+    """Return the scatter over modules of their contributions to the right-hand side, (11, 11).
 
-    Where a shadow ends in it, the pixels of a module err together. As many parts as unknowns are lost.
+    At the end of a shadow, the pixels of a module have a common error. As many parts as unknowns are lost.
 
     Source: Liang and Zeger (1986), Biometrika 73(1), covariance of estimates from clusters.
     """
@@ -206,9 +207,9 @@ def _iterate(
     scale: float,
     light: _Light | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return the unknowns of the least squares fit, its Jacobian and residuals, None if it does not converge.
+    """Return the unknowns of the least squares fit, its Jacobian and residuals; None without convergence.
 
-    The light, if given, is estimated with them. Of censored intensities those above the model count.
+    Any given light is estimated jointly. Censored intensities count only if they exceed the model.
     """
     modules, damping = len(black), 1e-3
 
@@ -243,7 +244,7 @@ def _square(modules: int) -> FloatArray:
 
 
 def _pixels_of(H: FloatArray, places: FloatArray) -> FloatArray:
-    """Return where places of the tag are, in the scaled frame of the pixels, shape (n, 2)."""
+    """Return places on the tag in the scaled frame of the pixels, shape (n, 2)."""
     found = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(H).T
     return np.asarray(found[:, :2] / found[:, 2:])
 
@@ -264,7 +265,7 @@ def _derivatives(theta: FloatArray, at: FloatArray, place: FloatArray) -> tuple[
 
 
 def _model(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the share of black at scaled pixels, (n,), and its derivatives by homography and blur (n, 9)."""
+    """Return the part of black at scaled pixels, (n,), and its derivatives by homography and blur, (n, 9)."""
     modules = len(black)
     uv, w, along, rest = _in_modules(theta, P)
     c = black.astype(float)  # rows are v, columns u
@@ -291,9 +292,9 @@ def _model(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArr
 
 
 def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return where scaled pixels are in modules, (n, 2), their denominators, (n,), and the blur there.
+    """Return scaled pixels in modules, (n, 2), their denominators, (n,), and the blur there.
 
-    It acts along one direction, and on u and v by themselves, both (n, 2).
+    The blur has a part along one direction and a part on u and v independently, each (n, 2).
     """
     H, blur = np.append(theta[_H], 1.0).reshape(3, 3), theta[_S]
     w = P @ H[2]
@@ -302,26 +303,26 @@ def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArra
     sigma = blur * np.sqrt((gradient**2).sum(axis=2))
     rho = blur**2 * (gradient[:, 0] * gradient[:, 1]).sum(axis=1) / sigma.prod(axis=1)
     along = np.sqrt(np.abs(rho))[:, None] * sigma * np.column_stack([np.ones(len(rho)), np.sign(rho)])
-    rest = np.maximum(1 - np.abs(rho), np.finfo(float).eps)  # 0 where a tag is seen edge on
+    rest = np.maximum(1 - np.abs(rho), np.finfo(float).eps)  # 0 if a tag is seen edge-on
     return uv, w, along, sigma * np.sqrt(rest)[:, None]
 
 
 @dataclass(frozen=True)
 class _Modules:
-    """Modules of a tag and the clear ones around it that pixels see, q of them."""
+    """The q modules that pixels see: those of a tag, and the clear ones around it."""
 
     uv: FloatArray
-    """where the pixels are, modules, (n, 2)"""
+    """positions of the pixels, modules, (n, 2)"""
     share: FloatArray
-    """share of each module in each pixel, (n, q)"""
+    """part of each module in each pixel, (n, q)"""
     weight: FloatArray
-    """sum of its squares, (q,)"""
+    """sum of squares of these parts, (q,)"""
     place: FloatArray
-    """middle of each module, modules, (q, 2)"""
+    """centre of each module, modules, (q, 2)"""
     printed: BoolArray
-    """which are black, (q,)"""
+    """black modules, (q,)"""
     judged: BoolArray
-    """which are modules of the tag, (q,)"""
+    """modules of the tag itself, (q,)"""
     background: float
     step: float
 
@@ -331,7 +332,7 @@ class _Modules:
         return np.asarray(self.background + self.step * self.printed, dtype=float)
 
     def covariance(self, at: FloatArray, level_at: FloatArray) -> FloatArray:
-        """Return covariances of the light at places, (k, 2), of intensities, (k,), with that at modules."""
+        """Return covariances of the light at places (k, 2), of intensity (k,), with the light at modules."""
         shade = LIGHT_SIGMA**2 * np.outer(level_at, self.level)
         return np.asarray(
             (shade + (GLARE_SIGMA * max(abs(self.step), np.finfo(float).eps)) ** 2)
@@ -365,9 +366,9 @@ def _see_modules(theta: FloatArray, P: FloatArray, black: BoolArray) -> _Modules
 
 
 def _estimate_light(seen: _Modules, residual: FloatArray, used: BoolArray) -> _Light:
-    """Return the light on a tag, given by its values in the middle of modules and of the clear ones around.
+    """Return the light on a tag, by its values at the centres of its modules and of the clear ones around.
 
-    The residuals are those of a fit of the tag, light in them.
+    The residuals are those of a fit of the tag and contain the light.
     """
     level_px = seen.background + seen.step * seen.share[:, seen.printed].sum(axis=1)
     K = seen.covariance(seen.place, seen.level)
@@ -385,10 +386,10 @@ def _estimate_light(seen: _Modules, residual: FloatArray, used: BoolArray) -> _L
 
 
 def _evidence_of_code(seen: _Modules, residual: FloatArray, noise: float) -> float:
-    """Return the logarithm of the likelihood of the code in uneven light over that of clutter.
+    """Return the log likelihood of the code in uneven light over that of clutter.
 
-    The residuals are those of a fit of the tag, light in them. A code with a module that is likelier in the
-    other colour has none, -inf.
+    The residuals are those of a fit of the tag and contain the light. The result is -inf if a module of the
+    code is likelier in the other colour.
     """
     modules, judged, step = seen.share / seen.weight, seen.judged, max(abs(seen.step), np.finfo(float).eps)
     mixed, unseen = modules.T @ seen.share, noise**2 * modules.T @ modules
@@ -414,8 +415,8 @@ def _has_wrong_module(
 
     Args:
         off: intensities of modules less those of the code, (q,).
-        inverted: what each module (column) in its other colour would change of them, (q, q).
-        covariance: of `off`, (q, q).
+        inverted: change of these by each module (column) in its other colour, (q, q).
+        covariance: covariance of `off`, (q, q).
         judged: modules of the tag, (q,).
     """
     h = inverted[np.ix_(judged, judged)]
@@ -424,7 +425,7 @@ def _has_wrong_module(
 
 
 def _ln_likelihood(values: FloatArray, covariance: FloatArray, judged: BoolArray) -> float:
-    """Return the logarithm of the density of values that are judged, without its constant."""
+    """Return the log density of the judged values, without its constant."""
     values, covariance = values[judged], covariance[np.ix_(judged, judged)]
     return -0.5 * float(values @ np.linalg.solve(covariance, values) + np.linalg.slogdet(covariance)[1])
 
