@@ -1,13 +1,13 @@
-"""Matching: the same points in several photographs, measured by their texture or found among unnamed targets.
+"""Matching: find and measure the same points in several photographs, by texture or among unlabelled targets.
 
-- `match_points`: begin here; points of one photograph in another, by correlation and least squares.
+- `match_points`: begin here; it finds points of one photograph in another, by correlation and least squares.
 - `match_ncc`: normalised cross-correlation in a search window; `match_lsm`: least squares matching.
-- `find_tie_points`, from `natural_points`: points of natural texture in many photographs.
+- `find_tie_points` (from `natural_points`): points of natural texture in many photographs.
 - `foerstner_points`: corners and centres of circles in the texture.
-- `match_targets`: unnamed targets of many oriented photographs.
-- `epipolar_paths`: the lines, bent by distortion, on which a point may be in another photograph.
+- `match_targets`: unlabelled targets in many oriented photographs.
+- `epipolar_paths`: the lines, curved by distortion, along which a point can lie in another photograph.
 - `radiometry_of`, `histogram`, `equalise_histogram`, `match_brightness`, `fit_radiometry`: mean, contrast and
-  histogram, and the brightness of one photograph brought to another.
+  histogram of photographs, and how to adapt the brightness of one to another.
 - `resample`: intensities between pixels.
 
     >>> import numpy as np

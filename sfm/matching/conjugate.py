@@ -1,16 +1,16 @@
-"""Conjugate points: from points of one photograph to the same points in another, and how well.
+"""Conjugate points: find points of one photograph in another by correlation and least squares matching.
 
-Correlation finds the place to a pixel in a search window, least squares matching takes it from there. Points
-not found in this way are looked for again with templates that are turned and scaled.
+Correlation finds the position in a search window to one pixel. Least squares matching starts there and
+refines it. Points that are not found this way are searched for again with rotated and scaled templates.
 
-Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or
-something else. Affine maps around points are taken beforehand from the key points near them, whose
-descriptors depend neither on scale nor on rotation.
+Wide baselines: if two photographs were taken far apart, a patch looks rotated, scaled and sheared, and
+correlation finds nothing or the wrong point. Affine maps are therefore estimated first, from the key points
+near each point. The descriptors of key points depend neither on scale nor on rotation.
 
-Out of focus, or moved during exposure, a photograph shows less of the same texture, and correlation and least
-squares matching find nothing alike: the sharper photograph is brought to the blur of the other. How much less
-texture there is needs no conjugate points: spectra of natural texture have
-one form, so that the ratio of those of two photographs of one object is that of their blurs.
+Blur: a photograph that is out of focus, or was moved during exposure, shows less of the texture, and the
+patches are no longer similar. The sharper photograph is therefore smoothed to the blur of the other. The
+difference of blur can be estimated without conjugate points. The spectra of natural texture all have the same
+shape, so the ratio of the spectra of two photographs of one object is the ratio of their blurs.
 """
 
 from __future__ import annotations
@@ -46,37 +46,38 @@ from sfm.matching.radiometry import averaged, grey_of, grey_of_8_bit
 from sfm.matching.tracks.features import match_features, sift_features
 
 TILE_PX = 128  # side of the squares whose spectra are averaged
-LOBE = 2  # frequencies on either side into which the window of a tile spreads each one
-NOISE_FREQUENCIES = 6  # the highest ones of a tile, in which photographs have noise only
-MIN_SIGNAL_TO_NOISE = 3.0  # of the power of a frequency that is compared
-MIN_FREQUENCIES = 4  # two parameters are fitted to them
-MIN_DEVIATE = 4.0  # of a difference of blur, in its standard deviations: neighbouring frequencies are alike
+LOBE = 2  # frequencies on either side over which the window of a tile spreads each frequency
+NOISE_FREQUENCIES = 6  # the highest frequencies of a tile, at which photographs contain only noise
+MIN_SIGNAL_TO_NOISE = 3.0  # of the power at a frequency that is compared
+MIN_FREQUENCIES = 4  # for the two parameters that are fitted
+MIN_DEVIATE = 4.0  # of a difference of blur, in standard deviations: neighbouring frequencies are correlated
 SHARP_PX = 0.7  # blur that leaves 9 % of the contrast at two pixels a cycle, and nearly nothing beyond
 MAX_TILES = 200  # spread over the photograph
 NEAR_KEY_POINTS = 12  # key points nearest to a point
 MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it
-FARTHEST_PX = 150.0  # of the third-nearest key point: farther away the surface is another one
-MARGIN_PX = 300.0  # around the points, in which key points are looked for
+FARTHEST_PX = 150.0  # of the third-nearest key point: farther away it may lie on another surface
+MARGIN_PX = 300.0  # around the points, within which key points are extracted
 MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
-LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
-GROSS_SPREADS = 3.0  # times the robust spread, beyond which a key point is on another map
-MAX_SPREAD_PX = 5.0  # of key points on one map: half of any set fit some map with their spread
+LOCALISATION_PX = 1.0  # smallest standard deviation of a key point
+GROSS_SPREADS = 3.0  # multiple of the robust spread beyond which a key point belongs to another map
+MAX_SPREAD_PX = 5.0  # of the key points of one map; with a large spread, half of any set fits some map
 MAX_FEATURES = 10_000
 TRIPLES = np.array(list(combinations(range(NEAR_KEY_POINTS), 3)))
-# Part of the squared extent of the key points that the triangle of a triple must have.
+# Smallest area of a triangle of key points, as a fraction of the squared extent of all of them.
 MIN_TRIANGLE_FRACTION = 1e-3
 # Correlation tolerates a rotation of 5 degrees and a scale of 7 % between template and photograph.
 ANGLES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
-SAME_PX = 5.0  # peaks of two shapes this near are one place
+SAME_PX = 5.0  # peaks of two shapes closer than this are the same position
 REACH_PX = 3  # of the match that follows
-OWN_PX = 500  # around a point, for others like it
-MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
-BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
-MIN_TEMPLATE_PX = 7  # smaller ones look like anything once they are turned and scaled
-REACH_SIGMAS = 3.0  # of the place that key points predict
+OWN_PX = 500  # around a point, within which similar patches are searched for
+MIN_CORRELATION = 0.7  # one patch then explains half of the variance of the other
+BACK_PX = 1.0  # a match whose way back ends farther than this from its start is another point
+MIN_TEMPLATE_PX = 7  # smaller templates match almost anything once they are rotated and scaled
+REACH_SIGMAS = 3.0  # of the position that key points predict
 MIN_REACH_PX = 4  # of that search
-# Reasons for a larger template, which shows more: a second place is as good, or there is hardly texture.
+# Reasons to try a larger template, which shows more: a second position is as good, or there is hardly any
+# texture.
 TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, LsmFlag.FLAT_TEXTURE))
 
 
@@ -98,36 +99,37 @@ def match_points(
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
 
-    Points that are not found in their search windows as they are, are looked for again (`wide`): where the
-    key points around them agree on an affine map to the right photograph, at the place and in the shape that
-    it says; else in their search windows turned by up to 30 degrees and scaled by up to 1.3. Those that are
-    ambiguous or without texture are looked for once more with templates twice as large.
+    A point that is not found upright in its search window is searched for again (`wide`). If the key points
+    around it agree on an affine map to the right photograph, the position and shape of that map are used.
+    Otherwise the template is rotated by up to 30 degrees and scaled by up to 1.3 within the search window.
+    Points that are ambiguous or have no texture are tried once more with templates twice as large.
 
-    Where one photograph is blurred more, the other is smoothed to it, and both are reduced until that blur is
-    one of a sharp photograph: templates and windows then have as many of the larger pixels.
+    If one photograph is more blurred, the other is smoothed to match it. Both are then reduced until that
+    blur is the blur of a sharp photograph. Templates and windows keep their number of pixels, but of the
+    larger pixels.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
-        xy_right: centres of the search windows, px, (k, 2); the same places as in the left if not given.
-            Where they are given, key points lead to no place outside the windows.
+        xy_right: centres of the search windows, px, (k, 2); by default the positions in the left photograph.
+            If they are given, positions predicted by key points must lie within the windows.
         method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
-        template_px: odd side of the template; document 002 has 19.
-        search_px: odd side of the search window; document 002 has 21.
+        template_px: odd side of the template; document 002 uses 19.
+        search_px: odd side of the search window; document 002 uses 21.
         equalise: equalise the histograms of both photographs before least squares matching.
         interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.two_photo.match_lsm`.
-        min_correlation: smallest r of a match. Least squares matching is started from 0.5 on, as the warp
-            makes patches more alike.
-        back_px: a point must lead back to within this of where it came from, px; None: it need not.
-        wide: look again for what is not found; without it photographs must be turned by less than 5 degrees
-            and of one scale to 10 %.
+        min_correlation: smallest r of a match. Least squares matching starts from r = 0.5 or more, since the
+            warp makes the patches more similar.
+        back_px: matching back must end within this distance of the start, px; None: no matching back.
+        wide: search again for points that are not found. Without it the photographs must be rotated by less
+            than 5 degrees and have the same scale within 10 %.
 
     Returns:
-        One result for each point.
+        One result per point.
 
     Raises:
-        GeometryError: unknown method, even windows, or points that do not go in pairs.
+        GeometryError: unknown method, even windows, or different numbers of left and right points.
 
     Source: document 002, sec. 2 (equations 2.1 to 2.20).
     """
@@ -160,16 +162,16 @@ def match_points(
 def _match_by_size(
     left: AnyArray, right: AnyArray, a: FloatArray, b: FloatArray, by: Settings, *, given: bool, wide: bool
 ) -> ConjugatePoints:
-    """Match points with templates as asked for, and larger ones where these show too little.
+    """Match points with templates of the requested size, and with larger ones where these show too little.
 
     Args:
         left: the left photograph.
         right: the right photograph.
         a: points in the left photograph, px, (k, 2).
         b: centres of the search windows, px, (k, 2).
-        by: how points are matched.
-        given: whether the centres are known, and not those of the left photograph.
-        wide: whether what is not found is looked for turned, scaled, and with larger templates.
+        by: matching settings.
+        given: whether the caller gave the centres; if not, they are the positions in the left photograph.
+        wide: whether points not found are tried again, rotated, scaled, and with larger templates.
     """
     if not wide:
         return confirmed(left, right, match_upright(left, right, a, b, by), by)
@@ -196,16 +198,16 @@ def _match(
     *,
     given: bool,
 ) -> ConjugatePoints:
-    """Match points with templates of one size: upright, led by key points, or turned.
+    """Match points with templates of one size: upright, then as key points predict or rotated.
 
     Args:
         left: the left photograph.
         right: the right photograph.
         a: points in the left photograph, px, (k, 2).
         b: centres of the search windows, px, (k, 2).
-        by: how points are matched.
-        maps: where key points lead.
-        given: whether the centres are known, and not those of the left photograph.
+        by: matching settings.
+        maps: positions and shapes that the key points predict.
+        given: whether the caller gave the centres; if not, they are the positions in the left photograph.
     """
     matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
     lost = np.array([bool(why) and "left photograph" not in why for why in matched.reason], dtype=bool)
@@ -234,20 +236,19 @@ def match_turned(
     *,
     given: bool,
 ) -> ConjugatePoints:
-    """Match points whose templates are turned by up to 30 degrees and scaled by up to 1.3 in the right.
+    """Match points whose templates appear rotated by up to 30 degrees and scaled by up to 1.3 on the right.
 
-    The two best places of all shapes are matched, and the better one is taken where it is better by more than
-    chance: a template in steps of 10 degrees is not alike enough to decide beforehand.
+    The best two positions of all shapes are matched. The better one is accepted if it is better by more than
+    chance. With steps of 10 degrees the templates are not similar enough to decide before matching.
 
     Args:
         left: the left photograph.
         right: the right photograph.
         xy_left: points in the left photograph, px, (k, 2).
         xy_right: centres of the search windows, px, (k, 2).
-        by: how points are matched.
-        given: whether the centres are known. Where they are not, the place may be outside of its window, and
-            what is in the window another one like it: then the template must be the only one of its kind in
-            the left photograph, as far as OWN_PX.
+        by: matching settings.
+        given: whether the centres are known. If not, the point may lie outside its window, and the window may
+            contain a similar patch. The template must then be unique in the left photograph within OWN_PX.
     """
     best, rival, second = _starts(left, right, xy_left, xy_right, by)
     one, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
@@ -275,7 +276,7 @@ def match_turned(
 def _starts(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
 ) -> tuple[Starts, Starts, FloatArray]:
-    """Return the best place of all shapes, the best one elsewhere, and the second r of that best shape."""
+    """Return the best position of all shapes, the best one elsewhere, and the second r of that best shape."""
     grey_left, grey_right = grey_of_8_bit(left), grey_of_8_bit(right)
     shapes, peaks, r, second = [], [], [], []
     for angle in np.radians(ANGLES_DEG):
@@ -309,31 +310,31 @@ def _starts(
 
 @dataclass(frozen=True)
 class LocalAffinities:
-    """Where points are in the other photograph, and how it is turned and scaled there; NaN if unknown."""
+    """Positions of points in the other photograph, and their rotation and scale there; NaN if unknown."""
 
-    xy: FloatArray  # place in the right photograph, px, (k, 2)
+    xy: FloatArray  # position in the right photograph, px, (k, 2)
     linear: FloatArray  # right px per left px, (k, 2, 2)
-    spread_px: FloatArray  # standard deviation of the place along an axis, right px, (k,)
+    spread_px: FloatArray  # standard deviation of the position along an axis, right px, (k,)
 
     def rows(self, some: IntArray) -> LocalAffinities:
-        """Return those of some points."""
+        """Return the entries of some points."""
         return LocalAffinities(self.xy[some], self.linear[some], self.spread_px[some])
 
 
 def local_affinities(
     left: AnyArray, right: AnyArray, xy: FloatArray, *, max_features: int = MAX_FEATURES, seed: int = 0
 ) -> LocalAffinities:
-    """Return the affine maps around points that the key points near them agree on.
+    """Return the affine map around each point on which the key points near it agree.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy: points in the left photograph, px, (k, 2).
-        max_features: of each photograph, the strongest ones.
-        seed: of the random samples of the epipolar geometry.
+        max_features: largest number of key points per photograph; the strongest are kept.
+        seed: seed of the random samples for the epipolar geometry.
 
     Source: Lowe (2004), IJCV 60(2), for the key points; Rousseeuw (1984), J. Am. Stat. Assoc. 79, for the
-    least median of squares over all triples of the nearest ones.
+    least median of squares over all triples of the nearest key points.
     """
     at = np.asarray(xy, dtype=float).reshape(-1, 2)
     if not len(at):
@@ -347,32 +348,32 @@ def local_affinities(
 
 
 def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArray) -> LocalAffinities:
-    """Return the affine maps of conjugate key points, px, (m, 2) each, around points, px, (k, 2)."""
+    """Return the affine maps around points, px, (k, 2), from conjugate key points, px, (m, 2) each."""
     at = np.asarray(xy, dtype=float).reshape(-1, 2)
     found = LocalAffinities(
         np.full((len(at), 2), np.nan), np.full((len(at), 2, 2), np.nan), np.full(len(at), np.nan)
     )
     if len(key_left) < NEAR_KEY_POINTS:
         return found
-    for k, place in enumerate(at):
-        if not np.isfinite(place).all():
+    for k, point in enumerate(at):
+        if not np.isfinite(point).all():
             continue
-        distance = np.linalg.norm(key_left - place, axis=1)
+        distance = np.linalg.norm(key_left - point, axis=1)
         near = np.argpartition(distance, NEAR_KEY_POINTS - 1)[:NEAR_KEY_POINTS]
         if np.sort(distance[near])[2] > FARTHEST_PX:
             continue
-        one = _agreed_map(key_left[near] - place, key_right[near])
+        one = _agreed_map(key_left[near] - point, key_right[near])
         if one is not None:
             found.linear[k], found.xy[k], found.spread_px[k] = one[0], one[1], one[2]
     return found
 
 
 def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return linear part, place of the zero offset and its standard deviation, px; None if too few agree.
+    """Return linear part, position of the point and its standard deviation, px; None if too few agree.
 
     Args:
-        offset: of the key points from the point, left px, (NEAR_KEY_POINTS, 2).
-        target: their places in the right photograph, px, (NEAR_KEY_POINTS, 2).
+        offset: key points minus the point, left px, (NEAR_KEY_POINTS, 2).
+        target: positions of the key points in the right photograph, px, (NEAR_KEY_POINTS, 2).
     """
     full = np.column_stack([offset, np.ones(len(offset))])  # (n, 3)
     area = np.abs(np.linalg.det(full[TRIPLES]))
@@ -388,7 +389,7 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
     agree = off[best] <= GROSS_SPREADS * spread
     if agree.sum() < MIN_AGREEING:
         return None
-    # near ones predict the place better than far ones, as the surface is curved
+    # near key points predict the position better than far ones, since the surface is curved
     length = np.linalg.norm(offset[agree], axis=1)
     weight = 1.0 / (1.0 + (length / max(float(np.median(length)), 1.0)) ** 2)
     N = full[agree].T @ (weight[:, None] * full[agree])
@@ -407,31 +408,31 @@ def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
 
 @dataclass(frozen=True)
 class EquallyBlurred:
-    """Two photographs of one blur, in pixels that are as large as it allows."""
+    """Two photographs of equal blur, with pixels as large as the blur allows."""
 
     left: AnyArray
     right: AnyArray
-    shrink: int  # px of the photographs that were given along the side of a pixel of these
+    shrink: int  # side of one of these pixels, px of the photographs that were given
 
     def small(self, xy: FloatArray) -> FloatArray:
-        """Return places in these photographs from those in the ones given, px, (k, 2)."""
+        """Convert positions in the given photographs to positions in these, px, (k, 2)."""
         return (xy + 0.5) / self.shrink - 0.5
 
     def full(self, xy: FloatArray) -> FloatArray:
-        """Return places in the photographs given from those in these, px, (k, 2)."""
+        """Convert positions in these photographs to positions in the given ones, px, (k, 2)."""
         return self.shrink * (xy + 0.5) - 0.5
 
 
 def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
     """Return both photographs with the blur of the less sharp one.
 
-    The sharper one is smoothed by a Gaussian. Both are then averaged over squares for which that blur is one
-    of SHARP_PX: a window contains as much texture as one of a sharp photograph, and its noise is that of
-    pixels that have none in common.
+    The sharper one is smoothed by a Gaussian. Both are then averaged over squares, so large that the blur
+    becomes SHARP_PX. A window then contains as much texture as a window of a sharp photograph. Its noise is
+    the noise of pixels without overlap.
 
     Args:
-        left: photograph, (H, W) or (H, W, 3), 8 or 16 bit or float, of an object.
-        right: another one of it.
+        left: photograph of an object, (H, W) or (H, W, 3), 8 or 16 bit or float.
+        right: another photograph of the same object.
     """
     more = difference_of_blur(left, right)
     sigma = float(np.sqrt(abs(more)))
@@ -444,12 +445,13 @@ def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
 
 
 def difference_of_blur(left: AnyArray, right: AnyArray) -> float:
-    """Return by how much the variance of the point spread is larger in the right photograph, px^2.
+    """Return the difference of the variances of the point spread, right minus left, px^2.
 
-    0 where the spectra do not differ by more than chance, or noise hides them. Blur is counted in the pixels
-    of each photograph: of photographs in different scale those of the same lens count as equal.
+    The result is 0 if the spectra differ by no more than chance, or if noise hides them. Blur is measured in
+    the pixels of each photograph: two photographs of different scale, taken with the same lens, are equally
+    blurred.
 
-    Source: the Gaussian as in Pentland (1987), A new sense for depth of field, IEEE Trans. PAMI 9(4): the
+    Source: the Gaussian model of Pentland (1987), A new sense for depth of field, IEEE Trans. PAMI 9(4). The
     logarithm of the ratio of two power spectra is linear in the squared frequency, and its slope is the
     difference of the variances.
     """
@@ -476,7 +478,7 @@ def difference_of_blur(left: AnyArray, right: AnyArray) -> float:
 
 
 def _power_spectrum(grey: AnyArray) -> FloatArray:
-    """Return the mean power of a photograph at 1, 2 ... cycles a tile, without direction, (n,)."""
+    """Return the mean power of a photograph at 1, 2 ... cycles per tile, averaged over directions, (n,)."""
     side = min(TILE_PX, *grey.shape)
     side -= side % 2
     taper = np.hanning(side + 2)[1:-1].astype(np.float32)

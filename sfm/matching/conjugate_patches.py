@@ -1,7 +1,8 @@
-"""Points of one photograph matched in another from a start: correlation to a pixel, then least squares.
+"""Match points in two photographs from approximate positions: correlation, then least squares matching.
 
-With `equalise` the histograms of both photographs are equalised in between, which is the order of document
-002; it helps the eye more than the matching, which estimates gain and offset itself.
+Correlation finds the position to one pixel, and least squares matching refines it. With `equalise` the
+histograms of both photographs are equalised between the two steps, which is the order in document 002. This
+helps the eye more than the matching, which estimates gain and offset itself.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import equalise_histogram, grey_of
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
-MAX_BIAS_PX = 1.0  # of a match whose template is bent
+MAX_BIAS_PX = 1.0  # of a match whose surface is curved
 NOT_PLANE = "surface not plane over the template"
-START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make alike
+START_CORRELATION = 0.5  # smallest r at the start, before the warp makes the patches similar
 
 
 @dataclass(frozen=True)
 class ConjugatePoints:
-    """Points of the left photograph and where they are in the right one; NaN where there is a reason."""
+    """Points of the left photograph and their positions in the right one; NaN where a reason is given."""
 
     method: str  # ncc | lsm | lsm8 | shift
     left: FloatArray  # px, (k, 2)
@@ -45,7 +46,7 @@ class ConjugatePoints:
     covariance: FloatArray  # of `right`, px^2, (k, 2, 2)
     warp: FloatArray  # right px from left px relative to the left point, homogeneous, (k, 3, 3)
     correlation: FloatArray  # r of the template and the matched patch, (k,)
-    second: FloatArray  # r of the second-best place of the search window, (k,)
+    second: FloatArray  # r of the second-best position in the search window, (k,)
     gain: FloatArray  # right intensities per left one, (k,)
     offset: FloatArray  # right intensity units, (k,)
     steps: IntArray  # Gauss-Newton steps, 0 for correlation, (k,)
@@ -65,11 +66,11 @@ class ConjugatePoints:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
     def rows(self, some: BoolArray) -> ConjugatePoints:
-        """Return the marked points only, (k,)."""
+        """Return only the points marked in `some`, (k,)."""
         return self._changed(lambda column: column[some])
 
     def with_rows(self, rows: IntArray, others: ConjugatePoints) -> ConjugatePoints:
-        """Return the points with those of some numbers replaced by others, in order."""
+        """Return the points with the given rows replaced by those of `others`, in order."""
 
         def put(column: AnyArray, new: AnyArray) -> AnyArray:
             column[rows] = new
@@ -78,7 +79,7 @@ class ConjugatePoints:
         return self._changed(put, others)
 
     def _changed(self, change: Callable[..., AnyArray], *others: ConjugatePoints) -> ConjugatePoints:
-        """Return the points with all columns changed by a function of a copy and of those of others."""
+        """Return the points with each column changed by a function of its copy and of the others' columns."""
         columns: dict[str, Any] = {"method": self.method}
         for field in fields(self):
             parts = [getattr(one, field.name) for one in (self, *others)]
@@ -92,7 +93,7 @@ class ConjugatePoints:
 
 @dataclass(frozen=True)
 class Settings:
-    """How points are matched; see `sfm.matching.conjugate.match_points`."""
+    """Matching settings; see `sfm.matching.conjugate.match_points`."""
 
     method: str
     template_px: int
@@ -104,12 +105,12 @@ class Settings:
 
     @property
     def reach_px(self) -> int:
-        """How far the template moves in the search window along a row and a column, px."""
+        """Distance that the template moves in the search window along rows and columns, px."""
         return (self.search_px - self.template_px) // 2
 
     @property
     def start_correlation(self) -> float:
-        """Smallest r of a place that is matched, or is a start for least squares matching."""
+        """Smallest r of a match, or of a start for least squares matching."""
         if self.method == "ncc":
             return self.min_correlation
         return min(self.min_correlation, START_CORRELATION)
@@ -117,17 +118,17 @@ class Settings:
 
 @dataclass(frozen=True)
 class Starts:
-    """Where points are expected in the right photograph, and in which shape."""
+    """Predicted positions of points in the right photograph, and their shape there."""
 
     xy: FloatArray  # px, NaN where unknown, (k, 2)
     linear: FloatArray  # right px per left px, (k, 2, 2)
-    reach_px: IntArray  # how far from there they may be along a row and a column, left px, (k,)
+    reach_px: IntArray  # largest distance from the prediction along a row and a column, left px, (k,)
 
 
 def match_upright(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
 ) -> ConjugatePoints:
-    """Match points whose templates look in the right photograph as they are, px, (k, 2) each."""
+    """Match points, px, (k, 2), whose templates are neither rotated nor scaled on the right."""
     found = match_ncc(
         left,
         right,
@@ -143,7 +144,7 @@ def match_upright(
 def match_warped(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, start: Starts, by: Settings
 ) -> ConjugatePoints:
-    """Match points, px, (k, 2), whose templates are turned, scaled and sheared in the right photograph."""
+    """Match points, px, (k, 2), whose templates are rotated, scaled and sheared in the right photograph."""
     found = match_ncc_warped(
         left,
         right,
@@ -164,18 +165,20 @@ def confirmed(
     by: Settings,
     reach_px: IntArray | None = None,
 ) -> ConjugatePoints:
-    """Return the matches, those flagged that do not lead back to within `back_px`.
+    """Return the matches, with a flag on those that do not lead back to within `back_px`.
 
-    By how much the others lead elsewhere, where it is more than noise, goes into their covariance: what one
-    photograph sees steeply the other one sees with windows that show less of the surface.
+    If an unflagged match leads back to a position that differs by more than noise, the difference is added to
+    its covariance. Where one photograph sees a surface obliquely, the windows of the other show less of the
+    surface.
 
     Args:
         left: the left photograph.
         right: the right photograph.
-        matched: points of the left found in the right one.
-        by: how.
-        reach_px: how far around the left point the way back may end, with the warp that was found turned
-            round, left px, (k,); upright templates in the whole search window if not given.
+        matched: points of the left photograph found in the right one.
+        by: matching settings.
+        reach_px: how far from the left point the way back may end, left px, (k,). The template is then warped
+            with the inverse of the warp found. By default templates are upright and use the whole search
+            window.
     """
     good = np.flatnonzero(matched.good)
     if by.back_px is None or not len(good):
@@ -208,8 +211,8 @@ def confirmed(
 def _finished(
     left: AnyArray, right: AnyArray, a: FloatArray, found: NccMatches, linear: FloatArray, by: Settings
 ) -> ConjugatePoints:
-    """Return correlation's places as they are, or as starts of least squares matching."""
-    # A peak at the border of the search window is a start like any other: least squares may walk out of it.
+    """Return the positions found by correlation, or refine them by least squares matching."""
+    # A peak at the border of the search window is a valid start: least squares matching may leave the window.
     started = found.good | (found.flag == int(NccFlag.AT_BORDER))
     pixels = independent_pixels(grey_of(left), a, by.template_px)
     doubt = started & ambiguous(found.correlation, found.second, pixels)
@@ -267,13 +270,13 @@ def _finished(
 def _what_is_outside(
     photograph: AnyArray, xy: FloatArray, half: int, *, kernel: bool = False
 ) -> tuple[str, ...]:
-    """Return in words what of the left points is outside their photograph, empty where nothing is.
+    """Return in words what part of each left point lies outside its photograph, empty where none does.
 
     Args:
         photograph: the left photograph.
         xy: the points, px, (k, 2).
         half: half the side of the template, px.
-        kernel: whether the margin counts that least squares matching needs around the template.
+        kernel: whether to include the margin around the template that least squares matching needs.
     """
     size = np.array(photograph.shape[1::-1])
     reach = half + MARGIN if kernel else half

@@ -1,9 +1,10 @@
-"""Normalised cross-correlation: the best place of a template, its precision and its rivals.
+"""Normalised cross-correlation: the best position of a template, its precision and its rivals.
 
-The coefficient r is that of equation (2.6) of document 002; cv2.matchTemplate does the sums. The peak is
-refined by a parabola, which is good to a tenth of a pixel where the patches differ by a shift only. The sigma
-includes the misfit of the parabola: errors are 0.5 to 1.9 times as large on the textures tried, 2.6 times on
-a smooth one without noise at whole pixels, as nine values do not show the third powers.
+The coefficient r is equation (2.6) of document 002; cv2.matchTemplate computes the sums. A parabola refines
+the peak to a tenth of a pixel if the patches differ only by a shift. The standard deviation includes the
+misfit of the parabola. On the textures tried, the errors were 0.5 to 1.9 times as large as it. On a smooth
+texture without noise they were 2.6 times as large at whole pixels, because nine values do not show the
+third-order terms.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
 
 class NccFlag(IntFlag):
-    """Why correlation gives no position, one bit each."""
+    """Reasons why correlation gives no position, one bit each."""
 
     NONE = 0
     FLAT_TEXTURE = 1 << 0  # template or search window without contrast
-    OUTSIDE = 1 << 2  # the template reaches beyond its photograph, or the search window beyond the other
-    AT_BORDER = 1 << 3  # the best place is at the border of the search window: it may lie outside
-    LOW_CORRELATION = 1 << 4  # nothing alike in the search window
-    AMBIGUOUS = 1 << 5  # the second-best place is nearly as good
+    OUTSIDE = 1 << 2  # the template or the search window reaches beyond its photograph
+    AT_BORDER = 1 << 3  # the best position is at the border of the search window; the true one may be outside
+    LOW_CORRELATION = 1 << 4  # nothing similar in the search window
+    AMBIGUOUS = 1 << 5  # the second-best position is nearly as good
     NOT_CONFIRMED = 1 << 6  # matching back leads elsewhere
 
 
-# The same for compiled code, which knows no enumerations.
+# The same flags as numbers, because compiled code cannot use enumerations.
 MATCHED, FLAT_TEXTURE, DIVERGED, OUTSIDE, TOO_FAR, LOW_CORRELATION = (int(f) for f in (0, 1, 2, 4, 8, 16))
-PEAK_ZONE = 2  # a second peak is at least this many pixels farther from the first in a row or column, px
-# Columns of what is read from a surface: x and y in it with their covariances, r, second r, gain, offset.
+PEAK_ZONE = 2  # a second peak is farther than this from the first in a row or column, px
+# Columns of the values read from a surface: x and y in it with their covariances, r, second r, gain, offset.
 OUTPUTS = 10
 FLAG, X, Y, CXX, CXY, CYY, R, SECOND, GAIN, OFFSET = range(OUTPUTS)
 NOT_COMPARED = np.array([int(NccFlag.OUTSIDE)] + [np.nan] * (OUTPUTS - 1))
@@ -46,19 +47,19 @@ FLAT, BORDER, LOW, DOUBT = (
 )
 QUANTILE = 1.645  # of the normal distribution, one-sided, 5 %
 MAX_R = 1.0 - 1e-12  # above it Fisher's z is infinite
-# Standard deviation below which a template is flat, part of the full scale of 8 bit (of 16 bit alike).
+# Standard deviation below which a template is flat, as a fraction of the full scale (8 and 16 bit).
 MIN_CONTRAST = 1.0 / 255.0
 
 
 @dataclass(frozen=True)
 class NccMatches:
-    """Best places of templates in their search windows; NaN in `xy` where the flag gives the reason."""
+    """Best positions of templates in their search windows; `xy` is NaN where the flag gives the reason."""
 
-    xy: FloatArray  # place in the right photograph, px, (k, 2)
-    peak: FloatArray  # best place to a whole pixel, whatever the flag, px, (k, 2)
-    covariance: FloatArray  # of xy, from r, its curvature and what the parabola misses, px^2, (k, 2, 2)
+    xy: FloatArray  # position in the right photograph, px, (k, 2)
+    peak: FloatArray  # best position to a whole pixel, for any flag, px, (k, 2)
+    covariance: FloatArray  # of xy, from r, its curvature and the misfit of the parabola, px^2, (k, 2, 2)
     correlation: FloatArray  # r at the best whole pixel, (k,)
-    second: FloatArray  # r of the second-best peak, -1 where there is none, (k,)
+    second: FloatArray  # r of the second-best peak, -1 if there is none, (k,)
     gain: FloatArray  # beta of right = alpha + beta left, (k,)
     offset: FloatArray  # alpha, right intensity units, (k,)
     flag: IntArray  # see NccFlag, 0 = matched, (k,)
@@ -85,23 +86,23 @@ def match_ncc(
     max_second: float = 1.0,
     back_px: float | None = None,
 ) -> NccMatches:
-    """Look for the surroundings of points of the left photograph in windows of the right one.
+    """Search windows of the right photograph for the patches around points of the left one.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
-        xy_left: points in the left photograph, px, (k, 2); the template is centred at the nearest pixel, and
+        xy_left: points in the left photograph, px, (k, 2). The template is centred on the nearest pixel, and
             the fraction is added to the result.
         xy_right: centres of the search windows, px, (k, 2).
         template_px: odd side of the template.
-        search_px: odd side of the window in which the whole template moves. It is cut at the border of the
-            photograph.
+        search_px: odd side of the window within which the whole template moves. It is clipped at the border
+            of the photograph.
         min_correlation: smallest r of a match.
         max_second: largest ratio of the second-best r to the best.
-        back_px: if given, the place found must lead back to within this of the left point.
+        back_px: if given, matching back must end within this distance of the left point, px.
 
     Returns:
-        One result for each point.
+        One result per point.
 
     Raises:
         GeometryError: even windows, a search window not larger than the template, or unpaired points.
@@ -112,7 +113,7 @@ def match_ncc(
     side = odd_window("NCC template", template_px)
     if odd_window("NCC search", search_px) <= side:
         raise GeometryError(
-            f"NCC: a search window of {search_px} px for a template of {side} px, it must be larger"
+            f"NCC: a search window of {search_px} px for a template of {side} px, needed a larger window"
         )
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = np.asarray(xy_right, dtype=float).reshape(-1, 2)
@@ -139,7 +140,7 @@ def match_ncc(
 
 
 def matches_of(out: FloatArray, origin: FloatArray | IntArray, xy_left: FloatArray, half: int) -> NccMatches:
-    """Return what was read from surfaces of r, (k, OUTPUTS); their windows begin at `origin`, px, (k, 2)."""
+    """Return the matches from values read from surfaces of r, (k, OUTPUTS); windows begin at `origin`, px."""
     fraction = xy_left - np.rint(xy_left)
     xy = origin + out[:, [X, Y]] + half + fraction
     peak = np.rint(xy - fraction) + fraction
@@ -152,14 +153,14 @@ def matches_of(out: FloatArray, origin: FloatArray | IntArray, xy_left: FloatArr
 
 
 def least_deviations(left: AnyArray, right: AnyArray) -> tuple[float, float]:
-    """Return the standard deviations of intensities below which a template, and a window, are flat."""
+    """Return the standard deviations of intensities below which a template and a window are flat."""
     return MIN_CONTRAST * full_scale(left), MIN_CONTRAST * full_scale(right)
 
 
 def _corners(
     a: FloatArray, b: FloatArray, half: int, reach: int, left: tuple[int, ...], right: tuple[int, ...]
 ) -> AnyArray:
-    """Return corner of each template (-1: outside), first and last corner of each search window, (k, 6)."""
+    """Return the corner of each template (-1: outside), and both corners of each search window, (k, 6)."""
     to, size_right = np.nan_to_num(np.rint(b), nan=-1e6), np.array(right[1::-1])
     low = np.clip(to - reach, 0, size_right)
     high = np.clip(to + reach + 1, 0, size_right)
@@ -167,7 +168,7 @@ def _corners(
 
 
 def template_corners(a: FloatArray, half: int, shape: tuple[int, ...]) -> IntArray:
-    """Return the first column and row of the template at each point, -1 where it reaches outside, (k, 2)."""
+    """Return first column and row of the template at each point, -1 if it reaches outside, (k, 2)."""
     at = np.nan_to_num(np.rint(a), nan=-1e6)
     outside = np.asarray(((at < half) | (at > np.array(shape[1::-1]) - 1 - half)).any(axis=1))
     return np.asarray(np.where(outside[:, None], -1, at - half), dtype=np.int64)
@@ -176,7 +177,7 @@ def template_corners(a: FloatArray, half: int, shape: tuple[int, ...]) -> IntArr
 def _confirm(
     left: AnyArray, right: AnyArray, a: FloatArray, matches: NccMatches, side: int, search: int, limit: float
 ) -> NccMatches:
-    """Match back from right to left and flag what does not return."""
+    """Match back from right to left, and flag the matches that do not return."""
     good = np.flatnonzero(matches.good)
     back = match_ncc(right, left, matches.xy[good], a[good], template_px=side, search_px=search)
     lost = good[~(np.linalg.norm(back.xy - a[good], axis=1) <= limit)]
@@ -187,15 +188,16 @@ def _confirm(
 
 
 def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolArray:
-    """Return whether the second-best place may be as good as the best.
+    """Return whether the second-best position may be as good as the best.
 
-    The difference of their Fisher's z is compared with its standard error, that of independent coefficients
-    of so many pixels. Of 3 independent pixels or less nothing can be concluded, and any second place counts.
+    The difference of their Fisher's z is compared with its standard error. This is the standard error for
+    independent coefficients of that number of pixels. With 3 independent pixels or fewer nothing can be
+    concluded, and any second position makes the match ambiguous.
 
     Args:
-        best: coefficients r of the best places, (k,).
-        second: those of the second-best places, -1 where there is none, (k,).
-        pixels: pixels of the template that are independent of one another, (k,).
+        best: coefficients r of the best positions, (k,).
+        second: coefficients r of the second-best positions, -1 if there is none, (k,).
+        pixels: number of independent pixels in the template, (k,).
 
     Source: Fisher (1921), Metron 1, pp. 3-32.
     """
@@ -205,7 +207,7 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
 
 
 def independent_pixels(grey: AnyArray, xy: FloatArray, template_px: int) -> FloatArray:
-    """Return how many independent pixels are worth as much as a template, whose neighbours are alike, (k,).
+    """Return the number of independent pixels equivalent to a template with correlated neighbours, (k,).
 
     Args:
         grey: photograph, one channel, (H, W).
@@ -213,10 +215,10 @@ def independent_pixels(grey: AnyArray, xy: FloatArray, template_px: int) -> Floa
         template_px: odd side of the templates.
 
     Source: Clifford, Richardson and Hemon (1989), Biometrics 45, pp. 123-134: 1 + n over the sum of the
-    squared autocorrelations. Those estimated from one template have noise, which makes the number up to a
-    half too small, and the test the more cautious, where neighbours are not alike at all.
+    squared autocorrelations. Autocorrelations estimated from one template are noisy. If neighbouring pixels
+    are uncorrelated, the number is therefore up to a half too small, and the test is more cautious.
     """
-    wide = 2 * template_px  # of the transform, so that the template does not meet itself around the border
+    wide = 2 * template_px  # of the transform, so that the template does not overlap itself across the border
     out = np.full(len(xy), np.nan)
     for k, (x, y) in enumerate(template_corners(xy, template_px // 2, grey.shape).tolist()):
         if x < 0:
@@ -241,10 +243,10 @@ def read_peak(
     max_second: float,
     out: FloatArray,
 ) -> None:
-    """Fill best and second-best peak of a surface of r, its parabola and the regression of intensities.
+    """Find best and second-best peak of a surface of r, fit the parabola and the regression of intensities.
 
     Args:
-        template: intensities, float32, (s, s); contiguous, as all of these: there is one compiled form.
+        template: intensities, float32, (s, s). All arrays are contiguous: only one form is compiled.
         window: intensities of the search window, float32, (H, W).
         surface: r where a match is allowed, else -1, float32, (H - s + 1, W - s + 1).
         whole: r everywhere, for the parabola; same shape.
@@ -256,7 +258,7 @@ def read_peak(
     rows, cols = surface.shape
     side = template.shape[0]
     n = side * side
-    highest = np.empty(rows, np.float32)  # of each row: most rows need no second look
+    highest = np.empty(rows, np.float32)  # of each row, so that most rows are not searched for a second peak
     bi, bj = 0, 0
     for i in range(rows):
         highest[i] = _largest(surface[i])
@@ -264,7 +266,7 @@ def read_peak(
             bi = i
     while bj < cols - 1 and surface[bi, bj] < highest[bi]:
         bj += 1
-    # the sums of cv2 are in float32: the best place in double precision
+    # cv2 sums in float32: compute r at the best position again in double precision
     tm, wm = 0.0, 0.0
     for i in range(side):
         for j in range(side):
@@ -292,7 +294,7 @@ def read_peak(
             r2 = surface[i, j]
             if r2 <= second or (abs(i - bi) <= PEAK_ZONE and abs(j - bj) <= PEAK_ZONE):
                 continue
-            top = True  # of its neighbours, or it is only the slope of a peak
+            top = True  # a peak is higher than its neighbours, unlike a slope
             for u in range(max(0, i - 1), min(rows, i + 2)):
                 for v in range(max(0, j - 1), min(cols, j + 2)):
                     top = top and surface[u, v] <= r2
@@ -307,7 +309,7 @@ def read_peak(
         out[FLAG] = DOUBT
     if out[FLAG] != 0:
         return
-    # least squares parabola through the nine coefficients around the peak (their weights in closed form)
+    # least squares parabola through the nine coefficients around the peak (weights in closed form)
     gx, gy, hxx, hyy, hxy = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
@@ -326,7 +328,8 @@ def read_peak(
     out[Y] += min(1.0, max(-1.0, dy))
     # least squares of the shift has N = sum g g^T = -r'' sum f^2 / r, sigma^2 = (1 - r^2) sum f^2 / (n - 4)
     c = (1.0 - r * r) * r / (n - 4) / det
-    # r is no parabola: what the nine coefficients miss it by, of 9 - 6 degrees of freedom, is in the gradient
+    # r is not a parabola: the misfit of the nine coefficients, with 9 - 6 degrees of freedom, adds to the
+    # gradient
     mean = 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
@@ -363,24 +366,24 @@ def match_ncc_warped(
     min_correlation: float = 0.5,
     max_second: float = 1.0,
 ) -> NccMatches:
-    """Look for templates in windows of the right photograph that are resampled by an affine map each.
+    """Search windows of the right photograph, each resampled by an affine map, for templates.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
-        xy_right: where they are expected in the right one, px, (k, 2).
+        xy_right: their predicted positions in the right photograph, px, (k, 2).
         linear: right px per left px around each point, (k, 2, 2).
-        reach_px: how far from there they may be along a row and a column, left px, (k,).
+        reach_px: largest distance from the prediction along a row and a column, left px, (k,).
         template_px: odd side of the template.
         min_correlation: smallest r of a match.
         max_second: largest ratio of the second-best r to the best.
 
     Returns:
-        One result for each point, places and covariances in the right photograph.
+        One result per point, with positions and covariances in the right photograph.
 
     Raises:
-        GeometryError: an even template, no reach, or points that do not go in threes with place and map.
+        GeometryError: an even template, no reach, or different numbers of points, positions and maps.
 
     Source: as `match_ncc`; the window is resampled by bilinear interpolation.
     """
@@ -391,9 +394,8 @@ def match_ncc_warped(
         raise GeometryError(f"NCC: a reach of {reach_px.min()} px, needed at least 1 px")
     if len(a) != len(b) or A.shape != (len(a), 2, 2):
         raise GeometryError(
-            f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(b), 'place')} in the "
-            "right and maps of shape "
-            f"{A.shape}, needed one of each for every point"
+            f"NCC: {counted(len(a), 'point')} in the left photograph, {counted(len(b), 'position')} in the "
+            f"right one and maps of shape {A.shape}, needed one position and one map for each point"
         )
     grey_left, grey_right = grey_of(left), grey_of(right)
     least = least_deviations(left, right)
@@ -409,7 +411,7 @@ def match_ncc_warped(
             out[k] = NOT_COMPARED
             continue
         x, y = corners[k].tolist()
-        first = b[k] - A[k] @ (fraction[k] + half + reach)  # where the window's first pixel comes from
+        first = b[k] - A[k] @ (fraction[k] + half + reach)  # position of the window's first pixel
         window = cv2.warpAffine(
             grey_right,
             np.column_stack([A[k], first]),
@@ -417,11 +419,11 @@ def match_ncc_warped(
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])  # as windows are
+        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])  # like the windows
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         allowed = np.where(inside, surface, np.float32(-1.0))
         read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
-    around = np.repeat(-(half + reach_px)[:, None], 2, axis=1)  # of the windows, as seen from their middles
+    around = np.repeat(-(half + reach_px)[:, None], 2, axis=1)  # window corners, from their centres
     matches = matches_of(out, around, np.zeros_like(a), half)
     return replace(
         matches,
@@ -434,7 +436,7 @@ def match_ncc_warped(
 def _inside(
     A: FloatArray, b: FloatArray, fraction: FloatArray, half: int, reach: int, shape: tuple[int, ...]
 ) -> BoolArray:
-    """Return at which places of the window the whole template is inside the right photograph, (n, n)."""
+    """Return at which positions in the window the whole template is inside the right photograph, (n, n)."""
     at = np.arange(-reach, reach + 1.0)
     x, y = at[None, :] - fraction[0], at[:, None] - fraction[1]
     inside = np.ones((len(at), len(at)), dtype=bool)
@@ -447,18 +449,18 @@ def _inside(
 
 
 class LsmFlag(IntFlag):
-    """Why least squares matching gives no position, one bit each."""
+    """Reasons why least squares matching gives no position, one bit each."""
 
     NONE = 0
     FLAT_TEXTURE = 1 << 0  # in some direction no more texture than noise
-    DIVERGED = 1 << 1  # no solution within the steps allowed, or a patch turned inside out
+    DIVERGED = 1 << 1  # no solution within the steps allowed, or a degenerate warp or gain
     OUTSIDE = 1 << 2  # the window, or the margin of its kernel, reaches beyond a photograph
     TOO_FAR = 1 << 3  # farther from the start than allowed
-    LOW_CORRELATION = 1 << 4  # converged on something that is not alike
+    LOW_CORRELATION = 1 << 4  # converged, but the patches are not similar
 
 
 def in_words(kind: type[LsmFlag] | type[NccFlag], flag: int) -> str:
-    """Return the names of the flags set, in words; empty where none is."""
+    """Return the names of the flags that are set, in words; empty if none is."""
     return ", ".join(
         str(one.name).lower().replace("_", " ") for one in kind if one.value and flag & one.value
     )

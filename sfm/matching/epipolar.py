@@ -1,4 +1,4 @@
-"""Epipolar geometry of two oriented photographs, in images free of distortion."""
+"""Epipolar geometry of two oriented photographs: essential matrices, and the epipolar lines of points."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from sfm.conventions import FloatArray, IntArray, skew
 from sfm.kernels.compiling import compiled
 from sfm.network import Estimate
 
-VERTICES = 65  # of a path; between them distortion bends it by less than 0.1 px on ordinary lenses
+VERTICES = 65  # of a path; between two of them ordinary distortion bends it by less than 0.1 px
 
 
 def essential_matrices(position: FloatArray, rotation: FloatArray, pairs: IntArray) -> FloatArray:
-    """Return E of pairs of photographs, so that q_j^T E q_i = 0 for the image vectors of one point.
+    """Return E of pairs of photographs; q_j^T E q_i = 0 holds for the image vectors of one point.
 
     Args:
         position: projection centres X0, object unit, (m, 3).
@@ -45,7 +45,7 @@ def epipolar_paths(
     nearest: float,
     farthest: float,
 ) -> tuple[FloatArray, ...]:
-    """Return the pictures, in the right photograph, of the rays through points of the left one.
+    """Return the images in the right photograph of the rays through points of the left one.
 
     Args:
         estimate: orientation of both photographs.
@@ -57,13 +57,13 @@ def epipolar_paths(
         farthest: largest depth, object unit.
 
     Returns:
-        k polygons (n, 2) in px, from near to far; points behind the right camera are left out. Use them with
-        `ncc.match_along_line`.
+        k polygons (n, 2) in px, from near to far; points behind the right camera are omitted.
+        `sfm.textbook.match_along_line` accepts them.
 
     Raises:
-        GeometryError: an index of a photograph or camera that is not there.
+        GeometryError: the index of a photograph or camera does not exist.
 
-    Source: Kraus (2007), sec. 4.3: an epipolar line is the picture of the other photograph's ray.
+    Source: Kraus (2007), sec. 4.3: an epipolar line is the image of the ray of the other photograph.
     """
     check_indices(
         "epipolar_paths: left, right", np.array([left, right]), min(len(camera), len(estimate.position))
@@ -71,7 +71,7 @@ def epipolar_paths(
     check_indices("epipolar_paths: camera", camera, len(estimate.cameras))
     uv = tangents_from_pixel(estimate.cameras[camera[left]], xy)
     direction = ray_directions(uv, estimate.rotation[left])
-    # equal steps in 1 / depth are about equal steps in the picture
+    # equal steps in 1 / depth are nearly equal steps in the image
     depth = 1.0 / np.linspace(1.0 / nearest, 1.0 / farthest, VERTICES)
     paths = []
     for ray in direction:
@@ -85,7 +85,7 @@ def epipolar_paths(
 
 @compiled
 def epipolar_distance(E: FloatArray, ui: float, vi: float, uj: float, vj: float) -> float:
-    """Return how far (uj, vj) is from the epipolar line of (ui, vi), tangents; inf where there is no line."""
+    """Return the distance of (uj, vj) from the epipolar line of (ui, vi), tangents; inf if there is none."""
     l0 = E[0, 0] * ui + E[0, 1] * vi - E[0, 2]
     l1 = E[1, 0] * ui + E[1, 1] * vi - E[1, 2]
     l2 = E[2, 0] * ui + E[2, 1] * vi - E[2, 2]

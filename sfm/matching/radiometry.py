@@ -1,9 +1,11 @@
-"""Radiometry of patches and photographs in grey: contrast, histograms, brightness.
+"""Radiometry of grey patches and photographs: contrast, histograms, brightness, and a cache of photographs.
 
-Photographs in grey, as many at a time as there is place for: each is needed with many others.
+Brightness and contrast are the mean and standard deviation of intensities, and gain and offset follow from a
+linear regression of one patch on another.
 
-Where all are needed in turn, again and again, the oldest one is needed next: of more photographs than there
-is place for, forgetting it would read every one every time. So one by chance is forgotten.
+`GreyPhotographs` keeps as many grey photographs as fit into memory, because each is needed with many others.
+If more photographs than fit are used in turn, again and again, the oldest one is always needed next. Removing
+the oldest would therefore read every photograph every time, so a random one is removed.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 
-MEMORY_BYTES = 200_000_000  # of photographs at a time, as they were read: 16 of 12 megapixels of 8 bit
-GREY_BYTES = 100_000_000  # of these in single precision
+MEMORY_BYTES = 200_000_000  # of photographs kept as they were read: 16 of 12 megapixels with 8 bit
+GREY_BYTES = 100_000_000  # of photographs kept in single precision
 LEVELS_8, LEVELS_16 = 256, 65536
 FULL_SCALE_8, FULL_SCALE_16 = LEVELS_8 - 1.0, LEVELS_16 - 1.0
-# Rec. 601, as cv2 turns colour into grey; photographs in memory are red, green, blue here.
+# Rec. 601, which cv2 uses for grey; photographs in memory are red, green, blue here.
 LUMINANCE = (0.299, 0.587, 0.114)
 MIN_WINDOW_PX = 3
 
@@ -50,13 +52,13 @@ class LinearRadiometry:
 
 @dataclass(frozen=True)
 class Grey:
-    """What `grey_of` has returned: it is not looked through again for every match."""
+    """A result of `grey_of`, which need not be checked again for every match."""
 
     pixels: AnyArray  # float32, finite, (H, W)
 
 
 def grey_of(photograph: AnyArray | Grey) -> AnyArray:
-    """Return a photograph as one channel of float32, its intensities kept (0-255, 0-65535 or as they are).
+    """Return a photograph as one channel of float32 with unchanged intensities (0-255, 0-65535 or as given).
 
     Args:
         photograph: shape (H, W), or (H, W, 3) in the order red, green, blue; 8 or 16 bit or float.
@@ -81,24 +83,24 @@ def grey_of(photograph: AnyArray | Grey) -> AnyArray:
 
 
 def _finite(array: AnyArray) -> bool:
-    """Return whether all intensities are finite; where their sum is, they are, and it is quicker."""
+    """Return whether all intensities are finite; if their sum is finite, they all are, and it is faster."""
     with np.errstate(over="ignore", invalid="ignore"):
         total = array.sum()
     return bool(np.isfinite(total) or np.isfinite(array).all())
 
 
 def grey_of_8_bit(photograph: AnyArray) -> AnyArray:
-    """Return a photograph as `grey_of` does, with intensities of the full scale of 8 bit."""
+    """Return a photograph as `grey_of` does, with intensities scaled to the full scale of 8 bit."""
     return grey_of(photograph) * np.float32(FULL_SCALE_8 / full_scale(photograph))
 
 
 def full_scale(photograph: AnyArray) -> float:
-    """Return the highest intensity that a photograph can have; floats count as 8 bit."""
+    """Return the highest intensity possible in a photograph; floats count as 8 bit."""
     return FULL_SCALE_16 if np.asarray(photograph).dtype == np.uint16 else FULL_SCALE_8
 
 
 def averaged(photograph: AnyArray, shrink: int) -> AnyArray:
-    """Return a photograph whose pixels are means of so many along each side; a rest at the border is cut."""
+    """Return a photograph averaged over squares of side `shrink`; a remainder at the border is cut off."""
     if shrink == 1:
         return photograph
     height, width = (side // shrink for side in photograph.shape[:2])
@@ -107,7 +109,7 @@ def averaged(photograph: AnyArray, shrink: int) -> AnyArray:
 
 
 def odd_window(what: str, side_px: int) -> int:
-    """Return the side of a window that has a pixel in its middle.
+    """Return the side of a window that has a central pixel.
 
     Raises:
         GeometryError: an even side, or less than 3.
@@ -120,11 +122,11 @@ def odd_window(what: str, side_px: int) -> int:
 
 
 def patch_around(photograph: AnyArray, centre: tuple[int, int], side_px: int) -> AnyArray:
-    """Return the square of pixels around a pixel, a view of the photograph.
+    """Return the square patch around a pixel, as a view of the photograph.
 
     Args:
         photograph: shape (H, W) or (H, W, 3).
-        centre: column and row of the pixel in the middle.
+        centre: column and row of the central pixel.
         side_px: odd side.
 
     Raises:
@@ -177,13 +179,13 @@ def histogram(photograph: AnyArray) -> IntArray:
 
 @checked_arguments()
 def equalise_histogram(photograph: AnyArray) -> AnyArray:
-    """Return the photograph with the intensities spread so that all are equally frequent, same type.
+    """Return the photograph with all intensities made equally frequent, same type.
 
-    The lowest intensity becomes 0, the highest the end of the scale; a photograph of one intensity is
-    returned as it is.
+    The lowest intensity becomes 0 and the highest the end of the scale. A photograph of one intensity is
+    returned unchanged.
 
     Args:
-        photograph: shape (H, W) or (H, W, 3), 8 or 16 bit or float of the scale of 8 bit.
+        photograph: shape (H, W) or (H, W, 3), 8 or 16 bit, or float on the 8 bit scale.
 
     Source: Gonzalez and Woods, Digital Image Processing, sec. 3.3.1; 8 bit is cv2.equalizeHist.
     """
@@ -202,7 +204,7 @@ def equalise_histogram(photograph: AnyArray) -> AnyArray:
 
 @checked_arguments()
 def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
-    """Return offset and gain that bring the intensities of one patch nearest to another, pixel by pixel.
+    """Fit the gain and offset that bring the intensities of one patch closest to another, pixel by pixel.
 
     Args:
         source: patch, shape (H, W) or (H, W, 3).
@@ -230,10 +232,10 @@ def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
 
 @checked_arguments()
 def match_brightness(source: AnyArray, target: AnyArray) -> FloatArray:
-    """Return the source with mean and standard deviation of the target; the two need not show the same.
+    """Return the source with mean and standard deviation of the target; they need not show the same object.
 
     Args:
-        source: photograph or patch; a flat one is given the mean only.
+        source: photograph or patch; a flat one receives only the mean.
         target: photograph or patch.
 
     Returns:
@@ -247,9 +249,9 @@ def match_brightness(source: AnyArray, target: AnyArray) -> FloatArray:
 
 
 class GreyPhotographs:
-    """Photographs that are read when they are needed; others are forgotten. Threads may share it.
+    """Photographs that are read when needed and removed when memory is full. Threads may share it.
 
-    More are kept as they were read, which takes a quarter of the memory, than in single precision.
+    Most are kept as they were read, which takes a quarter of the memory of single precision.
     """
 
     def __init__(
@@ -259,12 +261,12 @@ class GreyPhotographs:
         memory_bytes: int = MEMORY_BYTES,
         grey_bytes: int = GREY_BYTES,
     ) -> None:
-        """Begin with none.
+        """Start empty.
 
         Args:
             read: returns a photograph, (H, W) or (H, W, 3), 8 or 16 bit or float.
-            memory_bytes: of all that are kept as they were read.
-            grey_bytes: of all that are kept in single precision; the last two are, whatever their size.
+            memory_bytes: limit for photographs kept as they were read.
+            grey_bytes: limit for photographs in single precision; the last two are always kept.
         """
         self._read = read
         self._stored: dict[int, AnyArray] = {}
@@ -293,7 +295,7 @@ class GreyPhotographs:
         return Grey(grey)
 
     def _use(self, i: int, grey: AnyArray) -> None:
-        """Keep a photograph as the one that was needed last."""
+        """Mark a photograph as used last."""
         self._grey.pop(i, None)
         self._grey[i] = grey
 

@@ -1,7 +1,7 @@
-"""Windows that cover photographs without overlap, and object points projected into them.
+"""Windows that cover photographs without overlap, and object points projected into photographs.
 
-Windows that overlap measure the same pixels twice, and their errors have these in common: a result would
-be reported too precise, and no residual shows it.
+Windows that overlap measure the same pixels twice, so part of their errors is common. Results would then be
+reported as too precise, and no residual would show it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 from sfm.network import Estimate, ImagePoints, rows_of
 
-# Ratio of precisions for the same pixels up to which the windows that are preferred are taken.
+# Ratio of precisions for the same pixels up to which the preferred windows are used.
 MAX_COST_RATIO = 1.1
-MAX_SHARED_FRACTION = 0.15  # part of the pixels of a point, or of a window, that others may have measured
-SAMPLES = np.linspace(-0.42, 0.42, 6)  # of a window at which it is asked what is covered, in its sides
+MAX_SHARED_FRACTION = 0.15  # of the pixels of a point, or of a window, that others may have measured
+SAMPLES = np.linspace(-0.42, 0.42, 6)  # positions in a window, in sides, where coverage is checked
 
 
 @dataclass(frozen=True)
@@ -28,28 +28,28 @@ class Windows:
     """Windows of least squares matching."""
 
     side_px: int  # odd
-    model: str = "affine"  # or shift, with the linear part of its warp from the plane of the surface
+    model: str = "affine"  # or shift, for which the linear part of the warp comes from the surface plane
 
 
 def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
-    """Return the first windows that are about as precise as the best for the same pixels.
+    """Return the first windows that are nearly as precise as the best for the same pixels.
 
-    The standard deviation of a window's place falls with its side, the number of windows with the square of
-    that: for noise alone all together leave the same. Where larger ones leave more, the surface is not plane
-    over them.
+    The standard deviation of a window's position is proportional to 1 / side, and the number of windows to
+    1 / side^2. With noise alone, all sizes together give the same precision. If larger ones give less, the
+    surface is not plane over them.
 
     Args:
-        costs: windows and the standard deviation that their rays leave together, the preferred ones first.
+        costs: windows, the preferred ones first, each with the standard deviation from all its rays together.
     """
     best = min(cost for _, cost in costs)
     return next(windows for windows, cost in costs if cost <= MAX_COST_RATIO * best)
 
 
 class CoveredPixels:
-    """Which pixels of photographs have been measured, a bit each."""
+    """A record of the pixels that have been measured in each photograph, one bit each."""
 
     def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:
-        """Nothing is covered yet of photographs of these shapes (height, width)."""
+        """Start with nothing covered, for photographs of these shapes (height, width)."""
         self.shapes = [shape[:2] for shape in shapes]
         self._bits = [np.zeros((height, -(-width // 8)), np.uint8) for height, width in self.shapes]
 
@@ -58,7 +58,7 @@ class CoveredPixels:
         return np.unpackbits(self._bits[image], axis=1, count=self.shapes[image][1])
 
     def cover(self, image: IntArray, xy: FloatArray, side_px: FloatArray) -> None:
-        """Cover squares, given by photograph (k,), middle (px, (k, 2)) and side (px, (k,))."""
+        """Cover squares, given by photograph (k,), centre (px, (k, 2)) and side (px, (k,))."""
         sizes = np.array([shape[::-1] for shape in self.shapes])[image]
         first = np.clip(np.rint(xy - side_px[:, None] / 2 + 0.5).astype(np.int64), 0, sizes)
         behind = np.clip(np.rint(xy + side_px[:, None] / 2 + 0.5).astype(np.int64), 0, sizes)
@@ -68,7 +68,7 @@ class CoveredPixels:
             self._bits[i][y0:y1] |= np.packbits(row)
 
     def free_middles(self, image: int, side_px: int) -> BoolArray:
-        """Return which pixels of a photograph are middles of squares with few covered pixels, (H, W)."""
+        """Return which pixels of a photograph are centres of squares with few covered pixels, (H, W)."""
         shared = cv2.boxFilter(self.pixels(image), cv2.CV_32F, (side_px, side_px))
         return np.asarray(shared <= MAX_SHARED_FRACTION)
 
@@ -77,8 +77,8 @@ class CoveredPixels:
 
         Args:
             image: index of the photograph.
-            xy: middles of the squares, px, (k, 2).
-            side_px: their side.
+            xy: centres of the squares, px, (k, 2).
+            side_px: side of the squares.
         """
         height, width = self.shapes[image]
         col = np.rint(xy[:, :1] + side_px * SAMPLES).astype(np.int64).clip(0, width - 1)[:, None, :]
@@ -92,8 +92,8 @@ def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points
 
     Args:
         seen: image points.
-        fits: which of them count, (k,).
-        side_px: of the windows.
+        fits: image points that count, (k,).
+        side_px: side of the windows.
         n_points: number of points.
     """
     kept = np.zeros(n_points, dtype=bool)
@@ -104,7 +104,7 @@ def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points
     order = np.argsort(-count, kind="stable")
     rows = rows[np.argsort(seen.point[rows], kind="stable")]
     cells = np.floor(seen.xy[rows] / side_px).astype(np.int64)
-    cells -= cells.min(axis=0) - 1  # with a free one on each side, so that neighbours have different numbers
+    cells -= cells.min(axis=0) - 1  # with a free cell on each side, so that neighbours have different numbers
     columns, lines = cells.max(axis=0) + 2
     cell = (seen.image[rows] * lines + cells[:, 1]) * columns + cells[:, 0]
     first = np.concatenate([[0], np.cumsum(count)])
@@ -126,15 +126,15 @@ def _keep_apart(
 
     Args:
         order: points, the first to be kept first, (n,).
-        first: the first ray of each point, and the end, (n + 1,).
-        xy: middles of the windows, point by point, in sides, (k, 2).
-        cell: number of the square of side 1 that each is in, (k,).
+        first: first ray of each point, and the end, (n + 1,).
+        xy: centres of the windows, point by point, in sides, (k, 2).
+        cell: number of the unit square that contains each centre, (k,).
         cells: these numbers, sorted, (c,).
-        columns: squares of a line: the number of a neighbour is by 1, `columns` or both larger or smaller.
+        columns: squares per line; the number of a neighbour differs by 1, by `columns` or by both.
         kept: filled, (n,).
     """
-    latest = np.full(len(cells), -1)  # window kept in each square
-    before = np.full(len(xy), -1)  # that was kept there before
+    latest = np.full(len(cells), -1)  # window kept last in each square
+    before = np.full(len(xy), -1)  # window kept before it in the same square
     for point in order:
         begin, end = first[point], first[point + 1]
         shared, most = 0.0, MAX_SHARED_FRACTION * (end - begin)
@@ -159,7 +159,7 @@ def _keep_apart(
 
 
 def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return the picture of one object point for each row, px, NaN behind the photograph, (k, 2)."""
+    """Return the image of one object point per row, px, NaN behind the photograph, (k, 2)."""
     UVW = _in_photographs(estimate, image, points)
     out = np.full((len(image), 2), np.nan)
     for lens, rows in _of_cameras(estimate, camera, image):
@@ -179,18 +179,18 @@ def plane_warps(
 ) -> FloatArray:
     """Return the homographies of windows of one photograph in another, relative to both points, (k, 3, 3).
 
-    A window is seen in perspective, and its middle is not the middle of its picture: over 15 px at 45 degrees
-    an affine warp is off by about 0.01 px, in the same direction all over a photograph.
+    A window is seen in perspective, so its centre is not the centre of its image. Over 15 px at 45 degrees an
+    affine warp is off by about 0.01 px, in the same direction all over a photograph.
 
     Args:
         estimate: interior and exterior orientation of all photographs.
         camera: index of the camera of each photograph, (m,).
         i: photograph of the windows.
-        j: the other photograph, of all or of each, (k,).
-        xy: windows' middles in i, px, (k, 2).
-        points: object points of these, (k, 3).
-        normal: of the surface there, (k, 3).
-        reach_px: from the middle to where the perspective is taken from: half the side of the windows.
+        j: the other photograph, one for all windows or one for each, (k,).
+        xy: centres of the windows in i, px, (k, 2).
+        points: object points at these centres, (k, 3).
+        normal: surface normals there, (k, 3).
+        reach_px: distance from the centre at which the perspective is computed: half the side of the windows.
     """
     R, X0 = estimate.rotation[i], estimate.position[i]
     lens, other = estimate.cameras[camera[i]], np.broadcast_to(np.asarray(j), (len(xy),))

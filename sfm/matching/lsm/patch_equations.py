@@ -1,8 +1,8 @@
 """Least squares matching of a patch: window, warp, gradients and normal equations.
 
-Observations are the intensities of the window; unknowns are 2, 6 or 8 geometric parameters, offset and gain,
-and, where the photographs may be blurred differently, three of the difference of their blur.
-The template is in single precision, the sums are in double.
+Observations are the intensities of the window. Unknowns are 2, 6 or 8 geometric parameters, gain and offset,
+and three parameters for a difference of blur if the photographs may be blurred differently. The template is
+in single precision, the sums are in double precision.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from sfm.kernels.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, 
 from sfm.kernels.small_algebra import factorise
 from sfm.matching.correlation import FLAT_TEXTURE, MATCHED, OUTSIDE
 
-MAX_STRETCH = 3.0  # ratio of lengths, of a patch in both photographs, that is a match no more
+MAX_STRETCH = 3.0  # ratio of lengths of a patch in both photographs above which it is not a match
 MODELS = {"shift": 2, "affine": 6, "projective": 8}  # geometric parameters
 RADIOMETRIC = 2  # offset and gain
 # Differences of the second moments of blur, px^2: xx, xy, yy. A blur changes intensities by half the products
 # of its second moments and the second derivatives, up to moments of higher order.
 BLUR = 3
 MARGIN = 3  # pixels around the template that its gradients need
-UNDETERMINED = 1e-9  # part of a diagonal that rounding of float32 intensities leaves of nothing
+UNDETERMINED = 1e-9  # fraction of a diagonal element that is left by rounding of float32 intensities
 # Symmetric difference of sixth order, taps 1, 2, 3; a gradient has the variance of a pixel times SLOPE_NOISE.
 # Source: Abramowitz and Stegun (1964), table 25.2 (seven-point formula).
 SLOPE = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
 SLOPE_NOISE = 2.0 * (SLOPE[0] ** 2 + SLOPE[1] ** 2 + SLOPE[2] ** 2)
-# Contributions of noise of variance 1 to products of blur's rows: (1 -2 1) across (1 2 1) / 4, halved, and
-# its mixed difference: of xx or yy with itself, of xx with yy, of xy with itself, and of xx or yy with
+# Contributions of noise of variance 1 to products of the blur rows: (1 -2 1) across (1 2 1) / 4, halved, and
+# its mixed difference. In order: xx or yy with itself, xx with yy, xy with itself, and xx or yy with
 # intensities.
 BLUR_NOISE = (9.0 / 16.0, 1.0 / 16.0, 1.0 / 4.0, -1.0 / 2.0)
 
 
 class Workspace(NamedTuple):
-    """Settings of all patches, and the arrays in which each is worked on in turn."""
+    """Settings for all patches, and the arrays in which they are processed one after the other."""
 
     half: int  # half the side of the window, px
     kind: int  # kernel of resampling
     geometric: int  # geometric parameters
     blurred: int  # parameters of blur: 0 or BLUR
     grid: AnyArray  # template with its margin, float32
-    J: AnyArray  # d (patch) / d (unknowns), a row each, float32, (u, side^2)
+    J: AnyArray  # d (patch) / d (unknowns), one row each, float32, (u, side^2)
     N: FloatArray  # normal matrix, (u, u)
     L: FloatArray  # its factor, (u, u)
     q: FloatArray  # solution, (u,)
@@ -55,7 +55,7 @@ class Workspace(NamedTuple):
 
 @compiled
 def new_workspace(half: int, kind: int, geometric: int, blurred: int) -> Workspace:
-    """Return arrays for windows of a size and a model."""
+    """Return arrays for windows of one size and one model."""
     side, size = 2 * half + 1, geometric + RADIOMETRIC + blurred
     wide = side + 2 * MARGIN
     return Workspace(
@@ -77,7 +77,7 @@ def new_workspace(half: int, kind: int, geometric: int, blurred: int) -> Workspa
 
 @compiled
 def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int:
-    """Fill gradients, normal matrix and factor of the template around a point; return the flag."""
+    """Compute gradients, normal matrix and factor of the template around a point; return the flag."""
     if not resample_window(left, x, y, work.half + MARGIN, work.kind, work.wx, work.wy, work.grid):
         return OUTSIDE
     gradients(work.grid, work.half, work.geometric, work.J)
@@ -89,7 +89,7 @@ def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int
 
 @compiled
 def gradients(grid: AnyArray, half: int, geometric: int, J: AnyArray) -> None:
-    """Fill J: d (patch) / d (geometric, offset, gain), window coordinates counted in half windows.
+    """Fill J: d (patch) / d (geometric, offset, gain), with window coordinates in half windows.
 
     Order of the geometric parameters: shift x, y; xx, xy, yx, yy; and the two of perspective.
     """
@@ -120,7 +120,7 @@ def gradients(grid: AnyArray, half: int, geometric: int, J: AnyArray) -> None:
 def blur_changes(grid: AnyArray, half: int, J: AnyArray) -> None:
     """Fill J: d (patch) / d (second moments of blur xx, xy, yy), (3, side^2).
 
-    Second differences are taken over three rows and columns, which keeps them free from most of the noise.
+    Second differences are averaged over three rows and columns, which removes most of the noise.
     """
     side, quarter, eighth = 2 * half + 1, np.float32(0.25), np.float32(0.125)
     for i in range(side):
@@ -138,7 +138,7 @@ def blur_changes(grid: AnyArray, half: int, J: AnyArray) -> None:
 
 @compiled_fast
 def fill_normals(J: AnyArray, N: FloatArray) -> None:
-    """Fill N = J J^T, the rows of J being the unknowns."""
+    """Fill N = J J^T; the rows of J are the unknowns."""
     for a in range(len(J)):
         for b in range(a + 1):
             N[a, b] = N[b, a] = dot(J[a], J[b])
@@ -146,7 +146,7 @@ def fill_normals(J: AnyArray, N: FloatArray) -> None:
 
 @compiled_fast
 def dot(a: AnyArray, b: AnyArray) -> float:
-    """Return the sum of products of two rows of float32 in double precision."""
+    """Return the sum of products of two rows of float32, in double precision."""
     total = 0.0
     for p in range(len(a)):
         total += np.float64(a[p]) * np.float64(b[p])
@@ -225,7 +225,7 @@ def resample_patch(
 
 @compiled
 def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int) -> float:
-    """Put the step q on H, H <- H dH^-1; return the shift in px, inf if the patch is turned inside out."""
+    """Apply the step q, H <- H dH^-1; return the shift in px, inf if gain or warp become degenerate."""
     beta = q[geometric + 1]
     if not beta > 0.0:
         return np.inf
@@ -240,7 +240,7 @@ def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int) -> float:
         d11 += q[5] / beta
     if geometric > 6:
         d20, d21 = q[6] / (beta * half), q[7] / (beta * half)
-    # adjugate of dH; its determinant is only a scale, which the norm H[2, 2] = 1 takes out
+    # adjugate of dH; its determinant is only a scale, which the normalisation H[2, 2] = 1 removes
     a00, a01, a02 = d11 - d12 * d21, d02 * d21 - d01, d01 * d12 - d02 * d11
     a10, a11, a12 = d12 * d20 - d10, d00 - d02 * d20, d02 * d10 - d00 * d12
     a20, a21, a22 = d10 * d21 - d11 * d20, d01 * d20 - d00 * d21, d00 * d11 - d01 * d10

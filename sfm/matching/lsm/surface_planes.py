@@ -1,10 +1,8 @@
-"""Planes of the surface where a photograph sees it, and windows as large as they allow.
+"""Local planes of the surface that a photograph sees, and windows as large as the surface is plane.
 
-Matches with windows as large as the surface is plane over: smaller ones where it is not.
-
-The middle of a window and the mean of what it shows are at one place only on a plane. On a curved surface a
-match is off by the parallax of the mean depth over the window, which grows with the square of its side.
-Smaller windows lead elsewhere then.
+The centre of a window and the mean of its contents coincide only on a plane. On a curved surface a match is
+off by the parallax of the mean depth over the window, which grows with the square of its side. Smaller
+windows then lead to another position. The largest window that no smaller one contradicts is therefore chosen.
 """
 
 from __future__ import annotations
@@ -20,23 +18,23 @@ from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.network import Estimate, ImagePoints, rows_of
 
-SIDE_RATIO = 0.75  # side of the next window
-MIN_WINDOW_PX = 9  # smaller ones hardly hold the parameters of an affine warp
-# Squared difference of two windows, in that of the smaller one's noise, from which the larger one is off.
-# Half of that noise is common to both: chance leads so far in less than one of a hundred.
+SIDE_RATIO = 0.75  # of the next window to the one before
+MIN_WINDOW_PX = 9  # smaller windows hardly determine the parameters of an affine warp
+# Squared difference of two windows, over the covariance of the smaller one, from which the larger one is off.
+# Half of that noise is common to both: chance leads this far in less than one case in a hundred.
 MAX_SQUARED_RATIO = 6.0
-ROUNDING_PX = 1e-6  # of places in intensities of single precision
-NEIGHBOURS = 6  # object points whose plane a place is put on
-NEAREST, FARTHEST = 0.5, 2.0  # of a plane, in the depths of the nearest and the farthest object point
+ROUNDING_PX = 1e-6  # of positions from intensities in single precision
+NEIGHBOURS = 6  # object points that define the plane at a position
+NEAREST, FARTHEST = 0.5, 2.0  # depths allowed for a plane, times those of the nearest and farthest point
 TOLERANCE_FACTOR = 6.0  # of the spread of points about the planes of their neighbours
-# Part of the squares of neighbours' tangents that is added where they are in a row.
+# Fraction of the squares of neighbours' tangents that is added in case they lie in a row.
 REGULARISATION_FRACTION = 1e-6
 
 
 def planes_at(
     estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Put places of a photograph on the planes through the object points around them.
+    """Project positions in a photograph onto the planes through the object points around them.
 
     Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c.
 
@@ -44,11 +42,11 @@ def planes_at(
         estimate: orientation and object points.
         camera: index of the camera of each photograph, (m,).
         i: the photograph.
-        xy: places, px, (k, 2).
+        xy: positions, px, (k, 2).
         point: object points that it sees.
 
     Returns:
-        Object points of the places, and unit normals of the surface there, towards the photograph, both
+        Object points at the positions, and unit normals of the surface there, towards the photograph, both
         (k, 3); NaN where the neighbours define no plane in front of the photograph.
     """
     lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
@@ -62,7 +60,7 @@ def planes_at(
     known, inverse, uv = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2], uv[rows]
     near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
     plane = _planes(known[near] - uv[:, None], inverse[near])[0]
-    value = plane[:, 2].copy()  # inverse of the depth at the place
+    value = plane[:, 2].copy()  # inverse of the depth at the position
     plane[:, 2] -= np.sum(plane[:, :2] * uv, axis=1)
     inside = (value > inverse.min() / FARTHEST) & (value < inverse.max() / NEAREST)
     rows, uv, value, plane = rows[inside], uv[inside], value[inside], plane[inside]
@@ -75,16 +73,16 @@ def planes_at(
 def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful: BoolArray) -> BoolArray:
     """Return which object points lie on the surface of their neighbours in all their photographs, (n,).
 
-    An error along the epipolar line moves a point of two rays towards its photographs or away, and nothing
-    else. A point is taken for wrong that is farther from the plane through its neighbours than
-    TOLERANCE_FACTOR times what is usual in the photograph. Of neighbours the farthest leaves first, as it
-    bends the planes of the others.
+    An error along the epipolar line moves a point with two rays towards its photographs or away from them,
+    and has no other effect. A point is rejected if its distance from the plane through its neighbours exceeds
+    TOLERANCE_FACTOR times the usual one in the photograph. Among neighbours the farthest is rejected first,
+    since it distorts the planes of the others.
 
     Args:
         seen: image points of n object points.
         camera: index of the camera of each photograph, (m,).
         estimate: orientation and object points.
-        doubtful: the points that may be wrong, (n,); the others are taken for right.
+        doubtful: points that may be wrong, (n,); the others are assumed to be right.
     """
     good = np.asarray(estimate.determined | ~doubtful)
     for i, rows in enumerate(rows_of(seen.image, len(estimate.position))):
@@ -113,18 +111,18 @@ def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful
 
 
 def _others(near: IntArray) -> IntArray:
-    """Return the neighbours of each point without itself, of (k, NEIGHBOURS + 1) with it, in any place."""
+    """Return the neighbours of each point without itself; `near`, (k, NEIGHBOURS + 1), contains it."""
     itself = near == np.arange(len(near))[:, None]
-    itself[~itself.any(axis=1), -1] = True  # several in one place
+    itself[~itself.any(axis=1), -1] = True  # several at one position
     return np.asarray(near[~itself].reshape(len(near), -1))
 
 
 def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a, b, c of the planes 1 / t = a u + b v + c about k places, and their normal matrices.
+    """Return a, b, c of the planes 1 / t = a u + b v + c around k positions, and their normal matrices.
 
     Args:
-        away: tangents of the neighbours less those of the place, (k, NEIGHBOURS, 2).
-        inverse: of the depths of these, (k, NEIGHBOURS).
+        away: tangents of the neighbours minus those of the position, (k, NEIGHBOURS, 2).
+        inverse: inverse depths of the neighbours, (k, NEIGHBOURS).
     """
     A = np.concatenate([away, np.ones((*away.shape[:2], 1))], axis=2)
     N = np.einsum("kij,kil->kjl", A, A)
@@ -145,14 +143,14 @@ def match_where_plane(
     window_px: int,
     interpolation: str = "six_tap",
 ) -> tuple[LsmMatches, FloatArray]:
-    """Return the match of the largest window of each point that no smaller one leads away from.
+    """Return for each point the match of the largest window that no smaller one contradicts.
 
     Args:
         left: photograph, (H, W).
         right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
-        matches: of them, with an affine or projective warp.
-        window_px: odd side of the windows of these.
+        matches: matches of these points, with an affine or projective warp.
+        window_px: odd side of the windows of these matches.
         interpolation: kernel for the right photograph.
 
     Returns:
@@ -188,10 +186,10 @@ def _rows(matches: LsmMatches, rows: IntArray) -> LsmMatches:
 
 
 def _largest_that_agrees(found: list[LsmMatches]) -> IntArray:
-    """Return the number of the first window of each point whose place no smaller window contradicts, (k,).
+    """Return the number of the first window of each point that no smaller window contradicts, (k,).
 
     Args:
-        found: of the same points with smaller and smaller windows; all of the first are good.
+        found: matches of the same points with smaller and smaller windows; all of the first are good.
     """
     chosen = np.full(len(found[0]), -1, dtype=np.int64)
     for number in reversed(range(len(found))):
@@ -205,9 +203,9 @@ def _largest_that_agrees(found: list[LsmMatches]) -> IntArray:
 
 
 def squares_over_covariance(d: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return d' C^-1 d of differences of places, px, (k,); NaN where C is.
+    """Return d' C^-1 d for differences of positions, px, (k,); NaN where C is.
 
-    Of photographs without noise C is 0, but no place is known better than ROUNDING_PX.
+    For photographs without noise C is 0, but no position is known better than ROUNDING_PX.
     """
     C = covariance + ROUNDING_PX**2 * np.eye(2)
     return np.asarray(np.einsum("ki,ki->k", d, np.linalg.solve(C, d[:, :, None])[:, :, 0]))

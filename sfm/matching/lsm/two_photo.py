@@ -1,14 +1,15 @@
-"""Least squares matching: where a patch of one photograph is in another, and how well.
+"""Least squares matching: the position of a patch of one photograph in another, and its precision.
 
-The patch T around a point of the left photograph and the right photograph S are tied by
+The patch T around a point of the left photograph is related to the right photograph S by
 
     S(H x) = alpha + beta T(x) + noise
 
-with x in the window, a geometric model H (shift, affine or projective) and the two radiometric parameters.
-Gauss-Newton is written the inverse way: the change dH of a step is applied to the template, whose gradients
-and normal equations then stay the same from step to step, and is put on H as H <- H dH^-1. The right
-photograph is resampled in every step, the gradients are symmetric differences of the resampled template.
-At convergence it is the least squares solution of the forward equations, up to the noise of the gradients.
+for x in the window, with a geometric model H (shift, affine or projective) and two radiometric parameters.
+Gauss-Newton is written in its inverse form. The change dH of a step is applied to the template, whose
+gradients and normal equations then stay the same in all steps, and H is updated by H <- H dH^-1. The right
+photograph is resampled in every step. The gradients are symmetric differences of the resampled template. At
+convergence the result is the least squares solution of the forward equations, up to the noise of the
+gradients.
 """
 
 from __future__ import annotations
@@ -52,25 +53,26 @@ from sfm.matching.lsm.patch_equations import (
 )
 from sfm.matching.radiometry import Grey, grey_of, odd_window
 
-# Texture is flat in a direction in which the gradients of the window together have no more energy than noise
-# has by chance: its mean and so many standard deviations more.
+# Texture is flat in a direction in which the gradients of the window have no more energy than noise has by
+# chance: its mean plus this many standard deviations.
 TEXTURE_SIGMAS = 3.0
-# Variance of such an energy of n pixels, times n, for a mean of 1: twice the sum of squared autocorrelations
-# of white noise seen through the difference formula, and through the mask by which its variance is estimated.
+# Variance of this energy over n pixels, times n, for a mean of 1: twice the sum of squared autocorrelations
+# of white noise seen through the difference formula, and through the mask that estimates its variance.
 ENERGY_VARIANCE = 2.0 * 1.576 + 2.0 * (35.0 / 18.0) ** 2
-# Columns of what is found out about a patch: place with its covariances, gain, offset, r, sigma0, steps.
+# Columns of the result for a patch: position with its covariances, gain, offset, r, sigma0, steps.
 OUTPUTS = 11
 FLAG, X, Y, CXX, CXY, CYY, GAIN, OFFSET, R, SIGMA0, STEPS = range(OUTPUTS)
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
-CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
-LAST_PX = 0.002  # the next step after the last one that is allowed, of a match; along edges it hardly shrinks
-CHUNK = 256  # patches that a thread takes at a time
+CONTRACTION = 0.04  # largest ratio of a step to the previous one; 0.01 to 0.03 on texture with noise
+# Next step after the last one allowed, up to which a match is accepted; along edges, steps shrink slowly.
+LAST_PX = 0.002
+CHUNK = 256  # patches that a thread processes at a time
 
 
 class Limits(NamedTuple):
-    """When the steps of a patch end, and which results are believed."""
+    """Criteria for the end of the steps of a patch, and for a result to be accepted."""
 
-    stop_px: float  # the shift of the step that would come next is shorter
+    stop_px: float  # the shift of the next step would be shorter
     max_steps: int
     max_shift_px: float  # from the start
     min_correlation: float
@@ -80,7 +82,7 @@ class Limits(NamedTuple):
 class LsmMatches:
     """Positions in the right photograph found by least squares matching; NaN with the reason in the flag."""
 
-    xy: FloatArray  # place of the left point in the right photograph, px, (k, 2)
+    xy: FloatArray  # position of the left point in the right photograph, px, (k, 2)
     covariance: FloatArray  # of xy, px^2, (k, 2, 2)
     warp: FloatArray  # H: right px from left px relative to the left point, homogeneous, (k, 3, 3)
     gain: FloatArray  # beta: right intensities per left one, (k,)
@@ -117,38 +119,38 @@ def match_lsm(
     start: FloatArray | None = None,
     threads: int = 1,
 ) -> LsmMatches:
-    """Match points of the left photograph in the right one, from places known to a pixel or two.
+    """Match points of the left photograph in the right one, from positions known to a pixel or two.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy_left: points in the left photograph, px, any fraction, (k, 2).
-        xy_right: where they are in the right photograph, approximately, px, (k, 2).
+        xy_right: approximate positions of these points in the right photograph, px, (k, 2).
         model: shift (2), affine (6) or projective (8 parameters), each with gain and offset.
         window_px: odd side of the template.
-        interpolation: kernel for the right photograph; on fine texture bilinear costs 1.25 times and bicubic
-            1.06 times the standard deviation of six_tap, and both are off by up to 0.013 px where all of the
-            patch is shifted by the same 0.1 to 0.4 px, six_tap by 0.002 px.
-        stop_px: the shift of the step that would come next is shorter than this. The remaining shift has the
-            direction of the start, which neighbouring points have in common: 0.002 px turn photographs.
-        max_steps: after so many a patch counts as diverged.
-        max_shift_px: farther from the start is too far.
-        min_correlation: below it the places are not alike.
-        blur: whether three more unknowns describe how differently both are blurred. Of an oblique surface
-            they always are, since a pixel is longer on it: without them windows move by 0.01 px, in all
-            matches of a template alike.
+        interpolation: kernel for the right photograph. On fine texture the standard deviation is 1.25 times
+            that of six_tap with bilinear, and 1.06 times with bicubic. If the whole patch is shifted by the
+            same 0.1 to 0.4 px, both are off by up to 0.013 px, six_tap by 0.002 px.
+        stop_px: the steps end when the next shift would be shorter than this. The remaining shift has the
+            direction of the start, which neighbouring points share: 0.002 px would rotate photographs.
+        max_steps: a patch that needs more steps counts as diverged.
+        max_shift_px: largest distance from the start.
+        min_correlation: smallest r of a match.
+        blur: whether three more unknowns describe the difference of blur between the photographs. On an
+            oblique surface the blur always differs, since a pixel covers more of it. Without these unknowns,
+            windows move by 0.01 px, in the same way in all matches of a template.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
-            points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if none.
-        threads: patches are shared among so many.
+            points, (k, 3, 3), whose perspective an affine model keeps; by default the unit matrix.
+        threads: number of threads that share the patches.
 
     Returns:
-        One match for each point; the covariance assumes the same noise in both photographs, after the gain.
+        One match per point; the covariance assumes the same noise in both photographs, after the gain.
 
     Raises:
-        GeometryError: an unknown model or kernel, an even window, or points that do not go in pairs.
+        GeometryError: an unknown model or kernel, an even window, or different numbers of points.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
-    Computer and Robot Vision II, ch. 16; the inverse way is Baker and Matthews (2004), IJCV 56(3).
+    Computer and Robot Vision II, ch. 16; the inverse form is Baker and Matthews (2004), IJCV 56(3).
     """
     if model not in MODELS:
         raise GeometryError(f"LSM: model '{model}', expected one of {', '.join(MODELS)}")
@@ -212,7 +214,7 @@ def _match_all(
     warp: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Match patch after patch; `warp` goes from start to solution, `out` receives the columns."""
+    """Match the patches one by one; `warp` changes from start to solution, `out` receives the columns."""
     work = new_workspace(half, kind, geometric, blurred)
     for i in range(len(xy)):
         out[i, FLAG] = prepare_template(left, xy[i, 0], xy[i, 1], work)
@@ -224,7 +226,7 @@ def _match_all(
 
 @compiled
 def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, out: FloatArray) -> int:
-    """Improve H by Gauss-Newton steps; return the flag, leave J^T S and the solution in the workspace."""
+    """Improve H by Gauss-Newton steps; return the flag, keep J^T S and the solution in the workspace."""
     half, q, rhs = work.half, work.q, work.rhs
     x0, y0 = H[0, 2], H[1, 2]
     coarse = work.kind > BILINEAR
@@ -253,11 +255,11 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
 
 @compiled
 def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
-    """Fill covariance of the shift, radiometry and correlation of the last step; return the flag.
+    """Compute the covariance of the shift, radiometry and correlation of the last step; return the flag.
 
-    A resampled intensity has the noise of a pixel times the sum of the squared weights, and neighbours have
-    noise in common. To texture that the kernel lets pass it is as harmful as that of the pixels themselves,
-    or more where the right patch is the smaller one and its pixels are used more than once.
+    A resampled intensity has the noise of a pixel times the sum of the squared weights, and neighbours share
+    noise. For texture that passes the kernel, this is as harmful as the noise of the pixels themselves. It is
+    more harmful if the right patch is smaller, so that its pixels are used more than once.
     """
     half, geometric, N, q, rhs, patch = work.half, work.geometric, work.N, work.q, work.rhs, work.patch
     n = len(patch)
@@ -275,10 +277,10 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
     white = min(variance, white_noise(patch, 2 * half + 1) / (1.0 + gain))
     out[X], out[Y] = H[0, 2], H[1, 2]
     out[GAIN], out[OFFSET], out[R], out[SIGMA0] = beta, alpha, r, np.sqrt(residual / (n - len(q)))
-    variance *= 1.0 + max(1.0, 1.0 / area_ratio(H))  # of the difference of two, as texture meets it
+    variance *= 1.0 + max(1.0, 1.0 / area_ratio(H))  # of the difference of two, as it affects texture
     variance *= (half / beta) ** 2
     # The solution obeys J'^T (S - ...) = 0 with noisy J': its covariance is (J'^T J)^-1 J'^T J' (J^T J')^-1,
-    # where J'^T J' = N, and J'^T J is N less what noise adds to it.
+    # where J'^T J' = N, and J'^T J is N minus the contribution of noise.
     least = 1.0 + TEXTURE_SIGMAS * np.sqrt(ENERGY_VARIANCE / n)
     clean = without_noise(N, least * white / (beta * beta), half, geometric)
     flat = not factorise(clean, clean, 0.0)
@@ -309,18 +311,18 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
 
 @compiled
 def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> FloatArray:
-    """Return a normal matrix less what white noise of the template adds to it on average.
+    """Return a normal matrix without the mean contribution of white noise in the template.
 
     Args:
         N: normal matrix of `patch_equations.gradients`, (u, u).
         white: variance of the noise of an intensity of the template.
         half: half the side of the window, px.
-        geometric: geometric parameters.
+        geometric: number of geometric parameters.
     """
     clean = N.copy()
     n = (2 * half + 1) ** 2
-    noise = n * white * SLOPE_NOISE * half * half  # of gradients along x and y, which have none in common
-    second = (half + 1.0) / (3.0 * half)  # mean squares of the window coordinates, and their fourth powers
+    noise = n * white * SLOPE_NOISE * half * half  # of gradients along x and y, which share no noise
+    second = (half + 1.0) / (3.0 * half)  # mean squares of the window coordinates; below, their fourth powers
     fourth = second * (3.0 * half * half + 3.0 * half - 1.0) / (5.0 * half * half)
     for a in range(geometric):
         if a < 2:
@@ -348,7 +350,7 @@ def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> Flo
 def residual_as_sharp(work: Workspace, square: float) -> float:
     """Return the sum of squared residuals of a fit without blur.
 
-    A blur that makes the template less noisy fits better than the true one: its residuals are too small.
+    A blur that makes the template less noisy fits better than the true one, so its residuals are too small.
 
     Args:
         work: normal equations with blur in the last rows.
@@ -361,12 +363,12 @@ def residual_as_sharp(work: Workspace, square: float) -> float:
     solve_factorised(factor, q)
     for a in range(size):
         square -= q[a] * work.rhs[a]
-    return max(square, 0.0)  # rounding, where nothing is left
+    return max(square, 0.0)  # negative only by rounding
 
 
 @compiled_fast
 def subtract(patch: AnyArray, q: FloatArray, J: AnyArray) -> None:
-    """Turn the patch into its residuals."""
+    """Replace the patch by its residuals."""
     for a in range(len(q)):
         factor, row = np.float32(q[a]), J[a]
         for p in range(len(patch)):
@@ -375,7 +377,7 @@ def subtract(patch: AnyArray, q: FloatArray, J: AnyArray) -> None:
 
 @compiled_fast
 def white_noise(residual: AnyArray, side: int) -> float:
-    """Return the variance of the part of the residuals that is different from pixel to pixel.
+    """Return the variance of the part of the residuals that is independent from pixel to pixel.
 
     Source: Immerkaer (1996), CVIU 64(2): the mask (1 -2 1)^T (1 -2 1), whose squares add up to 36.
     """
@@ -393,8 +395,8 @@ def white_noise(residual: AnyArray, side: int) -> float:
 
 @compiled
 def kernel_noise(H: FloatArray, half: int, kind: int, wx: AnyArray, wy: AnyArray) -> float:
-    """Return the mean sum of squared weights over the window: what resampling leaves of a pixel's noise."""
-    stride = max(1, half // 2)  # 25 places give the mean
+    """Return the mean sum of squared weights over the window: the variance factor of resampled noise."""
+    stride = max(1, half // 2)  # 25 positions give the mean
     total, count = 0.0, 0
     for b in range(-half, half + 1, stride):
         for a in range(-half, half + 1, stride):

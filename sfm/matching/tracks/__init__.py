@@ -1,8 +1,8 @@
-"""Points of many photographs at once.
+"""Points in many photographs at once.
 
-- `correspondence.match_targets`: unnamed targets of oriented photographs; `evidence`: its compiled part.
-- `feature_tracks.find_tie_points`: points of natural texture of photographs of unknown orientation.
-- `features.overlapping_pairs`: which photographs have enough in common to be matched.
-- `interest.natural_points`: what one photograph shows alone, to be kept and linked, at points at which
-  matching is precise (`interest.foerstner_points`).
+- `correspondence.match_targets`: unlabelled targets of oriented photographs; `evidence`: its compiled part.
+- `feature_tracks.find_tie_points`: points of natural texture in photographs of unknown orientation.
+- `features.overlapping_pairs`: pairs of photographs that overlap enough to be matched.
+- `interest.natural_points`: the natural points of a single photograph. They are kept, linked with those of
+  others, and moved to points at which matching is precise (`interest.foerstner_points`).
 """

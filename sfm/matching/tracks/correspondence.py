@@ -1,10 +1,10 @@
-"""Correspondence: unnamed targets of all oriented photographs put together to object points.
+"""Correspondence: combine unlabelled targets of all oriented photographs into object points.
 
-Two rays meet within the tolerance everywhere along an epipolar line, so a pair is only a hypothesis: its
-intersection is projected into all photographs, and what is found there decides. A hypothesis is judged
-by the number of points as good that chance would give: few where many photographs agree closely, many
-where the point ought to be seen and is not. The best are taken first, their targets are used up, and
-the rest is judged anew among what remains.
+Two rays meet within the tolerance all along an epipolar line, so a pair is only a hypothesis. Its
+intersection is projected into all photographs, and the targets found there decide. The measure is the number
+of equally good points that chance would give. It is small if many photographs agree closely, and large if the
+point should be visible in a photograph but is not found. The best hypotheses are accepted first and their
+targets are used up. The rest is judged again among the remaining targets.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from sfm.network import Estimate
 
 # Two points that never share a photograph and lie closer than this many tolerances are one target.
 SAME_TOLERANCES = 2.5
-# Cells of the search raster along the longer side of a photograph, at most.
+# Largest number of cells of the search raster along the longer side of a photograph.
 RASTER = 64
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Object points found among unnamed targets, and the targets that belong to them."""
+    """Object points found among unlabelled targets, and the targets that belong to them."""
 
     image: IntArray  # index of the photograph, (k,)
     target: IntArray  # index among the targets of that photograph, (k,)
@@ -51,7 +51,7 @@ class Correspondences:
     points: FloatArray  # intersected object points, object unit, (n, 3)
 
     def rays(self) -> IntArray:
-        """Return the number of photographs that each point was found in, (n,)."""
+        """Return the number of photographs in which each point was found, (n,)."""
         return np.bincount(self.point, minlength=len(self.points))
 
 
@@ -70,28 +70,28 @@ def match_targets(
     max_partners: int = 20,
     max_false: float = 0.1,
 ) -> Correspondences:
-    """Match unnamed targets across all oriented photographs at once and intersect their points.
+    """Match unlabelled targets across all oriented photographs at once and intersect their points.
 
     Args:
-        estimate: interior and exterior orientation; photographs without orientation are left out.
+        estimate: interior and exterior orientation; photographs without orientation are ignored.
         camera: index of the camera of each photograph, (m,).
-        targets: positions of the unnamed targets of each photograph, px, m arrays (k_i, 2).
-        tolerance_px: largest distance of a target from its projected point; it must cover the error of
-            the orientation and should stay below a quarter of the spacing of the targets.
-        min_rays: fewest photographs that make a point; with 2, pairs that have no rival are added.
-        kinds: only targets of the same number match (as dark and bright), m arrays (k_i,).
-        diameters_px: diameters of the targets; with them, only targets match whose sizes at the object
-            agree, m arrays (k_i,).
-        max_size_ratio: largest ratio of two diameters at the object for one target.
+        targets: positions of the unlabelled targets of each photograph, px, m arrays (k_i, 2).
+        tolerance_px: largest distance of a target from its projected point. It must cover the error of the
+            orientation, and should be less than a quarter of the spacing of the targets.
+        min_rays: fewest photographs per point; with 2, pairs without a rival are added.
+        kinds: only targets with the same number match (such as dark and bright), m arrays (k_i,).
+        diameters_px: diameters of the targets, m arrays (k_i,). If given, only targets with equal sizes on
+            the object match.
+        max_size_ratio: largest ratio of two diameters on the object for one target.
         min_angle_deg: smallest angle of two rays that may start a point.
-        max_partners: with how many photographs each one is paired to start points.
-        max_false: number of chance points, expected among all hypotheses, up to which one is accepted.
+        max_partners: number of photographs with which each one is paired to start points.
+        max_false: largest number of chance points, expected among all hypotheses, for a point to be accepted.
 
     Returns:
         The correspondences; points are ordered by their first photograph and target.
 
     Raises:
-        GeometryError: the lists do not belong to the photographs, or fewer than 2 rays are asked for.
+        GeometryError: the lists do not match the photographs, or min_rays is below 2.
 
     Source: Maas (1992), Digitale Photogrammetrie in der dreidimensionalen Stroemungsmesstechnik, ch. 4
     (epipolar search in several photographs); Moisan and Stival (2004), IJCV 57(3) (false alarms).
@@ -160,9 +160,9 @@ class _Search:
         return seeds
 
     def accept(self, track: IntArray, place: FloatArray) -> None:
-        """Use up the targets of a point, and keep it unless it is an accepted point seen a second time.
+        """Use up the targets of a point, and keep the point unless it repeats an accepted one.
 
-        When the orientation is off by more than the tolerance, one target may split in two points.
+        If the orientation is off by more than the tolerance, one target may split into two points.
         """
         self.used[track[track >= 0]] = True
         reach = SAME_TOLERANCES * self.scene.tolerance
@@ -174,7 +174,7 @@ class _Search:
 
 
 def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
-    """Accept the points that are the best for all their targets; return how many."""
+    """Accept the points that are best for all their targets; return their number."""
     seeds = search.seeds()
     if len(seeds) == 0:
         return 0
@@ -189,7 +189,7 @@ def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
         if score[a] > log_max_false:
             break
         members = best[a][best[a] >= 0]
-        # A target that another point wants more waits until that one is accepted or out of the game.
+        # A target that belongs to a better point waits until that point is accepted or ruled out.
         if not search.used[members].any() and (score[members] >= score[a]).all():
             search.accept(best[a], place[a])
             accepted += 1
@@ -197,7 +197,7 @@ def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
 
 
 def _take_lone_pairs(search: _Search) -> None:
-    """Accept pairs without a rival that are not contradicted by more photographs than speak for them."""
+    """Accept pairs without a rival, unless more photographs contradict them than support them."""
     seeds = search.seeds()
     scene = search.scene
     rivals = np.bincount(seeds.ravel(), minlength=len(search.used))
@@ -262,7 +262,7 @@ def _scene(
         widest = SEARCH[0] * tolerance / c[i]
         if len(known):
             extent = np.ptp(known, axis=0)
-            # Chance could have put the targets anywhere in their hull, widened by the search.
+            # Chance could have put the targets anywhere in their extent, widened by the search radius.
             area[i] = np.prod(extent + 2 * widest) * c[i] ** 2
             corner[i] = known.min(axis=0)
             cell[i] = max(widest, extent.max() / RASTER)
@@ -290,7 +290,7 @@ def _window(camera: Camera) -> FloatArray:
 
 
 def _pairs(estimate: Estimate, max_partners: int) -> IntArray:
-    """Return pairs of photographs: each with the nearest ones that are not in the same place."""
+    """Return pairs of photographs: each with the nearest ones taken from another position."""
     index = np.flatnonzero(estimate.oriented)
     base = np.linalg.norm(estimate.position[index][:, None] - estimate.position[index][None], axis=2)
     apart = base > 1e-3 * base.max(initial=0.0)

@@ -1,7 +1,8 @@
-"""Evidence: what speaks for an object point in all photographs, and what against it.
+"""Evidence for and against an object point in all photographs.
 
-The compiled part of `correspondence`: hypotheses from pairs of targets, multi-ray intersection, search of
-the targets around a projected point, and the number of points as good that chance would give.
+This is the compiled part of `correspondence`. It forms hypotheses from pairs of targets and intersects their
+rays. It searches for targets around a projected point, and computes how many equally good points chance would
+give.
 """
 
 from __future__ import annotations
@@ -16,36 +17,37 @@ from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_three
 from sfm.matching.epipolar import epipolar_distance
 
-# A point from two rays of an orientation that is wrong by the tolerance lands this many tolerances off in
-# a third photograph; the search narrows to one tolerance as more rays join.
+# If the orientation is wrong by the tolerance, a point from two rays is this many tolerances off in a third
+# photograph. The search narrows to one tolerance as more rays join.
 SEARCH = (2.5, 1.5, 1.0, 1.0)
-# Residuals below this part of the tolerance count alike, so that chance agreement is not mistaken for proof.
+# Residuals below this fraction of the tolerance count as equal, so that chance agreement is not taken for
+# proof.
 FLOOR = 0.1
 # Radius, in standard deviations of a coordinate, that contains 95 % of a normal distribution in the plane.
 RADIUS_95 = 2.45
-# Natural logarithm of the number of chance points below which a point is beyond doubt (1 in 10^9).
+# Natural logarithm of the number of chance points below which a point is certain (1 in 10^9).
 CERTAIN = -20.0
 GAUSS_NEWTON_STEPS = 3
 
 
 class Scene(NamedTuple):
-    """All targets of all photographs in one row, in images free of distortion, with a search raster."""
+    """All targets of all photographs in one list, in images free of distortion, with a search raster."""
 
     first: IntArray  # index of the first target of each photograph, (m + 1,)
     uv: FloatArray  # tangents u = -U/W, v = -V/W, (N, 2)
     kind: IntArray  # only equal kinds match, (N,)
     size: FloatArray  # diameter / c, 0 = unknown, (N,)
-    ratio: float  # largest ratio of the sizes of one target at the object
+    ratio: float  # largest ratio of the sizes of one target on the object
     tolerance: float  # largest residual, px
     oriented: BoolArray  # (m,)
     c: FloatArray  # principal distance, px, (m,)
     position: FloatArray  # X0, (m, 3)
     M: FloatArray  # object to image axes, (m, 3, 3)
-    window: FloatArray  # tangents surely inside the photograph: u0, v0, u1, v1, (m, 4)
+    window: FloatArray  # range of tangents certainly inside the photograph: u0, v0, u1, v1, (m, 4)
     area: FloatArray  # area over which the targets of the photograph spread, px^2, (m,)
     corner: FloatArray  # corner of the raster, tangents, (m, 2)
     cell: FloatArray  # width of its cells, at least the widest search, tangents, (m,)
-    columns: IntArray  # its columns and rows, (m, 2)
+    columns: IntArray  # number of its columns and rows, (m, 2)
     cells: IntArray  # index of its first cell in `start`, (m,)
     start: IntArray  # first entry of each cell in `member`
     member: IntArray  # targets in the order of their cells, (N,)
@@ -55,7 +57,7 @@ class Scene(NamedTuple):
 def list_seeds(seeds: IntArray, scene: Scene, pairs: IntArray, E: FloatArray, used: BoolArray) -> int:
     """Fill `seeds` with pairs of unused targets on each other's epipolar lines; return their number.
 
-    With an empty array it only counts.
+    With an empty array, the pairs are only counted.
     """
     n = 0
     for k in range(len(pairs)):
@@ -86,7 +88,7 @@ def grow(
     min_rays: int,
     cos_angle: float,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Grow each pair to all photographs and return the best point of every target.
+    """Extend each pair to all photographs and return the best point of every target.
 
     Args:
         scene: targets and orientation.
@@ -96,11 +98,12 @@ def grow(
         density: unused targets per px^2 in each photograph, (m,).
         log_tests: natural logarithm of the number of hypotheses tested.
         min_rays: fewest rays of a point.
+        min_rays: fewest rays of a point.
         cos_angle: cosine of the smallest angle between the two rays of a pair.
 
     Returns:
-        Of the best point of each target: its target in each photograph or -1, (N, m); its place, (N, 3);
-        natural logarithm of the number of points as good that chance would give, inf if none, (N,).
+        For the best point of each target: its target in each photograph or -1, (N, m); its position, (N, 3);
+        natural logarithm of the number of equally good points that chance would give, inf if none, (N,).
     """
     m = len(scene.c)
     best = np.full((len(used), m), -1, dtype=np.int64)
@@ -112,9 +115,9 @@ def grow(
         a, b = seeds[s]
         i, j = photograph[a], photograph[b]
         if best[a, j] == b and best[b, i] == a:
-            continue  # known to belong together
+            continue  # already in one point
         if score[a] < CERTAIN and score[b] < CERTAIN:
-            continue  # both settled; should their points fall, the next round asks again
+            continue  # both are settled; if their points are rejected, the next round tries again
         if not meet(scene, a, b, i, j, cos_angle, X):
             continue
         size = object_size(scene, a, i, X)
@@ -150,7 +153,7 @@ def meet(
     cos_angle: float,
     X: FloatArray,
 ) -> bool:
-    """Fill X with the midpoint of the shortest line between two rays; False if it is of no use."""
+    """Fill X with the midpoint of the shortest line between two rays; False if the rays are unsuitable."""
     di, dj = np.empty(3), np.empty(3)
     for k in range(3):
         di[k] = (
@@ -202,14 +205,14 @@ def tangents(scene: Scene, image: int, X: FloatArray) -> tuple[float, float, flo
 
 @compiled
 def object_size(scene: Scene, target: int, image: int, X: FloatArray) -> float:
-    """Return the diameter of a target at the object, 0 where it is unknown."""
+    """Return the diameter of a target on the object, 0 if unknown."""
     size: float = scene.size[target] * tangents(scene, image, X)[2]
     return size
 
 
 @compiled
 def similar(one: float, other: float, ratio: float) -> bool:
-    """Return whether two sizes agree; unknown ones (0) agree with all."""
+    """Return whether two sizes agree; an unknown size (0) agrees with any."""
     return one == 0.0 or other == 0.0 or (one < ratio * other and other < ratio * one)
 
 
@@ -224,7 +227,7 @@ def gather(
     track: IntArray,
     residual: FloatArray,
 ) -> int:
-    """Fill `track` with the nearest unused target around the projected point; return their number."""
+    """Fill `track` with the nearest unused target around the point in each photograph; count them."""
     rays = 0
     for i in range(len(scene.c)):
         track[i] = -1
@@ -255,7 +258,7 @@ def gather(
 
 @compiled
 def intersect(scene: Scene, track: IntArray, X: FloatArray) -> bool:
-    """Move X to the least squares intersection of its rays, in px; False if they do not determine it.
+    """Move X to the least squares intersection of its rays, in px; False if the rays do not determine it.
 
     Source: Kraus (2007), sec. 5.2 (spatial intersection by the collinearity equations, Gauss-Newton).
     """
@@ -289,7 +292,7 @@ def intersect(scene: Scene, track: IntArray, X: FloatArray) -> bool:
 
 @compiled
 def prune(scene: Scene, X: FloatArray, track: IntArray, residual: FloatArray) -> int:
-    """Recompute the residuals of a point and drop the rays beyond the tolerance; return how many are left."""
+    """Recompute the residuals of a point, drop rays beyond the tolerance, and return the number kept."""
     rays = 0
     for i in range(len(track)):
         a = track[i]
@@ -308,7 +311,7 @@ def prune(scene: Scene, X: FloatArray, track: IntArray, residual: FloatArray) ->
 def same_target(
     scene: Scene, one: IntArray, X: FloatArray, other: IntArray, Y: FloatArray, reach_px: float
 ) -> bool:
-    """Return whether two points are one target: never in the same photograph, and close in most of them."""
+    """Return whether two points are one target: never in the same photograph, and mostly close together."""
     near = far = 0
     for i in range(len(scene.c)):
         if not scene.oriented[i]:
@@ -345,10 +348,10 @@ def log_false_alarms(
     density: FloatArray,
     log_tests: float,
 ) -> float:
-    """Return the logarithm of the number of points as good, by rays and residuals, that chance would give.
+    """Return the logarithm of the number of points with as good rays and residuals that chance would give.
 
-    tests * binomial(n - 2, k - 2) * p^(k - 2): k of the n photographs that see the place agree, p is the
-    chance that a target lies within the radius of the residuals; two rays are taken for the hypothesis.
+    tests * binomial(n - 2, k - 2) * p^(k - 2): k of the n photographs that see the position agree. p is the
+    probability that a target lies within the radius of the residuals. The hypothesis itself uses two rays.
     """
     n = 0
     squares, log_p = 0.0, 0.0

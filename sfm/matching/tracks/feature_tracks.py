@@ -1,9 +1,10 @@
 """Tie points: points of natural texture found in several photographs and measured by least squares matching.
 
-SIFT features, whose descriptors know neither scale nor rotation, are matched pair by pair and kept where they
-fit an epipolar geometry; features connected over all photographs are one point. Each point is then put on the
-most precise place nearby in the photograph that sees it best (its reference), and carried into the others by
-least squares matching, which starts from the features' scales and directions.
+SIFT features have descriptors that depend neither on scale nor on rotation. They are matched pair by pair,
+and matches that fit an epipolar geometry are kept. Features connected over all photographs form one point.
+Each point has a reference, the photograph that shows it best. In the reference the point is moved to the most
+precise position nearby. Least squares matching then transfers it into the other photographs. It starts from
+the scales and directions of the features.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ from sfm.matching.tracks.interest import NaturalPoints
 from sfm.network import rows_of
 from sfm.runtime.progress import reported
 
-WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
-SNAP_PX = 6.0  # an interest point this close to a feature takes its place
+WINDOW_PX = 15  # larger windows are less noisy, but over them an affine warp cannot follow a curved surface
+SNAP_PX = 6.0  # an interest point this close to a feature replaces its position
 
 
-# Of pairs of photographs: pairs of features, and how distinctive they are; see `matched_features`.
+# For pairs of photographs: pairs of features, and how distinctive they are; see `matched_features`.
 Matches = dict[tuple[int, int], tuple[IntArray, FloatArray]]
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Which features belong to one point."""
+    """The features that belong to each point."""
 
     image: IntArray  # (k,)
     feature: IntArray  # index among the features of that photograph, (k,)
@@ -59,7 +60,7 @@ class TiePoints:
     point: IntArray  # 0 to n - 1, (k,)
     xy: FloatArray  # px, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
-    reference: IntArray  # the photograph that each point was taken from, (n,)
+    reference: IntArray  # the photograph in which each point was chosen, (n,)
 
     def __len__(self) -> int:
         return len(self.image)
@@ -79,17 +80,17 @@ def find_tie_points(
     known: Matches | None = None,
     neighbours: Sequence[IntArray] = (),
 ) -> TiePoints:
-    """Find and measure points that several photographs have in common, knowing nothing of their orientation.
+    """Find and measure points common to several photographs, without any knowledge of their orientation.
 
     Args:
-        photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
-        natural: what `natural_points` has found in each of them.
+        photographs: m photographs, (H, W), 8 or 16 bit, grey or colour.
+        natural: the result of `natural_points` for each of them.
         window_px: odd side of the window of least squares matching.
-        min_rays: fewest photographs of a point.
-        min_image_points: of a photograph, below which its points of two rays are taken, too.
+        min_rays: fewest photographs per point.
+        min_image_points: a photograph with fewer image points also receives its points with two rays.
         min_correlation: smallest coefficient r of a match.
-        seed: of the random samples.
-        threads: pairs of photographs worked on at a time.
+        seed: seed of the random samples.
+        threads: number of pairs of photographs matched at the same time.
         known: see `link_features`.
         neighbours: see `link_features`.
 
@@ -97,9 +98,9 @@ def find_tie_points(
         The tie points; n may be 0.
 
     Raises:
-        GeometryError: no photographs, or natural points of more or fewer.
+        GeometryError: no photographs, or a different number of photographs and natural points.
 
-    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
+    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the positions; Gruen
     (1985) for the measurement.
     """
     if not photographs or len(natural) != len(photographs):
@@ -126,7 +127,7 @@ def find_tie_points(
 
 
 def _needed(image: IntArray, point: IntArray, m: int, min_rays: int, min_image_points: int) -> BoolArray:
-    """Return which image points are of points with enough rays, or with two that a photograph needs, (k,)."""
+    """Return which image points belong to points with enough rays, or with two where needed, (k,)."""
     n = int(point.max(initial=-1)) + 1
     rays = np.bincount(point, minlength=n)
     enough = rays >= min_rays
@@ -144,20 +145,21 @@ def link_features(
     known: Matches | None = None,
     neighbours: Sequence[IntArray] = (),
 ) -> Tracks:
-    """Match the features of photographs that overlap and put together what belongs to one point.
+    """Match the features of overlapping photographs and combine the features that belong to one point.
 
-    Where the matches leave the photographs in several parts, pairs between these are matched, too.
+    If the matches leave the photographs in several separate parts, pairs between these are matched as well.
 
-    A point has one feature in a photograph: matches are taken the most distinctive first, and one that would
-    put two features of a photograph together is left: a wrong match splits a track and does not lose it.
+    A point has at most one feature in each photograph. The most distinctive matches are used first. A match
+    that would join two features of one photograph is skipped, so a wrong match splits a track but does not
+    lose it.
 
     Args:
-        features: of m photographs.
-        min_rays: fewest photographs of a point.
-        seed: of the random samples.
-        threads: pairs worked on at a time.
-        known: matches of pairs of photographs that need not be matched again; the others are added.
-        neighbours: photographs that were taken near each, see `overlapping_pairs`.
+        features: features of m photographs.
+        min_rays: fewest photographs per point.
+        seed: seed of the random samples.
+        threads: number of pairs matched at the same time.
+        known: matches of pairs of photographs that need not be matched again; new matches are added to it.
+        neighbours: photographs taken near each photograph, see `overlapping_pairs`.
     """
     known = {} if known is None else known
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
@@ -198,7 +200,7 @@ def link_features(
 
 @compiled
 def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
-    """Return the group of every feature, the first one's number, no photograph twice in any, (k,).
+    """Return the group of every feature (the number of its first feature), no photograph twice in any, (k,).
 
     Args:
         edge: matches, the most distinctive first, (e, 2).
@@ -244,20 +246,19 @@ def measure_tracks(
 ) -> TiePoints:
     """Measure the points of tracks by least squares matching from their references.
 
-    The reference is the photograph in which the features are the most extended among the middle ones of the
-    point: a template should be neither the finest nor the coarsest picture. Matching measures the difference
-    of
-    two noises: half of its covariance goes to the point in the reference, half to the other.
+    The reference is the photograph with the middle feature scale of the point, because the template should be
+    neither the finest nor the coarsest image. Matching measures a difference of two noises. Half of its
+    covariance is assigned to the point in the reference, half to the point in the other photograph.
 
     Args:
         photographs: m photographs.
-        natural: of each photograph; corners near features take their places.
-        tracks: which features belong to one point.
+        natural: natural points of each photograph; corners near features replace their positions.
+        tracks: the features that belong to each point.
         window_px: odd side of the window of least squares matching.
-        min_rays: fewest photographs of a point.
+        min_rays: fewest photographs per point.
         min_image_points: see `find_tie_points`.
         min_correlation: smallest coefficient r of a match.
-        threads: pairs of photographs worked on at a time.
+        threads: number of pairs of photographs matched at the same time.
     """
     xy = _of_tracks([one.xy for one in natural], tracks)
     scale = _of_tracks([one.scale for one in natural], tracks)
@@ -322,13 +323,13 @@ def measure_tracks(
 
 
 def _of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
-    """Return the values of the features of tracks, of m photographs, (k, ...)."""
+    """Return the values of the features of tracks, from the values of m photographs, (k, ...)."""
     first = np.cumsum([0, *(len(one) for one in values)])
     return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])
 
 
 def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:
-    """Return the row of each point whose feature has the middle scale (the larger of two), (n,)."""
+    """Return for each point the row of the feature with the middle scale (the larger of two), (n,)."""
     order = np.lexsort([scale, point])
     first = np.searchsorted(point[order], np.arange(n))
     count = np.bincount(point, minlength=n)
@@ -336,7 +337,7 @@ def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:
 
 
 def _snapped(xy: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return for each place the first (strongest) corner within reach, or the place itself."""
+    """Return for each position the first (strongest) corner within reach, or the position itself."""
     if not len(xy) or not len(corners):
         return xy
     snapped = xy.copy()

@@ -1,9 +1,9 @@
-"""SIFT features of natural texture, and which photographs have enough in common to match.
+"""SIFT features of natural texture, and pairs of photographs that overlap enough to be matched.
 
-Which photographs have enough in common to be worth matching, from a few features of each. Matching every
-photograph with every other takes time with the square of their number. The coarsest features are the most
-likely to be found again from elsewhere; how many of a few hundred of them choose each other shows which
-photographs overlap, in a small part of the time of matching all.
+Matching every photograph with every other takes time that grows with the square of their number. A few
+hundred of the coarsest features of each photograph are therefore compared first, since these are the most
+likely to be found again from another viewpoint. The number of features that choose each other shows which
+photographs overlap. This takes a small part of the time of matching all pairs.
 
 Source: Lowe (2004), IJCV 60(2); Hartley and Zisserman (2003), sec. 11.6 (epipolar geometry by RANSAC).
 """
@@ -23,25 +23,26 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
 
-FEATURES = 250  # of each photograph, the coarsest
-PARTNERS = 10  # that what they show chooses for each photograph
-NEIGHBOURS = 4  # that were taken near each photograph, whatever they show
-MIN_MUTUAL_FEATURES = 6  # features that choose each other by which an overlap is more than chance
-# Partners of a photograph with few clear ones, and of one that is not connected with the others. So many hold
-# nearly all that overlap (96 to 100 % where 3 of 10 features are found again); pairs grow with photographs.
+FEATURES = 250  # of each photograph, the coarsest ones
+PARTNERS = 10  # of each photograph, by common features
+NEIGHBOURS = 4  # of each photograph, by position, whatever they show
+MIN_MUTUAL_FEATURES = 6  # mutual matches from which an overlap is not due to chance
+# Partners of a photograph with few clear ones, or that is not connected with the others. They include nearly
+# all overlapping ones (96 to 100 % if 3 of 10 features are found again); more photographs mean more pairs.
 MANY_PARTNERS = 30
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
 EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet known
 MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trusted
 RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
-# Contrast of a feature over the full scale; OpenCV's 0.04 leaves a fifth of what a weak natural texture has.
-# Lowe (2004) has 0.03 of the range 0 to 1, before the division by the layers of an octave.
+# Contrast of a feature over the full scale; OpenCV's 0.04 keeps only a fifth of the features of a weak
+# texture.
+# Lowe (2004) uses 0.03 of the range 0 to 1, before the division by the layers of an octave.
 MIN_CONTRAST = 0.01
-# Features are looked for in a picture of at most this side, and of half the photograph's: they start the
-# matching, which measures in the photograph itself. Where such a picture has too few, in finer ones.
+# Features are extracted from an image of at most this side, reduced at least by 2: they only start the
+# matching, which measures in the photograph itself. If too few are found, a finer image is used.
 MAX_SIDE_PX = 1600
-BLOCK = 256  # descriptors of one photograph that are compared with all of another at a time
-CELLS = 12  # along the longer side of a photograph: each cell has its share of the features
+BLOCK = 256  # descriptors of one photograph compared with all of another at a time
+CELLS = 12  # along the longer side of a photograph: each cell receives its share of the features
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
 
     Args:
         photograph: (H, W), 8 or 16 bit, grey or colour.
-        max_features: of more, every cell of a raster keeps its strongest.
+        max_features: if there are more, every cell of a raster keeps its strongest.
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
@@ -75,7 +76,7 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
     sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
     while True:
         height, width = (max(1, side // shrink) for side in eight_bit.shape)
-        # whole blocks of pixels: what is left at the border belongs to none
+        # whole blocks of pixels: a remainder at the border belongs to none
         whole = eight_bit[: height * shrink, : width * shrink]
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
@@ -98,36 +99,36 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
 
 
 def _spread_out(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the rows of the features to keep: the strongest of every cell, then the next ones, up to `most`.
+    """Return the rows of the features to keep: the strongest of each cell, then the second ones and so on.
 
     Args:
         xy: features, px, (k, 2).
-        strength: of each, (k,).
-        shape: of the photograph, (H, W).
-        most: how many are kept.
+        strength: strength of each feature, (k,).
+        shape: shape of the image, (H, W).
+        most: number of features to keep.
     """
     cell_px = max(shape) / CELLS
     cell = (xy[:, 1] // cell_px).astype(np.int64) * (CELLS + 1) + (xy[:, 0] // cell_px).astype(np.int64)
     order = np.lexsort((-strength, cell))
     starts = np.searchsorted(cell[order], cell[order])
-    rank = np.arange(len(order)) - starts  # place of each feature in its cell
+    rank = np.arange(len(order)) - starts  # rank of each feature in its cell
     chosen = order[np.lexsort((-strength[order], rank))][:most]
     return np.sort(chosen)
 
 
 def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
-    """Return pairs of features (k, 2) that choose each other and obey one epipolar geometry."""
+    """Return pairs of features, (k, 2), that choose each other and fit one epipolar geometry."""
     return matched_features(a, b, seed=seed)[0]
 
 
 def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, FloatArray]:
-    """Return such pairs, and 1 - the ratio of the distances to the nearest and second-nearest one, (k,)."""
+    """Return these pairs, and 1 - the ratio of distances to the nearest and second-nearest feature, (k,)."""
     none = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     if min(len(a), len(b)) < MIN_PAIR_MATCHES:
         return none
     nearest = _nearest_descriptors(a.descriptor, b.descriptor)
     mutual = nearest.back[nearest.forth] == np.arange(len(a))
-    # of unit vectors the squared distance is 2 - 2 s
+    # the squared distance of unit vectors is 2 - 2 s
     rows = np.flatnonzero(mutual & (1 - nearest.best < RATIO**2 * (1 - nearest.second)))
     forth, best, second = nearest.forth, nearest.best[rows], nearest.second[rows]
     distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
@@ -152,16 +153,16 @@ def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, 
 class _Nearest(NamedTuple):
     """The most similar descriptors of two photographs."""
 
-    forth: IntArray  # of the second photograph, for each one of the first, (k,)
-    best: AnyArray  # similarity of that one, (k,)
-    second: AnyArray  # of the one behind it, (k,)
-    back: IntArray  # of the first photograph, for each one of the second, (l,)
+    forth: IntArray  # feature of the second photograph for each one of the first, (k,)
+    best: AnyArray  # similarity of that feature, (k,)
+    second: AnyArray  # similarity of the next-best feature, (k,)
+    back: IntArray  # feature of the first photograph for each one of the second, (l,)
 
 
 def _nearest_descriptors(first: AnyArray, second: AnyArray) -> _Nearest:
-    """Return which unit vectors of two photographs have the largest products, the first of equal ones.
+    """Return the unit vectors of two photographs with the largest products, the first of equal ones.
 
-    The products are taken block by block, so that they are read where they were written, in the cache.
+    The products are computed block by block, so that they are still in the cache when they are read.
     """
     k, size = len(first), len(second)
     found = _Nearest(
@@ -176,7 +177,7 @@ def _nearest_descriptors(first: AnyArray, second: AnyArray) -> _Nearest:
 
 @compiled
 def _take_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: AnyArray) -> None:
-    """Take over the largest of some rows, and of all columns so far."""
+    """Update the largest of some rows, and the largest of all columns so far."""
     for i in range(similarity.shape[0]):
         best, second, at = np.float32(-np.inf), np.float32(-np.inf), 0
         for j in range(similarity.shape[1]):
@@ -193,16 +194,16 @@ def _take_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: An
 def overlapping_pairs(
     score: IntArray, *, partners: int = PARTNERS, neighbours: Sequence[IntArray] = ()
 ) -> IntArray:
-    """Return pairs of photographs (i < j) that are worth matching, (p, 2).
+    """Return the pairs of photographs (i < j) that are worth matching, (p, 2).
 
-    Every photograph has its `partners` best ones and its nearest neighbours. One with clear partners for less
-    than half has MANY_PARTNERS and all its neighbours.
+    Every photograph is paired with its best `partners` and its nearest neighbours. If fewer than half as many
+    partners are clear, it receives MANY_PARTNERS and all its neighbours.
 
     Args:
-        score: features that photographs have in common, see `common_features`, (m, m).
-        partners: how many others every photograph is matched with, at least; all, if there are no more.
-        neighbours: photographs that were taken near each, the nearest first, negative for none: an array
-            (m, k) for each way to know them.
+        score: number of common features of two photographs, see `common_features`, (m, m).
+        partners: smallest number of partners per photograph; all others if there are no more.
+        neighbours: photographs taken near each photograph, the nearest first, negative for none. One array
+            (m, k) for each source of this knowledge.
     """
     m = len(score)
     if m <= partners + 1:
@@ -217,11 +218,11 @@ def overlapping_pairs(
 
 
 def connecting_pairs(score: IntArray, part: IntArray, tried: IntArray) -> IntArray:
-    """Return pairs of photographs (i < j) that may connect parts: MANY_PARTNERS for each photograph, (p, 2).
+    """Return pairs of photographs (i < j) that may connect parts: MANY_PARTNERS per photograph, (p, 2).
 
     Args:
-        score: features that photographs have in common, see `common_features`, (m, m).
-        part: which part each photograph belongs to, (m,).
+        score: number of common features of two photographs, see `common_features`, (m, m).
+        part: number of the part to which each photograph belongs, (m,).
         tried: pairs that were matched, (q, 2).
     """
     apart = part[:, None] != part
@@ -231,7 +232,7 @@ def connecting_pairs(score: IntArray, part: IntArray, tried: IntArray) -> IntArr
 
 
 def _best(score: IntArray, count: IntArray) -> BoolArray:
-    """Return which others have the highest scores with each photograph, as many as it has to have, (m, m)."""
+    """Return which others have the highest scores with each photograph, `count` of them, (m, m)."""
     ranked = np.where(np.eye(len(score), dtype=bool), -2, score)
     order = np.argsort(-ranked, axis=1, kind="stable")[:, : len(score) - 1]
     best = np.zeros(score.shape, dtype=bool)
@@ -240,7 +241,7 @@ def _best(score: IntArray, count: IntArray) -> BoolArray:
 
 
 def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray]) -> IntArray:
-    """Return how many of the coarsest features of photographs i < j choose each other, (m, m)."""
+    """Return how many of the coarsest features choose each other, for photographs i < j, (m, m)."""
     m = len(descriptors)
     coarse = [d[np.argsort(-s, kind="stable")[:FEATURES]] for d, s in zip(descriptors, scales, strict=True)]
     first = np.cumsum([0, *(len(one) for one in coarse)])
@@ -253,7 +254,7 @@ def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray
         forth = similarity.argmax(axis=1)
         rows = np.arange(len(similarity))
         best = similarity[rows, forth]
-        # the best of each photograph for every feature of this one
+        # the best feature of each photograph for every feature of this one
         starts = first[i + 1 : -1] - first[i + 1]
         some = np.flatnonzero(np.diff(first[i + 1 :]))
         if not len(some):
@@ -268,6 +269,6 @@ def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray
 
 
 def connected_parts(pairs: IntArray, m: int) -> IntArray:
-    """Return the number of the connected part that each of m photographs belongs to, (m,)."""
+    """Return for each of m photographs the number of its connected part, (m,)."""
     links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(m, m))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)

@@ -1,7 +1,7 @@
 """Interest points by the Foerstner operator: the natural points of a photograph.
 
-Where gradients of all directions meet in a window, a match is precise in all directions: the normal
-equations N = sum g g^T of a shift are large (weight w) and round (roundness q).
+A match is precise in all directions if the window contains gradients of all directions. The normal equations
+N = sum g g^T of a shift are then large (weight w) and nearly isotropic (roundness q).
 """
 
 from __future__ import annotations
@@ -21,24 +21,23 @@ from sfm.matching.radiometry import grey_of, odd_window
 from sfm.matching.tracks.features import Features, sift_features
 
 DETECTORS = ("foerstner", "sift")
-# Foerstner and Guelch (1987): 0.5 <= q <= 0.75 and w >= 0.5 to 1.5 times its mean over the photograph.
+# Foerstner and Guelch (1987): 0.5 <= q <= 0.75, and w >= 0.5 to 1.5 times its mean over the photograph.
 MIN_ROUNDNESS = 0.5
 WEIGHT_OF_MEAN = 0.5
-# Standard deviation of the derivative of a Gaussian for the gradients, px; their noise is then
+# Standard deviation of the derivative of a Gaussian used for the gradients, px; their noise is then
 # sigma_n^2 / (8 pi s^4).
 DERIVATION_PX = 1.0
-STRIP = (
-    256  # rows of a photograph of which the windows are summed at a time: their sums take 20 times its memory
-)
-REACH_PX = 3  # of such a derivative
-TEXTURE_OF_MEAN = 0.1  # of the weight of squares: less is left; whether it can be matched is for the matching
+# Rows of a photograph processed at a time: the sums over the windows take 20 times its memory.
+STRIP = 256
+REACH_PX = 3  # of this derivative
+TEXTURE_OF_MEAN = 0.1  # smallest weight of a square, relative to the mean; matching decides about the rest
 
 
 @dataclass(frozen=True)
 class InterestPoints:
     """Interest points of one photograph, the best first."""
 
-    xy: FloatArray  # point where the edges of the window meet, px, (k, 2)
+    xy: FloatArray  # intersection of the edges in the window, px, (k, 2)
     covariance: FloatArray  # ellipse of precision of xy, px^2, (k, 2, 2)
     weight: FloatArray  # w = det N / tr N, squared intensity per squared px, (k,)
     roundness: FloatArray  # q = 4 det N / tr^2 N, 1 = a circle, (k,)
@@ -61,12 +60,12 @@ def foerstner_points(
     Args:
         photograph: (H, W), 8 or 16 bit or float, grey or colour.
         window_px: odd side of the window in which gradients are collected.
-        min_distance_px: of two points that are nearer the weaker one is left out.
-        max_points: of more the strongest are kept.
-        border_px: no points this close to the border of the photograph.
+        min_distance_px: of two points that are closer, the weaker one is omitted.
+        max_points: if there are more, the strongest are kept.
+        border_px: no point may be this close to the border of the photograph.
 
     Returns:
-        The points; the sigma of an intensity for the ellipses is that of the misfit of the window's edges.
+        The points. The covariances use the standard deviation of intensities from the misfit of the edges.
 
     Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
 
@@ -109,13 +108,13 @@ def foerstner_points(
 def textured_squares(
     photograph: AnyArray, side_px: int, allowed: BoolArray, *, border_px: int = 0
 ) -> FloatArray:
-    """Return the middles of squares with texture, side by side from the upper left, whole px, (k, 2).
+    """Return the centres of squares with texture, side by side from the upper left, whole px, (k, 2).
 
     Args:
         photograph: (H, W), 8 or 16 bit or float, grey or colour.
         side_px: odd side of the squares.
-        allowed: which pixels may be a middle, (H, W).
-        border_px: no middle this close to the border of the photograph.
+        allowed: pixels that may be a centre, (H, W).
+        border_px: no centre may be this close to the border of the photograph.
 
     Source: the weight of Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
     """
@@ -136,9 +135,9 @@ def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
 
 
 def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray, AnyArray]]:
-    """Yield first and last line of strips of a photograph, and line, x and y of the gradients that they need.
+    """Yield first and last line of strips of a photograph, and the first line, x and y of their gradients.
 
-    Of a large photograph gradients, their products and sums would take twenty times its memory.
+    For a whole large photograph, the gradients, their products and sums would take twenty times its memory.
 
     Args:
         grey: the photograph, float32, (H, W).
@@ -147,13 +146,13 @@ def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray
     for first in range(0, len(grey), STRIP):
         end = min(first + STRIP, len(grey))
         begin, behind = max(0, first - half), min(len(grey), end + half)
-        above = min(begin, REACH_PX + 1)  # whose intensities are in derivatives
+        above = min(begin, REACH_PX + 1)  # lines that the derivatives need
         gx, gy = _gradients(grey[begin - above : behind + REACH_PX + 1])
         yield first, end, begin, gx[above : above + behind - begin], gy[above : above + behind - begin]
 
 
 def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]:
-    """Return weight and roundness of the window around every pixel, each (H, W), of gradients (H, W)."""
+    """Return weight and roundness of the window around every pixel, each (H, W), from gradients (H, W)."""
     xx, xy, yy = (
         cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
         for product in (gx * gx, gx * gy, gy * gy)
@@ -172,7 +171,7 @@ def _weight(grey: AnyArray, side: int) -> AnyArray:
 
 
 def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
-    """Return the first free places (x, y), line by line, whose squares do not overlap; `free` is used up."""
+    """Return the first free positions (x, y), line by line, with disjoint squares; `free` is changed."""
     found = []
     for y in range(len(free)):
         for x in np.flatnonzero(free[y]).tolist():
@@ -198,7 +197,7 @@ def _thin(row: IntArray, col: IntArray, distance: float, most: int, near: BoolAr
 
 @compiled
 def _take(near: BoolArray, row: int, col: int, distance: float) -> None:
-    """Mark the pixels within the distance of a place."""
+    """Mark the pixels within the distance of a pixel."""
     height, width = near.shape
     reach = int(np.ceil(distance))
     for i in range(max(0, row - reach), min(height, row + reach + 1)):
@@ -218,9 +217,9 @@ def _intersect_edges(
     place: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, g their gradients.
+    """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, with their gradients g.
 
-    Gradients are those from line `begin` on.
+    `gx` and `gy` begin at line `begin` of the photograph.
     """
     n = (2 * half + 1) ** 2
     for k in range(len(row)):
@@ -238,7 +237,7 @@ def _intersect_edges(
         det = xx * yy - xy * xy
         dx, dy = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
         variance = max(rest - dx * bx - dy * by, 0.0) / (n - 2)
-        # a centre of curvature far from the window's middle is no corner of this window
+        # a centre of curvature far from the centre of the window is not a corner of this window
         inside = abs(dx) <= half and abs(dy) <= half
         place[k, 0] = col[k] + (dx if inside else 0.0)
         place[k, 1] = row[k] + (dy if inside else 0.0)
@@ -248,26 +247,26 @@ def _intersect_edges(
 
 @dataclass(frozen=True)
 class NaturalPoints(Features):
-    """SIFT features of a photograph, and the places in it at which matching is the most precise."""
+    """SIFT features of a photograph, and the positions in it at which matching is most precise."""
 
-    corners: FloatArray  # px, the strongest first, (c, 2); none where features stay where they are
+    corners: FloatArray  # px, the strongest first, (c, 2); empty if features keep their positions
 
 
 @checked_arguments()
 def natural_points(
     photograph: AnyArray, *, detector: str = "foerstner", max_features: int = 2000
 ) -> NaturalPoints:
-    """Find what photographs of natural texture are linked and measured by, in one of them.
+    """Find the natural points by which a photograph is linked to others and measured.
 
     Args:
         photograph: (H, W), 8 or 16 bit, grey or colour.
-        detector: foerstner finds places for the points, sift leaves them on their features.
-        max_features: the strongest ones of all parts of the photograph.
+        detector: foerstner finds positions for the points, sift keeps those of the features.
+        max_features: largest number of features, the strongest of all parts of the photograph.
 
     Raises:
         GeometryError: an unknown detector.
 
-    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places.
+    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the positions.
     """
     if detector not in DETECTORS:
         raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
