@@ -1,17 +1,12 @@
-"""How functions are compiled with numba, and from which sources kept results were made.
+"""Compile functions with numba, and keep the compiled code for the sources from which it was made.
 
-Compiled functions are kept in `__pycache__` of this folder, those of each module in a folder named by the
-hash of all sources that it depends on: numba itself would go on using a function whose inlined parts changed.
+Compiled functions are kept in `__pycache__` of this folder. Each module has a folder there, named by the hash
+of all sources on which the module depends: its own and those of every module of the package that it imports.
+Numba itself checks only the file of a kernel. It would continue to use a function after the functions
+compiled into it have changed. Measurements of photographs on disk are kept by the same hash.
 
-The sources that a module depends on: itself and those of every module of the package that it imports.
-
-Expensive results on disk, compiled kernels and measurements of photographs, are kept
-for these sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled
-into it.
-
-Whether kernels are being compiled, which takes a minute that a person wants to know of.
-
-Numba itself reports when it begins to compile, and reports nothing when it takes a form that it has kept.
+Compilation takes a minute, and the user should know of it. Numba reports when it begins to compile, and
+reports nothing when it uses kept code, so `when_compiling` listens for its first report.
 
 Source: numba, developer manual, "Notes on the event API", event numba:compile.
 """
@@ -32,8 +27,8 @@ import numba
 from numba.core.event import Event, Listener, install_listener
 
 COMPILING = (
-    "kernels are compiled first, a minute or more, once (ahead of it: python -m sfm.warm_up, which takes "
-    "the common ones)"
+    "kernels are compiled first; this takes a minute or more, once (to do it in advance: "
+    "python -m sfm.warm_up, which compiles the common ones)"
 )
 ROOT = Path(__file__).resolve().parents[2]
 IMPORT = re.compile(r"^\s*from (sfm[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -44,7 +39,7 @@ HASH_DIGITS = 16
 
 
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
-    """Return a function compiled with these options, kept for the sources that it depends on."""
+    """Return a function compiled with these options, kept for the sources on which it depends."""
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     numba.config.CACHE_DIR = before or cache_folder(function.__module__)  # type: ignore[attr-defined]
     try:
@@ -56,7 +51,7 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
 
 @cache
 def cache_folder(module: str) -> str:
-    """Return where the compiled functions of a module are kept; elsewhere by numba if none can write here."""
+    """Return the folder for the compiled functions of a module; empty (numba chooses) if not writable."""
     sources = source_hash(module)
     if sources is None or not os.access(KEPT.parent, os.W_OK):
         return ""
@@ -68,11 +63,11 @@ def cache_folder(module: str) -> str:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function compiled for loops over arrays that it is given; it can make none itself.
+    """Return a function compiled for loops over arrays of the caller; it cannot create arrays itself.
 
-    numba counts references of every array that a loop touches; at a few dozen operations for an image point
-    the counting would take twice the time of the formula (213 against 47 ns for the collinearity
-    equations). All arrays belong to the caller here, so nothing has to be counted.
+    numba counts the references of every array that a loop uses. With a few dozen operations per image point,
+    counting would take longer than the formula itself (213 against 47 ns for the collinearity equations).
+    Here all arrays belong to the caller, so nothing has to be counted.
     """
     return _compiled(function, fastmath={"contract"}, nogil=True, _nrt=False)
 
@@ -93,17 +88,17 @@ def compiled_fast(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function that is compiled into its callers, as the formula of one observation is."""
+    """Return a function that is compiled into its callers, such as the formula of one observation."""
     return _compiled(function, inline="always")
 
 
 def inlined_fast(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function as by `inlined`, for callers compiled by `compiled_fast`."""
+    """Return a function like `inlined`, for callers compiled by `compiled_fast`."""
     return _compiled(function, nogil=True, inline="always", fastmath=True)
 
 
 def sources_of(*modules: str) -> dict[str, str]:
-    """Return the source of modules and of all that they import of this package, by name."""
+    """Return the sources of modules and of all modules of this package that they import, by name."""
     found: dict[str, str] = {}
     left = list(modules)
     while left:
@@ -117,7 +112,7 @@ def sources_of(*modules: str) -> dict[str, str]:
 
 @cache
 def source_hash(module: str) -> str | None:
-    """Return the SHA-256 of a module and of all that it imports of this package; None for other modules."""
+    """Return the SHA-256 of a module and all that it imports from this package; None for other modules."""
     if _source(module) is None:
         return None
     digest = hashlib.sha256()
@@ -128,7 +123,7 @@ def source_hash(module: str) -> str | None:
 
 @cache
 def _source(name: str) -> str | None:
-    """Return the source of a module or package; None if no file is one."""
+    """Return the source of a module or package; None if it has no file."""
     path = ROOT.joinpath(*name.split("."))
     for file in (path.with_suffix(".py"), path / "__init__.py"):
         if file.is_file():
@@ -138,7 +133,7 @@ def _source(name: str) -> str | None:
 
 @cache
 def _imported(name: str) -> tuple[str, ...]:
-    """Return what a module imports of this package: modules, and names in them that may be modules too."""
+    """Return the modules of this package that a module imports, and names in them that may be modules too."""
     found = []
     for module, names in IMPORT.findall(_source(name) or ""):
         found.append(module)
@@ -154,14 +149,14 @@ def when_compiling(send: Callable[[], None]) -> Iterator[None]:
 
 
 class _First(Listener):
-    """Hears of every kernel, reports the first."""
+    """A listener that is told of every kernel and reports the first."""
 
     def __init__(self, send: Callable[[], None]) -> None:
         self._send: Callable[[], None] | None = send
 
     def on_start(self, event: Event) -> None:
-        """A function is compiled; those of numba and other libraries do not count."""
-        module = event.data["dispatcher"].py_func.__module__ or ""  # none for what numba itself writes
+        """Handle the start of a compilation; functions of numba and other libraries do not count."""
+        module = event.data["dispatcher"].py_func.__module__ or ""  # None for code that numba itself writes
         if self._send is not None and module.startswith("sfm."):
             send, self._send = self._send, None
             send()

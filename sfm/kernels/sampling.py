@@ -1,8 +1,8 @@
 """Interpolation: intensities and their gradients between the pixels of a photograph.
 
-A kernel is a row of six weights for the pixels -2 ... 3 around the whole pixel left of (above) the place;
-kernels with fewer taps leave the outer weights 0, so that every photograph is sampled by the same loop. All
-weights add up to 1, and at whole pixels each kernel returns the pixel itself.
+A kernel is a row of six weights for the pixels -2 ... 3 around the whole pixel left of (above) the position.
+Kernels with fewer taps leave the outer weights 0, so that one loop samples every photograph. The weights add
+up to 1, and at whole pixels each kernel returns the pixel itself.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from sfm.kernels.compiling import compiled, compiled_fast, inlined_fast
 NEAREST, BILINEAR, BICUBIC, SIX_TAP = 0, 1, 2, 3
 INTERPOLATIONS = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC, "six_tap": SIX_TAP}
 TAPS = 8  # six weights and two zeros: a row of intensities is then one vector of the processor
-BEFORE, AFTER = 2, 5  # pixels that a place needs left of (above) its whole pixel, and right of it
+BEFORE, AFTER = 2, 5  # pixels that a position needs left of (above) its whole pixel, and right of it
 
 
 def interpolation_index(name: str) -> int:
-    """Return the number by which compiled code knows a kernel.
+    """Return the number of a kernel in compiled code.
 
     Raises:
         GeometryError: no such kernel.
@@ -32,20 +32,20 @@ def interpolation_index(name: str) -> int:
 
 
 def as_grey(photograph: AnyArray) -> AnyArray:
-    """Return intensities as compiled code takes them, float32, which 16 bits fit exactly, shape (H, W).
+    """Return intensities in the type that compiled code expects, float32 (exact for 16 bit), (H, W).
 
-    Kernels are compiled for each type of array, and those that fit targets take 15 s.
+    Kernels are compiled for each type of array, and those for target fits take 15 s.
     """
     return np.ascontiguousarray(photograph, dtype=np.float32)
 
 
 @checked_arguments(photograph="h w", xy="... 2")
 def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_tap") -> FloatArray:
-    """Return the intensities of a photograph at any places.
+    """Return the intensities of a photograph at any positions.
 
     Args:
         photograph: intensities, shape (H, W).
-        xy: places in the pixel frame, px, shape (..., 2).
+        xy: positions in the pixel frame, px, shape (..., 2).
         interpolation: nearest, bilinear, bicubic (Keys) or six_tap (Lagrange).
 
     Returns:
@@ -64,7 +64,7 @@ def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_
 
 @compiled
 def _resample(grey: AnyArray, xy: FloatArray, kind: int) -> FloatArray:
-    """Each place with as many pixels as its kernel has, so that those near the border are served too."""
+    """Resample each position with only the pixels of its kernel, so that positions near the border work."""
     height, width = grey.shape
     wx, wy = np.zeros(TAPS, np.float32), np.zeros(TAPS, np.float32)
     reach = (0, 0, 1, 2)[kind]
@@ -125,9 +125,10 @@ def kernel_weights(kind: int, t: np.float32, w: AnyArray) -> None:
 
 @inlined_fast
 def sample(flat: AnyArray, at: np.uintp, width: np.uintp, wx: AnyArray, wy: AnyArray) -> np.float32:
-    """Weighted mean of 6 rows of 8 pixels of a photograph stored row by row, the first of them at `at`.
+    """Return the weighted mean of 6 rows of 8 pixels of a photograph stored row by row, from index `at` on.
 
-    Unsigned places (np.uintp) spare the test for negative ones and make a row one vector: three times faster.
+    Unsigned indices (np.uintp) avoid the test for negative ones and make a row one vector: three times
+    faster.
     """
     w2 = width + width
     w3, w4 = w2 + width, w2 + w2

@@ -1,17 +1,16 @@
 """Small algebra for compiled loops: vectors, 6 x 6 blocks, Cholesky, roots of quartics.
 
-Two products of 6 x 6 and 3 x 6 numbers for compiled loops, written in vectors of six.
+Symmetric systems of equations are solved by Cholesky's factorisation. Only the lower triangle of a matrix is
+read, and all work is done in arrays of the caller.
 
-Both are the inner work of sums over pairs of rays. The compiler makes vectors of loops over long arrays, but
-not of six numbers at a time: as loops they take 21 ns, as vectors 5 ns.
+Two products of 6 x 6 and 3 x 6 numbers, the inner work of sums over pairs of rays, are written with vectors
+of six numbers. The compiler vectorises loops over long arrays, but not six numbers at a time: as loops the
+products take 21 ns, as vectors 5 ns.
 
-Small symmetric systems of equations by Cholesky's factorisation, for use inside compiled loops. Only the
-lower triangle of a matrix is read. All work is done in arrays of the caller.
-
-Real positive roots of a quartic, none of which is missed. Ferrari's two quadratic factors give the roots
-where they multiply back to the quartic and no two roots are near each other. Closed formulas lose the
-near-double roots that occur when the camera is near the danger cylinder of three points; there every interval
-between turning points is searched by bracketed Newton steps, and a turning point that touches zero within
+The positive real roots of a quartic are found without missing any. Ferrari's two quadratic factors give the
+roots if their product is the quartic again and no two roots are close together. Closed formulas lose the
+near-double roots that occur when the camera is near the danger cylinder of three points. In that case
+bracketed Newton steps search every interval between turning points. A turning point that touches zero within
 rounding counts as a double root.
 
 Source: vector types and `contract` (fused multiply-add): LLVM Language Reference; Golub and Van Loan (2013),
@@ -36,14 +35,14 @@ from sfm.kernels.compiling import compiled, compiled_fused
 MAX_ROOTS = 8  # four roots, each of which may be reported once more as a touching turning point
 TOUCH = 1e-9  # |f| at a turning point over sum |coefficient| below which it counts as a double root
 STEPS = 60
-FACTORED = 1e-11  # misfit of the product of the factors over sum |coefficient| that is accepted
-APART = 1e-5  # discriminant of a factor over p^2 + 4 |q| above which its roots are real or complex for sure
-MAX_LAST_STEP = 1e-9  # relative step; the error after it is its square, or what rounding allows
+FACTORED = 1e-11  # largest misfit of the product of the factors over sum |coefficient|
+APART = 1e-5  # discriminant of a factor over p^2 + 4 |q| above which its roots are certainly real or complex
+MAX_LAST_STEP = 1e-9  # relative step; the error after it is its square, or rounding
 SIX = ir.VectorType(ir.DoubleType(), 6)
 FUSED = ("contract",)
-_intrinsic: Any = extending.intrinsic  # whose types are those of the code that is generated
-ALIGNED = 8  # bytes; no more is known of where six numbers lie
-MIN_PIVOT = 1e-14  # what elimination leaves of a diagonal of 1 below which scaled equations are singular
+_intrinsic: Any = extending.intrinsic  # its types are those of the generated code
+ALIGNED = 8  # bytes; six numbers may start at any multiple of this
+MIN_PIVOT = 1e-14  # remainder of a diagonal of 1 after elimination, below which scaled equations are singular
 # Determinant over the product of the diagonal below which three equations are singular.
 SINGULAR_THREE = 1e-13
 
@@ -85,7 +84,7 @@ def solve_scaled(N: FloatArray, n_vector: FloatArray, dx: FloatArray) -> bool:
         dx: receives the solution, (m,).
 
     Returns:
-        False where the unknowns are not determined.
+        False if the unknowns are not determined.
     """
     m = len(n_vector)
     L = np.empty((m, m))
@@ -134,15 +133,15 @@ def solve_three(N: FloatArray, h: FloatArray, x: FloatArray) -> bool:
 
 
 def _subtract_pair(_: Any, flat: Any, at: Any, stride: Any, Y: Any, s: Any, t: Any) -> Any:
-    """Take Y_s Y_t' off 6 x 6 numbers: flat[at + q stride + p] -= sum_r Y[s, r, q] Y[t, r, p].
+    """Subtract Y_s Y_t' from 6 x 6 numbers: flat[at + q stride + p] -= sum_r Y[s, r, q] Y[t, r, p].
 
     Args:
         flat: contiguous numbers, (any,).
-        at: place of the first of them.
-        stride: from one row to the next.
+        at: index of the first of them.
+        stride: distance from one row to the next.
         Y: rows Y' of image points, contiguous, (k, 3, 6).
-        s: one of them.
-        t: another.
+        s: first image point.
+        t: second image point.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -169,13 +168,13 @@ def _add_product(_: Any, YQ: Any, s: Any, Y: Any, t: Any, flat: Any, at: Any, st
     """Add Y_t' Q to YQ_s: YQ[s, r, p] += sum_q Y[t, r, q] flat[at + q stride + p].
 
     Args:
-        YQ: what is added to, rows of image points, contiguous, (k, 3, 6).
+        YQ: sums, rows of image points, contiguous, (k, 3, 6).
         s: image point of YQ.
         Y: rows of image points, contiguous, (k, 3, 6).
         t: image point of Y.
         flat: contiguous numbers, (any,).
-        at: place of the first of 6 x 6 numbers Q.
-        stride: from one row to the next.
+        at: index of the first of the 6 x 6 numbers Q.
+        stride: distance from one row to the next.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -205,7 +204,7 @@ add_product: Callable[[FloatArray, int, FloatArray, int, FloatArray, int, int], 
 
 
 def _data(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Return the pointer to the numbers of an array."""
+    """Return the pointer to the data of an array."""
     return context.make_array(kind)(context, builder, array).data
 
 
@@ -218,12 +217,12 @@ def _place(builder: Any, numbers: Any, start: Any, offset: int) -> Any:
 
 
 def _six(builder: Any, place: Any) -> Any:
-    """Return the six numbers from a place on."""
+    """Return the six numbers that begin at a pointer."""
     return builder.load(builder.bitcast(place, SIX.as_pointer()), align=ALIGNED)
 
 
 def _repeated(builder: Any, number: Any) -> Any:
-    """Return one number six times."""
+    """Return a vector that repeats one number six times."""
     nothing, lane = ir.Constant(SIX, ir.Undefined), ir.IntType(32)
     one = builder.insert_element(nothing, number, ir.Constant(lane, 0))
     return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(lane, 6), [0] * 6))
@@ -238,7 +237,7 @@ def solve_symmetric(N: FloatArray, g: FloatArray) -> bool:
         g: right-hand side, shape (n,).
 
     Returns:
-        False, with N and g spoilt, where N is not positive definite.
+        False if N is not positive definite; N and g are then invalid.
     """
     if not factorise(N, N, 0.0):
         return False
@@ -248,7 +247,7 @@ def solve_symmetric(N: FloatArray, g: FloatArray) -> bool:
 
 @compiled
 def invert_symmetric(N: FloatArray) -> bool:
-    """Replace a symmetric matrix, shape (n, n), by its inverse; False where it is not positive definite."""
+    """Replace a symmetric matrix, shape (n, n), by its inverse; False if it is not positive definite."""
     n = len(N)
     if not factorise(N, N, 0.0):
         return False
@@ -278,10 +277,10 @@ def factorise(N: FloatArray, L: FloatArray, least: float) -> bool:
     Args:
         N: symmetric matrix, shape (n, n).
         L: receives the factor, shape (n, n); may be N itself.
-        least: smallest part of a diagonal element of N that must be left after elimination.
+        least: smallest fraction of a diagonal element of N that must remain after elimination.
 
     Returns:
-        False where no more is left: an unknown is not determined, or N is not positive definite.
+        False if less remains: an unknown is not determined, or N is not positive definite.
     """
     for i in range(len(N)):
         for j in range(i + 1):
@@ -289,7 +288,7 @@ def factorise(N: FloatArray, L: FloatArray, least: float) -> bool:
             for k in range(j):
                 total -= L[i, k] * L[j, k]
             if i == j:
-                if not total > least * N[i, i]:  # nan is not above either
+                if not total > least * N[i, i]:  # False for NaN as well
                     return False
                 L[i, i] = math.sqrt(total)
             else:
@@ -299,7 +298,7 @@ def factorise(N: FloatArray, L: FloatArray, least: float) -> bool:
 
 @compiled
 def solve_factorised(L: FloatArray, x: FloatArray) -> None:
-    """Solve L L' x = g in place: x is g, shape (n,), and receives the solution."""
+    """Solve L L' x = g in place: x contains g, shape (n,), and receives the solution."""
     n = len(L)
     for i in range(n):
         total = x[i]
@@ -338,7 +337,7 @@ def find_positive_roots(g0: float, g1: float, g2: float, g3: float, g4: float, r
     n = _roots_by_factors(g0, g1, g2, g3, g4, roots)
     if n >= 0:
         return n
-    # up to 1 in x, above 1 in 1/x, so that every search is in (0, 1]
+    # x up to 1, and 1/x for x above 1, so that every search is in (0, 1]
     n = _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, 0)
     m = _roots_in_unit_interval(g4, g3, g2, g1, g0, roots, n)
     for i in range(n, m):
@@ -348,7 +347,7 @@ def find_positive_roots(g0: float, g1: float, g2: float, g3: float, g4: float, r
 
 @compiled_fused
 def _roots_by_factors(g0: float, g1: float, g2: float, g3: float, g4: float, roots: FloatArray) -> int:
-    """Ferrari: x^4 + a x^3 + b x^2 + c x + d = (x^2 + p x + q)(x^2 + r x + s); -1 if it is not safe."""
+    """Ferrari: x^4 + a x^3 + b x^2 + c x + d = (x^2 + p x + q)(x^2 + r x + s); -1 if this is not safe."""
     reverse = abs(g0) > abs(g4)
     if reverse:
         g0, g1, g3, g4 = g4, g3, g1, g0
@@ -360,7 +359,7 @@ def _roots_by_factors(g0: float, g1: float, g2: float, g3: float, g4: float, roo
     if under_p < 0.0 or under_q < 0.0:
         return -1
     half_p, half_q = np.sqrt(under_p), np.sqrt(under_q)
-    # p s + r q = a y / 2 - 2 half_p half_q must be c; the larger of the two roots gives the smaller
+    # p s + r q = a y / 2 - 2 half_p half_q must equal c; the larger of the two roots gives the smaller
     if under_p * d * d > under_q * b * b:
         half_q = 0.25 * (a * y - 2.0 * c) / half_p
     elif half_q > 0.0:
@@ -396,7 +395,7 @@ def _roots_by_factors(g0: float, g1: float, g2: float, g3: float, g4: float, roo
 
 @compiled_fused
 def _largest_cubic_root(b: float, c: float, d: float) -> float:
-    """Largest real root of y^3 + b y^2 + c y + d (Cardano, Vieta), polished by one Newton step."""
+    """Return the largest real root of y^3 + b y^2 + c y + d (Cardano, Vieta), refined by one Newton step."""
     shift = b / 3.0
     p = c / 3.0 - shift * shift
     q = shift * (shift * shift - 0.5 * c) + 0.5 * d
@@ -418,7 +417,7 @@ def _largest_cubic_root(b: float, c: float, d: float) -> float:
 def _roots_in_unit_interval(
     g0: float, g1: float, g2: float, g3: float, g4: float, roots: FloatArray, n: int
 ) -> int:
-    """Append the roots of the quartic in (0, 1] behind the first n and return the new number."""
+    """Append the roots of the quartic in (0, 1] after the first n and return the new number."""
     # turning points of the quartic are the roots of its derivative, whose turning points are those of
     # a quadratic
     e0, e1, e2 = 2.0 * g2, 6.0 * g3, 12.0 * g4
@@ -470,7 +469,7 @@ def _roots_in_unit_interval(
 def _bracketed(
     g0: float, g1: float, g2: float, g3: float, g4: float, low: float, high: float, f_low: float
 ) -> float:
-    """Return the root in a bracket by Newton's method, kept inside by bisection."""
+    """Return the root in a bracket by Newton's method; bisection keeps it inside."""
     x = 0.5 * (low + high)
     rising = f_low < 0.0
     for _ in range(STEPS):

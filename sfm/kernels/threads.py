@@ -1,9 +1,9 @@
-"""Threads and processor cores of the process, used on purpose.
+"""Threads and processor cores of the process, limited to where they help.
 
-numpy and scipy bring a BLAS pool each, whose threads spin while they wait. On two cores 100 photographs took
-464 ms with two threads and 219 ms with one, and a symmetric product of 6000 x 1208 took 160 against 129 ms:
-both pools get one thread. Where two threads help, the work is cut into the same two parts whatever their
-number, so that the results are the same to the last bit.
+numpy and scipy each bring a BLAS pool, whose threads spin while they wait. On two cores, 100 photographs took
+464 ms with two threads and 219 ms with one, and a symmetric product of 6000 x 1208 took 160 against 129 ms.
+Both pools are therefore given one thread. Where two threads help, the work is always divided into the same
+two parts, so the results are equal to the last bit for any number of threads.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _second: ContextVar[ThreadPoolExecutor | None] = ContextVar("second", default=No
 
 @contextmanager
 def own_threads(threads: int | None = None) -> Iterator[None]:
-    """Hold both BLAS pools to one thread, then give them back what they had.
+    """Limit both BLAS pools to one thread, and restore their numbers of threads afterwards.
 
-    Where there are more, a second thread is at hand meanwhile for `at_once`, also within an inner one.
+    If more threads are available, `at_once` can meanwhile use a second one, also within nested calls.
 
     Args:
-        threads: how many there are; as many as the pools had, if not given.
+        threads: number of threads available; by default the number that the pools had.
     """
     before = [(pool, pool.num_threads) for pool in _pools()]
     there = max((number for _, number in before), default=1) if threads is None else threads
@@ -52,7 +52,7 @@ def own_threads(threads: int | None = None) -> Iterator[None]:
 
 
 def at_once(one: Callable[[], T], other: Callable[[], T]) -> tuple[T, T]:
-    """Return what two functions return; they run at the same time where a second thread is at hand."""
+    """Return the results of two functions; they run at the same time if a second thread is available."""
     second = _second.get()
     if second is None:
         return one(), other()
@@ -60,14 +60,14 @@ def at_once(one: Callable[[], T], other: Callable[[], T]) -> tuple[T, T]:
     try:
         result = one()
     finally:
-        running.exception()  # ended, whatever became of the first
+        running.exception()  # wait for its end, even if the first failed
     return result, running.result()
 
 
 def in_threads(function: Callable[[S], T], items: Sequence[S], threads: int) -> Iterator[T]:
-    """Yield what a function returns for each item, in their order, so many worked on at a time.
+    """Yield the result of a function for each item, in order, with up to `threads` of them at a time.
 
-    It gains where the function spends its time in compiled code.
+    It is faster only if the function spends its time in compiled code.
     """
     if threads < 2 or len(items) < 2:
         yield from map(function, items)
@@ -78,12 +78,12 @@ def in_threads(function: Callable[[S], T], items: Sequence[S], threads: int) -> 
 
 @cache
 def _pools() -> tuple[LibController, ...]:
-    """The BLAS libraries that are loaded; looked up once, because looking takes milliseconds."""
+    """Return the loaded BLAS libraries; they are looked up once, because this takes milliseconds."""
     return tuple(pool for pool in ThreadpoolController().lib_controllers if pool.user_api == "blas")
 
 
 def cores() -> int:
-    """Return how many processor cores this process may use."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

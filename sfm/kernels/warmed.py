@@ -1,4 +1,4 @@
-"""Whether the kernels of a survey have been compiled for the sources and the numba of today."""
+"""Record whether the kernels of a survey are compiled for the current sources and version of numba."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ DECORATORS = "sfm.kernels.compiling"
 
 
 def is_warm() -> bool:
-    """Return whether `sfm.warm_up` has ended for the kernels of today."""
+    """Return whether `sfm.warm_up` has finished for the current kernels."""
     return (_folder() / _mark()).is_file()
 
 
 def set_warm() -> None:
-    """Remember that it has, and forget earlier ones; report a folder that cannot be written."""
+    """Record that it has finished and delete earlier records; a folder that is not writable is ignored."""
     folder = _folder()
     with suppress(OSError):
         if folder == KEPT:
@@ -36,13 +36,13 @@ def set_warm() -> None:
 
 
 def _folder() -> Path:
-    """Where numba keeps what it compiles, or the user's cache where that is not writable."""
+    """Return the folder of numba's compiled code, or the user's cache if that is not writable."""
     return KEPT if os.access(KEPT.parent, os.W_OK) else user_folder("kernels", "notes of compiled kernels")
 
 
 @cache
 def _mark() -> str:
-    """Name of the file that represents the sources of all kernels."""
+    """Return the name of the file that represents the sources of all kernels."""
     digest = hashlib.sha256(numba.__version__.encode())
     for module, source in sorted(sources_of(WARM_UP).items()):
         if DECORATORS in source:
