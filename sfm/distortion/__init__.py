@@ -1,1 +1,1 @@
-"""Distortion models: functions in `brown`, `radial` and `opencv`, a row each in `models`: begin there."""
+"""Distortion models: `models` lists them (begin there); `brown`, `radial` and `opencv` contain them."""

@@ -1,22 +1,24 @@
 """Brown's corrections of the measured point, and the balanced form with R0.
 
-In the measured plane, where frame[4] is 1, the point is found whose correction meets the ray, so that
-residuals are those of what was measured and its standard deviations are their weights. In the corrected
-plane, as DBAT has it (Boerlin and Grussenmeyer, 2013, Photogrammetric Record 28(144)), the residual is the
-difference between the ray and the corrected point: affinity and distortion that shrink that plane shrink v'Pv
-too, which biases them and all that is correlated with them (`tests/adjustment/test_plane_of_residuals.py`).
+If frame[4] is 1, residuals lie in the plane of measurement. The point is found whose correction meets the
+ray, and the residual is its difference from the measured point. The standard deviations of the measurement
+are then the right weights. Otherwise residuals lie in the corrected plane, as in DBAT (Boerlin and
+Grussenmeyer, 2013, Photogrammetric Record 28(144)): the difference between the ray and the corrected point.
+Affinity and distortion that shrink this plane also shrink v'Pv, which biases them and everything correlated
+with them (`tests/adjustment/test_plane_of_residuals.py`).
 
-Signs as PhotoModeler and DBAT. Its outputs are described in `sfm.distortion.models`.
+Signs are those of PhotoModeler and DBAT. The outputs are described in `sfm.distortion.models`.
 
-Balanced radial distortion, AICON's form with a second zero crossing R0, from and to `brown_forward`.
+The balanced radial distortion is AICON's form of `brown_forward` with a second zero crossing R0:
 
     x = x0 + X (1 + R) + B1 (r2 + 2 X^2) + 2 B2 X Y + C1 X + C2 Y
     y = y0 + Y (1 + R) + B2 (r2 + 2 Y^2) + 2 B1 X Y
     R = A1 (r2 - R0^2) + A2 (r4 - R0^4) + A3 (r6 - R0^6)
 
-with X = c u, Y = c v. At the radius R0 the radial distortion is 0, by a share of the scale that goes over
-into c: with s = 1 - A1 R0^2 - A2 R0^4 - A3 R0^6 it is `brown_forward` with s c, A1 / s^3, A2 / s^5, A3 / s^7,
-B1 / s^2, B2 / s^2, C1 / s, C2 / s, to the last digit.
+with X = c u, Y = c v. At the radius R0 the radial distortion is 0, because part of the scale is assigned to
+c.
+With s = 1 - A1 R0^2 - A2 R0^4 - A3 R0^6 it is exactly `brown_forward` with s c, A1 / s^3, A2 / s^5, A3 / s^7,
+B1 / s^2, B2 / s^2, C1 / s, C2 / s.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 3.3.3 (balanced distortion).
 """
@@ -29,15 +31,17 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import inlined
 
-BALANCED_MODEL = "brown_forward"  # the model whose other form is the balanced one
+BALANCED_MODEL = "brown_forward"  # the model to which the balanced form is equivalent
 BALANCED = ("c", "x0", "y0", "A1", "A2", "A3", "R0", "B1", "B2", "C1", "C2")
 BALANCED_UNITS = ("mm", "mm", "mm", "mm^-2", "mm^-4", "mm^-6", "mm", "mm^-1", "mm^-1", "1", "1")
-BALANCED_STEPS = 50  # of Newton's method at most
+BALANCED_STEPS = 50  # largest number of steps of Newton's method
 CONVERGED = 1e-15  # last step of s, which is near 1
 Values = tuple[tuple[str, float], ...]
-LOCATED_PX = 0.25  # Newton's step after which one more leaves nothing: its error is curvature by its square
-STEPS = 20  # Newton's steps at most
-FOLDED = 0.01  # determinant of d(corrected)/d(measured), 1 without distortion: corrections fold over below it
+# Step of Newton's method after which one more is exact: its error is the curvature times the squared step.
+LOCATED_PX = 0.25
+STEPS = 20  # largest number of steps of Newton's method
+# Determinant of d(corrected)/d(measured), 1 without distortion, below which the corrections fold over.
+FOLDED = 0.01
 
 
 @inlined
@@ -80,7 +84,7 @@ def brown_affine(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """As `brown` with affinity and shear behind the corrections instead of before them.
+    """Like `brown`, with affinity and shear after the corrections instead of before them.
 
     Source: DBAT's model 4: (xd, yd) = Brown(x - x0, y - y0), (1 + b1) xd + b2 yd = c u, yd = c v.
     """
@@ -125,11 +129,11 @@ def _pinhole(
 def _inverse(
     carried: bool, frame: FloatArray, dxx: float, dxy: float, dyx: float, dyy: float
 ) -> tuple[float, float, float, float]:
-    """Return what carries differences in the corrected plane, mm, y up, to px, y down.
+    """Return the matrix from differences in the corrected plane, mm, y up, to px, y down.
 
-    It is D^-1 with D = d(corrected)/d(measured): where e is left in the corrected plane, the point that
-    should have been measured is D^-1 e away, and with the unknowns it moves by D^-1 J. Where D folds over, or
-    differences are not to be carried to the measured plane, only the unit changes.
+    It is D^-1 with D = d(corrected)/d(measured). If e remains in the corrected plane, the point that should
+    have been measured is D^-1 e away, and it moves with the unknowns by D^-1 J. If D folds over, or if
+    residuals stay in the corrected plane, only the unit changes.
     """
     fx, fy = 1.0 / frame[2], -1.0 / frame[3]
     det = dxx * dyy - dxy * dyx
@@ -186,10 +190,10 @@ def _measured(
 ) -> tuple[float, float]:  # fmt: skip
     """Return the point that Brown's corrections move to (xc, yc), by Newton's method, mm.
 
-    It is short of one more step, for which the caller has the derivatives. It starts at (x, y), the measured
-    point, which is near, and ends at a step of the length `located`. Where the corrections fold over on the
-    way, as they may at bad start values, no such point is known and the start is returned: that one step is
-    then the whole residual.
+    One more step would be exact; the caller has the derivatives for it. The iteration starts at the measured
+    point (x, y), which is near, and ends at a step shorter than `located`. With bad approximate values the
+    corrections may fold over on the way. In that case the start is returned, and that one step is the whole
+    residual.
     """
     xh, yh = x, y
     for _ in range(STEPS):
@@ -207,13 +211,13 @@ def _measured(
 
 
 def from_balanced(values: Values) -> Values:
-    """Return the parameters of `brown_forward` of a camera in the balanced form.
+    """Return the `brown_forward` parameters of a camera in the balanced form.
 
     Args:
-        values: (name, value) of `BALANCED`, those left out are 0; c may be negative, as AICON writes it.
+        values: (name, value) of `BALANCED`, omitted ones are 0; c may be negative, as AICON writes it.
 
     Raises:
-        GeometryError: R0 is so large that nothing is left of the scale.
+        GeometryError: R0 is so large that the scale is not positive.
     """
     p = dict.fromkeys(BALANCED, 0.0) | dict(values)
     A, R0 = (p["A1"], p["A2"], p["A3"]), p["R0"]
@@ -229,11 +233,11 @@ def to_balanced(values: Values, R0: float) -> Values:
     """Return a camera of model `brown_forward` in the balanced form.
 
     Args:
-        values: (name, value) of its parameters; K4 must be 0, which the balanced form has not.
-        R0: radius at which the radial distortion is to be 0, mm.
+        values: (name, value) of its parameters; K4 must be 0, since the balanced form does not have it.
+        R0: radius at which the radial distortion shall be 0, mm.
 
     Raises:
-        GeometryError: K4 is not 0, or there is no scale that balances the distortion at R0.
+        GeometryError: K4 is not 0, or no scale balances the distortion at R0.
     """
     p = dict(values)
     if p.get("K4"):
@@ -258,9 +262,9 @@ def to_balanced(values: Values, R0: float) -> Values:
 
 
 def brown_by_balanced(values: Values) -> FloatArray:
-    """Return the derivatives of `brown_forward` by the balanced form, R0 held, (10, 10).
+    """Return the derivatives of `brown_forward` by the balanced form, with R0 fixed, (10, 10).
 
-    Rows are c, x0, y0, K1, K2, K3, P1, P2, b1, b2, columns `BALANCED` without R0; c is positive.
+    Rows are c, x0, y0, K1, K2, K3, P1, P2, b1, b2, columns are `BALANCED` without R0; c is positive.
 
     Args:
         values: (name, value) of `BALANCED`.
@@ -269,7 +273,7 @@ def brown_by_balanced(values: Values) -> FloatArray:
     """
     p = dict(values)
     A, R0 = np.array([p["A1"], p["A2"], p["A3"]]), p["R0"]
-    ds = -(R0 ** (2.0 * np.arange(1, 4)))  # of s by A1, A2, A3
+    ds = -(R0 ** (2.0 * np.arange(1, 4)))  # derivatives of s by A1, A2, A3
     s = 1.0 + float(ds @ A)
     J = np.zeros((10, 10))
     scaled = (("c", 0, 1), *((f"A{i}", 2 + i, -2 * i - 1) for i in (1, 2, 3)))

@@ -1,31 +1,33 @@
-"""The distortion models: which there are, what their parameters are called, and one way to all of them.
+"""The distortion models: a table of them with their parameters, and one function for all.
 
-A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
+A model is a compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. Its inputs are
 
-    frame (6,)      centre of the photograph, px, width and height of a pixel, mm; of models in mm 1 if
-                    residuals are to be those of the measured point, 0 if of the corrected one, and 1 if
-                    affinity and shear are those of the distorted point, 0 if of the ideal one; of models
-                    in px the number of focal lengths and of further parameters behind the principal point
+    frame (6,)      [0:2] centre of the photograph, px; [2:4] width and height of a pixel, mm
+                    models in mm: [4] is 1 if residuals are those of the measured point, 0 if those of the
+                    corrected one; [5] is 1 if affinity and shear act on the distorted point, 0 if on the
+                    ideal one
+                    models in px: [4] is the number of focal lengths, [5] the number of parameters after the
+                    principal point
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
     u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
 
-and fills
+and its outputs are
 
     residual (2,)   computed minus measured, px, pixel frame (y down)
     Ju (2, 2)       its derivatives by u and v
     Jp (2, n)       its derivatives by the parameters
 
-The models of photogrammetry correct the measured point, those of computer vision distort the ideal
-one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
-the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
-a module beside `brown` and give it a row in a table below; adjustment, resection, conversion, survey file
-and reports follow from that row and from the part that each parameter plays in it, and the tests of
-derivatives and inverse run over it.
+Models of photogrammetry correct the measured point, and models of computer vision distort the ideal point. In
+both cases the residual vanishes at the true parameters. It belongs to the measured point, except in the
+models named after DBAT, whose residuals lie in the corrected plane.
 
-Distortion of the ideal point in mm, with affinity and shear of the ideal or of the distorted point.
+To add a model, write its function in a module beside `brown` and add a row to a table below. Adjustment,
+resection, conversion, survey file and reports follow from that row and from the role of each parameter in it.
+The tests of derivatives and inverse cover it as well.
 
-Signs as PhotoModeler and DBAT. Its outputs are described in `sfm.distortion.models`.
+`brown_forward` is defined here: distortion of the ideal point in mm, with affinity and shear of the ideal or
+of the distorted point. Its signs are those of PhotoModeler and DBAT.
 """
 
 from __future__ import annotations
@@ -73,10 +75,10 @@ def brown_forward(
     dxx = radial + slope * X * X + 6.0 * P1 * X + 2.0 * P2 * Y
     dxy = slope * X * Y + 2.0 * P1 * Y + 2.0 * P2 * X  # = dyx
     dyy = radial + slope * Y * Y + 6.0 * P2 * Y + 2.0 * P1 * X
-    # what affinity and shear act on, X and Y or xd and yd
+    # affinity and shear act on X and Y, or on xd and yd
     off = 1.0 - on
     xa, ya = off * X + on * xd, off * Y + on * yd
-    a, s = 1.0 + on * b1, on * b2  # of distortion
+    a, s = 1.0 + on * b1, on * b2  # factors of the distortion
     fx, fy = 1.0 / sx, -1.0 / sy
     xX = a * dxx + s * dxy + off * b1
     xY = a * dxy + s * dyy + off * b2
@@ -112,7 +114,7 @@ def brown_forward(
 
 
 class Role(Enum):
-    """The part that a parameter plays; parameters of two models correspond if they play the same."""
+    """The role of a parameter; parameters of two models correspond if they have the same role."""
 
     FOCAL = "principal distance or focal length"
     X0 = "principal point, to the right"
@@ -134,7 +136,7 @@ class Parameter(NamedTuple):
 
     @property
     def has_null_hypothesis(self) -> bool:
-        """Whether 0 is a value that the parameter could have: not a focal length, nor a place in px."""
+        """Whether the parameter could be 0: not a focal length, nor a position in px."""
         return self.role is not Role.FOCAL and not (self.role in (Role.X0, Role.Y0) and self.unit == "px")
 
 
@@ -143,17 +145,17 @@ class Model:
     """A distortion model and its parameters."""
 
     name: str
-    """as survey files and `Camera.model` have it"""
+    """as in survey files and `Camera.model`"""
     function: Callable[..., None]
     """residual and Jacobian, compiled"""
     parameters: tuple[Parameter, ...]
     """in the order of the vector"""
     corrects: bool = False
-    """whether it corrects the measured point; else it distorts the ideal one"""
+    """whether it corrects the measured point; otherwise it distorts the ideal one"""
     corrected_plane: bool = False
     """whether residuals are those of the corrected point instead of the measured one"""
     distorted_affinity: bool = False
-    """whether affinity and shear of a distortion act on the distorted point instead of the ideal one"""
+    """whether affinity and shear act on the distorted point instead of the ideal one"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,16 +164,16 @@ class Model:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their units, in the same order."""
+        """Units of the parameters in the same order."""
         return tuple(parameter.unit for parameter in self.parameters)
 
     def names_of(self, *roles: Role) -> tuple[str, ...]:
-        """Return the names of the parameters that play one of some parts, in the order of the vector."""
+        """Return the names of the parameters with any of these roles, in the order of the vector."""
         return tuple(parameter.name for parameter in self.parameters if parameter.role in roles)
 
     @property
     def in_mm(self) -> bool:
-        """Whether c, x0, y0 are in mm on the sensor; else there are focal lengths in px."""
+        """Whether c, x0, y0 are in mm on the sensor; otherwise there are focal lengths in px."""
         return "c" in self.names
 
     @property
@@ -184,7 +186,7 @@ class Model:
 
 
 def _parameters(role: Role, names: str, *units: str) -> tuple[Parameter, ...]:
-    """Parameters of one part, from their names separated by blanks and their units or the unit of all."""
+    """Return the parameters of one role, from blank-separated names and their units, or one unit for all."""
     each = names.split()
     return tuple(
         Parameter(name, unit, role)
@@ -213,7 +215,7 @@ _P1_P2 = _parameters(Role.DECENTRING, "p1 p2", "1")
 _ALPHA_BETA = (*_parameters(Role.RADIAL, "alpha", "1"), *_parameters(Role.DENOMINATOR, "beta", "1"))
 _OPENCV = (*_TWO, *_K1_K2, *_P1_P2)
 _FRACTION = (*_parameters(Role.RADIAL, "k3", "1"), *_parameters(Role.DENOMINATOR, "k4 k5 k6", "1"))
-# Those of any lens that shows equal tangents about equally long
+# models for any lens that maps approximately by tangents
 GENERAL = (
     Model("brown", brown, _BROWN, corrects=True),
     Model("brown_forward", brown_forward, _FORWARD),
@@ -224,14 +226,14 @@ GENERAL = (
     Model("brown_affine_dbat", brown_affine, _BROWN, corrects=True, corrected_plane=True),
     Model("brown_forward_affine", brown_forward, _FORWARD, distorted_affinity=True),
 )
-# COLMAP's others by its names in small letters; here those with a part of the parameters of `opencv`
+# other models of COLMAP, by its names in lower case; here those with some of the parameters of `opencv`
 PERSPECTIVE = (
     Model("simple_pinhole", radial, _ONE),
     Model("pinhole", radial, _TWO),
     Model("simple_radial", radial, (*_ONE, *_K)),
     Model("radial", radial, (*_ONE, *_K1_K2)),
 )
-# of lenses that show equal angles about equally long, where others show equal tangents so
+# models for lenses that map approximately by angles instead of tangents
 WIDE_ANGLE = (
     Model("simple_fisheye", fisheye, _ONE),
     Model("fisheye", fisheye, _TWO),
@@ -267,18 +269,18 @@ MAX_PARAMETERS = max(len(model.names) for model in ALL)
 
 
 def number_of(model: str) -> int:
-    """Return the number by which compiled code knows a model: its row in `ALL`."""
+    """Return the number of a model in compiled code: its row in `ALL`."""
     return list(MODELS).index(model)
 
 
 def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
-    """Return one function of all, to be compiled: observe(number, frame, p, x, y, u, v, residual, Ju, Jp).
+    """Return one function for all, to be compiled: observe(number, frame, p, x, y, u, v, residual, Ju, Jp).
 
-    Its source, a branch for each model, is written here, because the compiler inlines the models only from
-    plain branches on their names; a chain of closures over them makes an adjustment a third slower. It is
-    compiled once and called: compiled into each of its callers it took three times as long to compile, and
-    an adjustment was no faster. This file takes the place of its source, so that it is kept as other kernels
-    are.
+    Its source, with a branch for each model, is written here, because the compiler inlines the models only
+    from plain branches on their names. A chain of closures over them makes an adjustment a third slower. The
+    function is compiled once and called. Compiling it into each caller took three times as long, and an
+    adjustment was no faster. This file is given as the file of its source, so that the compiled code is kept
+    like other kernels.
     """
     arguments = "frame, p, x, y, u, v, residual, Ju, Jp"
     lines = [f"def observe(number, {arguments}):"]

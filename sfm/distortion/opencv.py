@@ -1,7 +1,7 @@
-"""OpenCV's models, and equidistant ones with decentring and thin prism distortion.
+"""OpenCV's models, and equidistant models with decentring and thin prism distortion.
 
-All are in units of the focal lengths, as COLMAP has them. The ideal point (a, b) goes to e = s(r2) (a, b), as
-in `radial`, and from there to the distorted point. Outputs are described in `sfm.distortion.models`.
+All are in units of the focal lengths, as in COLMAP. The ideal point (a, b) is mapped to e = s(r2) (a, b), as
+in `radial`, and from there to the distorted point. The outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def thin_prism_fisheye(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """As OPENCV with (a, b) theta / r for (a, b): fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1.
+    """Like OPENCV, with (a, b) theta / r for (a, b): fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1.
 
     With t2 = theta^2, ad = ea (1 + k1 t2 + ... + k4 t8) + 2 p1 ea eb + p2 (t2 + 2 ea^2) + sx1 t2,
     bd = eb (1 + ...) + 2 p2 ea eb + p1 (t2 + 2 eb^2) + sy1 t2.
@@ -104,7 +104,7 @@ def _through(
     ad: float, bd: float, aa: float, ab: float, ba: float, bb: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill what follows from the distorted point and its derivatives aa, ab, ba, bb by e = s(r2) (a, b)."""
+    """Fill all outputs from the distorted point and its derivatives aa, ab, ba, bb by e = s(r2) (a, b)."""
     xx, xy, yy = s + 2.0 * a * a * ds, 2.0 * a * b * ds, s + 2.0 * b * b * ds  # d e / d (a, b)
     seen(
         frame, p, x, y, ad, bd,
@@ -121,7 +121,7 @@ def opencv(
     """Distortion of the ideal point in units of the focal length: fx, fy, cx, cy, k1, k2, p1, p2.
 
     Source: OpenCV calib3d and COLMAP, camera model OPENCV; there y is down, so a = u, b = -v.
-    cx, cy count from the centre of the top-left pixel here, from its corner in COLMAP.
+    Here cx, cy count from the centre of the top-left pixel, in COLMAP from its corner.
     """
     a, b = u, -v
     fx, fy, k1, k2, p1, p2 = p[0], p[1], p[4], p[5], p[6], p[7]
@@ -143,7 +143,7 @@ def full_opencv(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """As `opencv` with the rational radial term (1 + k1 r2 + k2 r4 + k3 r6)/(1 + k4 r2 + k5 r4 + k6 r6).
+    """Like `opencv`, with the rational radial term (1 + k1 r2 + k2 r4 + k3 r6)/(1 + k4 r2 + k5 r4 + k6 r6).
 
     Source: OpenCV calib3d and COLMAP, camera model FULL_OPENCV (parameters in the same order).
     """
@@ -178,7 +178,7 @@ def _pinhole(
     radial: float, slope: float, p1: float, p2: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill what is common to both OpenCV models: residual, derivatives by u, v and by fx, fy, cx, cy."""
+    """Fill the outputs common to both OpenCV models: residual, derivatives by u, v and by fx, fy, cx, cy."""
     fx, fy = p[0], p[1]
     residual[0] = fx * ad + p[2] - x
     residual[1] = fy * bd + p[3] - y

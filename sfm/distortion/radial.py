@@ -1,9 +1,9 @@
-"""Models of a radial distortion with focal lengths in px, perspective or wide-angle, as COLMAP has them.
+"""Models of radial distortion with focal lengths in px, perspective or wide-angle, as in COLMAP.
 
-The ideal point (a, b) = (x/z, y/z), y down, goes to s(r2) (a, b) with r2 = a^2 + b^2, and to pixels by one
-focal length or two, by frame[4]. All of them are smooth on the axis: s is a function of r2.
+The ideal point (a, b) = (x/z, y/z), y down, is mapped to s(r2) (a, b) with r2 = a^2 + b^2. One or two focal
+lengths (frame[4]) convert it to pixels. All models are smooth on the axis because s is a function of r2.
 
-Its outputs are described in `sfm.distortion.models`.
+The outputs are described in `sfm.distortion.models`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import math
 from sfm.conventions import FloatArray
 from sfm.kernels.compiling import inlined
 
-SERIES = 0.01  # r2 below which a closed form has lost more digits than its series leaves out
-SMALL_OMEGA2 = 1e-3  # likewise, of omega^2
+SERIES = 0.01  # r2 below which a series is more precise than the closed form
+SMALL_OMEGA2 = 1e-3  # the same for omega^2
 
 
 @inlined
@@ -96,7 +96,7 @@ def division(
     a, b, first = u, -v, int(frame[4]) + 2
     r2 = a * a + b * b
     k = p[first]
-    root = math.sqrt(1.0 - 4.0 * k * r2)  # NaN beyond where the distortion folds over
+    root = math.sqrt(1.0 - 4.0 * k * r2)  # NaN where the distortion folds over
     s = 2.0 / (1.0 + root)
     ds = s * s * k / root
     by_k = s * s * r2 / root
@@ -140,7 +140,7 @@ def equidistant(r2: float) -> tuple[float, float]:
 
 @inlined
 def _ratio_of_tangent(omega: float, w: float, dw: float) -> tuple[float, float]:
-    """Return w / omega with w = 2 tan(omega / 2), and its derivative; by series where omega is small."""
+    """Return w / omega with w = 2 tan(omega / 2), and its derivative; by series if omega is small."""
     o2 = omega * omega
     if o2 < SMALL_OMEGA2:
         ratio = 1.0 + o2 * (1.0 / 12.0 + o2 * (1.0 / 120.0 + o2 * (17.0 / 20160.0 + o2 * 31.0 / 362880.0)))
@@ -154,7 +154,7 @@ def _scaled(
     frame: FloatArray, p: FloatArray, x: float, y: float, a: float, b: float, s: float, ds: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill what follows from s and ds = d s / d(r2) of a radial distortion."""
+    """Fill all outputs from s and ds = d s / d(r2) of a radial distortion."""
     ab = 2.0 * a * b * ds
     seen(frame, p, x, y, s * a, s * b, s + 2.0 * a * a * ds, ab, ab, s + 2.0 * b * b * ds, residual, Ju, Jp)
 
@@ -172,7 +172,7 @@ def seen(
         x: measured pixel.
         y: measured pixel.
         ad: distorted point in units of the focal lengths, y down.
-        bd: likewise.
+        bd: the same along y.
         aa: d ad / d a, of the ideal point (a, b) = (u, -v).
         ab: d ad / d b.
         ba: d bd / d a.
@@ -187,7 +187,7 @@ def seen(
     residual[1] = fy * bd + p[focal + 1] - y
     Ju[0, 0], Ju[0, 1] = fx * aa, -fx * ab
     Ju[1, 0], Ju[1, 1] = fy * ba, -fy * bb
-    Jp[1, 0] = Jp[0, focal - 1] = 0.0  # of two focal lengths; one has both derivatives
+    Jp[1, 0] = Jp[0, focal - 1] = 0.0  # with two focal lengths; one alone has both derivatives
     Jp[0, 0], Jp[1, focal - 1] = ad, bd
     Jp[0, focal], Jp[1, focal] = 1.0, 0.0
     Jp[0, focal + 1], Jp[1, focal + 1] = 0.0, 1.0
