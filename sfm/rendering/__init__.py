@@ -1,1 +1,1 @@
-"""Synthetic photographs of scenes with known truth; begin with `render`, what can be drawn is in `scene`."""
+"""Synthetic photographs of scenes with known truth: begin with `render`; `scene` lists what can be drawn."""

@@ -1,7 +1,7 @@
-"""Area sampling of marks on planes: how much of a cell of the photograph a disc, arc or rectangle covers.
+"""Area sampling of marks on planes: the fraction of a photograph's cell that a disc, arc or rectangle covers.
 
-The compiled part of `render`. A cell is one of n^2 parts of a pixel. Plane coordinates are linear
-within a cell to second order, and the edge of a mark is taken as straight in each of PARTS^2 parts of it.
+This is the compiled part of `render`. A cell is one of n^2 parts of a pixel. Plane coordinates are linear
+within a cell to second order. The edge of a mark is taken as straight in each of PARTS^2 parts of a cell.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 from sfm.rendering.scene import ARC, DISC, RECTANGLE
 
-# An edge counts as straight within this part of a cell; an arc of 4 px radius departs by 1e-3 px there.
+# An edge counts as straight within 1 / PARTS of a cell; an arc of 4 px radius deviates by 1e-3 px there.
 PARTS = 3
 
 
@@ -21,7 +21,7 @@ class Cell(NamedTuple):
     """A cell of the photograph on the plane of a face, object unit; zeros behind the camera."""
 
     a: float
-    """plane coordinates of its middle"""
+    """plane coordinates of its centre"""
     b: float
     a_column: float
     """steps of the plane coordinates to the next cell in the row"""
@@ -40,9 +40,9 @@ class Lamp(NamedTuple):
     height: float
     """above the plane, object unit"""
     reach2: float
-    """squared distance at which the lamp shines with strength 1, 0 where there is none"""
+    """squared distance at which the lamp gives strength 1, 0 without a lamp"""
     ambient: float
-    """light from everywhere"""
+    """light from all directions"""
 
 
 @compiled
@@ -60,21 +60,21 @@ def fill_face(
     lamp: Lamp,
     n: int,
 ) -> None:
-    """Fill value and cover of the cells of a face: its lit texture, and the part of each cell inside it.
+    """Fill value and cover of the cells of a face: its lit texture, and the fraction of each cell inside it.
 
-    Light and texture are taken once a pixel; only pixels at the edge of the face are divided into cells.
+    Light and texture are computed once per pixel; only pixels at the edge of the face are divided into cells.
 
     Args:
         value: receives the intensities, (rows, columns) of the box.
-        cover: receives the parts inside the face, 0 to 1, of the same shape.
+        cover: receives the fractions inside the face, 0 to 1, of the same shape.
         box: first and last row and column of the cells of the face, in whole pixels, (4,).
         rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
         H: plane coordinates from rays, (3, 3).
         rectangle: the face as the shape of a mark, (4,).
         mean: reflectance of the face.
-        amplitude: of its texture.
+        amplitude: amplitude of its texture.
         grain: size of a grain of the texture, object unit.
-        seed: of the texture.
+        seed: seed of the texture.
         lamp: the light.
         n: cells along a pixel.
     """
@@ -114,12 +114,12 @@ def paint_mark(
     lamp: Lamp,
     n: int,
 ) -> None:
-    """Blend a lit mark into the cells of its face by the area that it covers of each.
+    """Blend a lit mark into the cells of its face by the area that it covers in each.
 
     Args:
         value: intensities of the cells of the face.
-        box: their first and last row and column, (4,).
-        part: those of the cells around the mark, (4,).
+        box: first and last row and column of these cells, (4,).
+        part: first and last row and column of the cells around the mark, (4,).
         rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
         H: plane coordinates from rays, (3, 3).
         kind: DISC, ARC or RECTANGLE.
@@ -143,13 +143,13 @@ def paint_mark(
 
 @compiled
 def cover_with(fine: AnyArray, box: IntArray, value: AnyArray, cover: AnyArray) -> None:
-    """Blend a face into the cells of a photograph by the part of each that it covers.
+    """Blend a face into the cells of a photograph by the fraction of each that it covers.
 
     Args:
         fine: intensities of all cells.
-        box: first and last row and column of those of the face, (4,).
+        box: first and last row and column of the cells of the face, (4,).
         value: intensities of the face, (rows, columns) of the box.
-        cover: the parts inside the face, 0 to 1, of the same shape.
+        cover: fractions inside the face, 0 to 1, of the same shape.
     """
     for i in range(value.shape[0]):
         for j in range(value.shape[1]):
@@ -160,7 +160,7 @@ def cover_with(fine: AnyArray, box: IntArray, value: AnyArray, cover: AnyArray) 
 
 @compiled
 def light_on(a: float, b: float, lamp: Lamp) -> float:
-    """Return the light at a place of a face: ambient, and a lamp by the cosine and inverse square laws."""
+    """Return the light at a point of a face: ambient, and a lamp by the cosine and inverse square laws."""
     d2 = (a - lamp.a) ** 2 + (b - lamp.b) ** 2 + lamp.height**2
     return lamp.ambient + max(lamp.height, 0.0) / math.sqrt(d2) * lamp.reach2 / d2
 
@@ -169,15 +169,15 @@ def light_on(a: float, b: float, lamp: Lamp) -> float:
 def on_plane(
     rays: FloatArray, H: FloatArray, y: int, x: int, fx: float, fy: float, step: float
 ) -> tuple[bool, Cell]:
-    """Return whether a place in pixel (x, y) meets the plane in front, and where.
+    """Project a position in pixel (x, y) onto the plane of a face.
 
     Args:
         rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
         H: plane coordinates from rays, (3, 3).
         y: row of the pixel.
-        x: its column.
-        fx: place in the pixel from its left edge, 0 to 1.
-        fy: place in the pixel from its upper edge, 0 to 1.
+        x: column of the pixel.
+        fx: position in the pixel from its left edge, 0 to 1.
+        fy: position in the pixel from its upper edge, 0 to 1.
         step: width of a cell, px.
 
     Returns:
@@ -213,7 +213,7 @@ def interpolate(
     fy: float,
     step: float,
 ) -> tuple[float, float, float]:
-    """Return the bilinear value in a pixel and its change to the next cell in columns and rows."""
+    """Return the bilinear value in a pixel, and its change to the next cell along columns and rows."""
     top = top_left + fx * (top_right - top_left)
     bottom = bottom_left + fx * (bottom_right - bottom_left)
     across = (1 - fy) * (top_right - top_left) + fy * (bottom_right - bottom_left)
@@ -222,7 +222,7 @@ def interpolate(
 
 @compiled
 def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) -> float:
-    """Return the part of a cell inside a mark, 0 to 1, exact for straight edges in PARTS^2 parts of it."""
+    """Return the fraction of a cell inside a mark, exact for edges that are straight in PARTS^2 parts."""
     a, b = cell.a - a0, cell.b - b0
     f, fa, fb = inside(kind, a, b, shape)
     gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
@@ -242,11 +242,11 @@ def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) 
 
 @compiled
 def half_plane(f: float, gx: float, gy: float, side: float) -> float:
-    """Return the part of a square on the positive side of the line f + gx x + gy y = 0 about its centre."""
+    """Return the fraction of a square where f + gx x + gy y > 0, with x and y from its centre."""
     gx, gy = abs(gx) * side, abs(gy) * side
     if gx + gy < 1e-300:
         return 1.0 if f > 0 else 0.0
-    # Distance from the corner that is farthest on the negative side, in steps of f.
+    # Distance from the corner that is farthest on the negative side, in the unit of f.
     low, high = min(gx, gy), max(gx, gy)
     t = f + 0.5 * (gx + gy)
     if t <= 0:
@@ -265,7 +265,7 @@ def half_plane(f: float, gx: float, gy: float, side: float) -> float:
 
 @compiled
 def inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, float, float]:
-    """Return the distance inside a mark (object unit) at plane coordinates from its centre, and gradient."""
+    """Return the distance inside a mark, object unit, at plane coordinates from its centre; its gradient."""
     if kind == DISC:
         radius = math.sqrt(a * a + b * b)
         if radius == 0.0:
@@ -277,7 +277,7 @@ def inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, flo
         if shape[1] - radius < f:
             f, fa, fb = shape[1] - radius, -a / radius, -b / radius
         start, end = shape[2], shape[2] + shape[3]
-        # Distances from the lines of the two ends; an arc over half of the circle is the union of both.
+        # Distances from the lines of both ends; an arc of more than half a circle is the union of both sides.
         from_start = -math.sin(start) * a + math.cos(start) * b
         from_end = math.sin(end) * a - math.cos(end) * b
         first = from_start < from_end
@@ -302,7 +302,7 @@ def inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, flo
 
 @compiled
 def smooth_noise(x: float, y: float, seed: int) -> float:
-    """Return noise of about +-1 that changes smoothly over a unit, the same at the same place.
+    """Return noise of about +-1 that changes smoothly over a unit and is reproducible at each position.
 
     Source: value noise after Perlin (1985), Computer Graphics 19(3), on a lattice of hashed values.
     """
@@ -316,7 +316,7 @@ def smooth_noise(x: float, y: float, seed: int) -> float:
 
 @compiled
 def lattice(i: int, j: int, seed: int) -> float:
-    """Return the value between -1 and 1 of a lattice point.
+    """Return the value of a lattice point, between -1 and 1.
 
     Source: finaliser of MurmurHash3 (Appleby 2011), 32 bit.
     """

@@ -1,8 +1,8 @@
-"""Photographs of a plan: its points as circular targets, coded ones with their ring.
+"""Photographs of a plan: its points are shown as circular targets, coded ones with their ring.
 
-Each target is on a separate card that faces as its point does. Cards and background are of one brightness,
-so that nothing but targets is seen; a photograph has those that the plan predicts, since what hides the
-others is not painted.
+Each target is on a separate card that faces in the direction of its point. Cards and background have the same
+brightness, so that only targets are visible. A photograph shows the targets that the plan predicts; objects
+that hide other targets are not drawn.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sfm.rendering.scene import (
 from sfm.targets.codes.rings import CodeFamily
 
 PAPER, INK = 0.8, 0.08  # reflectance of cards and of targets
-MARGIN = 1.25  # of a card over its target or ring
+MARGIN = 1.25  # size of a card over its target or ring
 
 
 def planned_scene(
@@ -40,9 +40,9 @@ def planned_scene(
 
     Args:
         xyz: centres of the targets, object unit, (n, 3).
-        normals: that they face, length 1, (n, 3).
-        code: number of each, UNCODED = a dot without ring, (n,).
-        radius: of the dots, object unit.
+        normals: directions in which they face, length 1, (n, 3).
+        code: code numbers, UNCODED = a dot without a ring, (n,).
+        radius: radius of the dots, object unit.
         family: the family of codes.
 
     Raises:
@@ -88,25 +88,25 @@ def write_planned_photographs(
     optics: Optics,
     seed: int,
 ) -> None:
-    """Render the photographs of a plan and write them into a folder that is there.
+    """Render the photographs of a plan and write them into an existing folder.
 
     Args:
-        folder: where they go.
+        folder: folder of the photographs.
         names: file names, m of them.
         camera: interior orientation.
         position: projection centres, object unit, (m, 3).
         rotation: R of each, (m, 3, 3).
-        xyz: as of `planned_scene`, as normals, code, radius and family.
-        normals: likewise.
-        code: likewise.
-        radius: likewise.
+        xyz: see `planned_scene`, as for normals, code, radius and family.
+        normals: see `planned_scene`.
+        code: see `planned_scene`.
+        radius: see `planned_scene`.
         seen: which photograph shows which target, (m, n).
-        family: as of `planned_scene`.
+        family: see `planned_scene`.
         optics: blur, exposure and noise.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Raises:
-        GeometryError: a code that the family does not have, or targets that are larger than their distance.
+        GeometryError: a code that the family does not have, or targets that overlap.
         OutputError: a photograph cannot be written.
     """
     _refuse_overlap(xyz, radius * np.where(code == UNCODED, 1.0, family.outer), seen)
@@ -122,7 +122,7 @@ def write_planned_photographs(
 
 
 def _refuse_overlap(xyz: FloatArray, reach: FloatArray, seen: BoolArray) -> None:
-    """Raise GeometryError where two targets that one photograph shows are nearer than their rings reach."""
+    """Raise GeometryError if two targets in one photograph are closer than their rings allow."""
     together = seen.T.astype(np.int64) @ seen.astype(np.int64) > 0
     distance = np.linalg.norm(xyz[:, None] - xyz[None], axis=2) - MARGIN * (reach[:, None] + reach[None])
     np.fill_diagonal(distance, np.inf)

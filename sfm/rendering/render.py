@@ -1,15 +1,14 @@
-"""Render: photographs of scenes with circular targets by area sampling, and the truth that goes with them.
+"""Render: photographs of scenes with circular targets by area sampling, together with their truth.
 
     python -m sfm.rendering.render datasets/demo/scene.toml build/demo
 
-The ray of every point of the photograph is intersected with the plane of the face, so a circle is seen in
-perspective and through the distortion as it is, not as an ellipse drawn at its centre. A cell of the
-photograph that an edge crosses gets the area inside; the blur is applied on a finer raster than the pixels,
-which are then means over their areas.
+The ray of every point of the photograph is intersected with the plane of the face. A circle is therefore seen
+in true perspective and distortion, and is not just an ellipse drawn around its centre. A cell of the
+photograph that is crossed by an edge receives the area inside. The blur is applied on a raster finer than the
+pixels. Each pixel is then the mean over its area.
 
-Painting order: which face of a scene hides which, seen from a camera.
-
-Truth of a rendered photograph: where each target of a scene is in it, and whether it is whole.
+The painting order tells which face of a scene hides which, as seen from a camera. The truth of a rendered
+photograph is the position of each target in it, and whether the target is whole.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from sfm.rendering.scene_file import Staging, read_scene
 from sfm.runtime.faults import ending_of
 from sfm.runtime.installation import refuse_folder_settings
 
-# A ray meets this many points of the rim when the truth asks whether a target is hidden.
+# Number of points of the rim that are tested to find out whether a target is hidden.
 RIM = 16
 # Corners of the polygon whose centre of area is the centre of the image of a circle.
 OUTLINE = 256
 
-# Faces that reach into each other by less than this part of the largest one only touch.
+# Faces that intersect each other by less than this fraction of the largest one only touch.
 TOUCHING_FRACTION = 1e-6
 
 TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
@@ -61,7 +60,7 @@ def render_photograph(
     """Photograph a scene.
 
     Args:
-        scene: what is photographed.
+        scene: the scene.
         camera: interior orientation, any distortion model.
         position: projection centre, object unit, (3,).
         rotation: R, image to object axes, (3, 3).
@@ -70,7 +69,7 @@ def render_photograph(
         rays: result of `corner_rays(camera)`, to share it between photographs.
 
     Returns:
-        Intensities, uint8 or uint16, shape (height, width), and where the targets are.
+        Intensities, uint8 or uint16, shape (height, width), and the positions of the targets.
 
     Raises:
         GeometryError: neither 8 nor 16 bit.
@@ -81,7 +80,7 @@ def render_photograph(
     width, height = camera.size_px
     n = optics.oversampling
     fine = np.full((height * n, width * n), scene.background, dtype=np.float32)
-    scratch = np.empty((2, fine.size), dtype=np.float32)  # once for all faces: fresh memory is slow
+    scratch = np.empty((2, fine.size), dtype=np.float32)  # allocated once for all faces: new memory is slow
     for face in painting_order(scene, position):
         _paint_face(fine, scene, int(face), camera, position, rotation, rays, n, scratch)
     sigma = optics.blur_px * n
@@ -102,19 +101,19 @@ def render_photographs(
     seed: int,
     threads: int = 2,
 ) -> tuple[list[AnyArray], list[ProjectedTargets]]:
-    """Photograph a scene from several stations side by side; each has other noise, given by the seed.
+    """Photograph a scene from several stations in parallel; the seed gives each photograph its own noise.
 
     Args:
-        scene: what is photographed.
+        scene: the scene.
         camera: interior orientation, any distortion model.
         positions: projection centres, (m, 3), object unit.
         rotations: R of each photograph, (m, 3, 3).
         optics: blur, vignetting, exposure, noise and depth of the photographs.
-        seed: of the noise.
-        threads: photographs rendered at a time.
+        seed: seed of the noise.
+        threads: number of photographs rendered at the same time.
 
     Returns:
-        The photographs and where the targets are in each.
+        The photographs and the positions of the targets in each.
     """
     rays = corner_rays(camera)
     sources = np.random.default_rng(seed).spawn(len(positions))
@@ -132,23 +131,23 @@ def render_photographs(
 def corner_rays(camera: Camera) -> FloatArray:
     """Return the tangents (u, v) at the corners of all pixels, (height + 1, width + 1, 2).
 
-    Between the corners of a pixel they are linear to 1e-4 px even where distortion reaches 100 px.
+    Between the corners of a pixel they are linear to 1e-4 px, even if the distortion reaches 100 px.
 
     Raises:
-        GeometryError: the distortion cannot be inverted in all of the photograph.
+        GeometryError: the distortion cannot be inverted everywhere in the photograph.
     """
     width, height = camera.size_px
     x, y = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
     uv = tangents_from_pixel(camera, np.column_stack([x.ravel(), y.ravel()]))
     if not np.isfinite(uv).all():
         raise GeometryError(
-            f"camera {camera.name}: its distortion cannot be inverted in all of the photograph"
+            f"camera {camera.name}: its distortion cannot be inverted everywhere in the photograph"
         )
     return uv.reshape(height + 1, width + 1, 2)
 
 
 def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyArray:
-    """Return the intensities that the sensor gives for the light on it."""
+    """Return the intensities that the sensor records for the light on it."""
     height, width = light.shape
     y, x = np.ogrid[:height, :width]
     corner = (width / 2) ** 2 + (height / 2) ** 2
@@ -172,7 +171,7 @@ def _paint_face(
     n: int,
     scratch: AnyArray,
 ) -> None:
-    """Paint one face with its marks and its light over what is there, n cells along a pixel."""
+    """Paint one face with its marks and its light over the existing image, n cells along a pixel."""
     faces, marks = scene.faces, scene.marks
     H = _plane_from_ray(scene, face, position, rotation)
 
@@ -203,7 +202,7 @@ def _paint_face(
     cover_with(fine, box, value, cover)
 
 
-# A square of half length 1, points along its sides so that its image is bounded under distortion too.
+# A square of half length 1, with points along its sides so that its image is bounded even with distortion.
 _SIDE = np.linspace(-1, 1, 9)[:-1]
 SQUARE = np.concatenate(
     [
@@ -216,14 +215,14 @@ SQUARE = np.concatenate(
 
 
 def _windows(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
-    """Return first and last row and column of the cells around places (k, p, 2), (k, 4); in whole pixels."""
+    """Return first and last row and column of the cells around points (k, p, 2), (k, 4); in whole pixels."""
     whole = (0, shape[0], 0, shape[1])
     in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
     seen = np.where(in_front[:, None, None], xy, 0.0)
     low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, shape[::-1])
     high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, shape[::-1])
     found = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
-    return np.where(in_front[:, None], found, whole)  # partly behind the camera: anywhere
+    return np.where(in_front[:, None], found, whole)  # partly behind the camera: can be anywhere
 
 
 def _lamp(scene: Scene, face: int) -> Lamp:
@@ -251,13 +250,13 @@ def _plane_from_ray(scene: Scene, face: int, position: FloatArray, rotation: Flo
 
 
 def write_photographs(staging: Staging, folder: Path) -> None:
-    """Render a scene file's photographs and write them with the truth; all files appear, or none.
+    """Render the photographs of a scene file and write them with the truth; all files appear, or none.
 
     Args:
         staging: result of `read_scene`.
-        folder: where the photographs go, with truth_points.csv (targets at the object), truth_images.csv
-            (exterior orientation) and truth_image_points.csv (images of the circles' centres and the
-            centres of their outlines, where the whole target is seen).
+        folder: folder of the photographs, with truth_points.csv (targets on the object), truth_images.csv
+            (exterior orientation) and truth_image_points.csv. The latter contains, for each target that is
+            wholly visible, the images of the circle's centre and the centre of its outline.
 
     Raises:
         OutputError: a file cannot be written.
@@ -307,7 +306,7 @@ def main() -> int:
         prog="python -m sfm.rendering.render", description=__doc__.splitlines()[0]
     )
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
-    parser.add_argument("folder", type=Path, help="where the photographs and the truth go")
+    parser.add_argument("folder", type=Path, help="folder for the photographs and the truth")
     given = parser.parse_args()
     try:
         refuse_folder_settings()
@@ -325,10 +324,10 @@ def main() -> int:
 
 
 def painting_order(scene: Scene, position: FloatArray) -> IntArray:
-    """Return the faces turned to the camera, from back to front (painter's algorithm).
+    """Return the faces turned towards the camera, from back to front (painter's algorithm).
 
-    Of two faces whose images overlap, one is painted first if it lies on the far side of the plane of the
-    other, or the other on the near side of the first's.
+    If the images of two faces overlap, one is painted first if it lies on the far side of the plane of the
+    other, or if the other lies on the near side of its own plane.
 
     Source: Newell, Newell and Sancha (1972), Proc. ACM National Conference, p. 443 (tests 2 to 4).
     """
@@ -336,7 +335,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     normal = faces.normals()
     turned = np.flatnonzero(np.einsum("fi,fi->f", normal, position - faces.centre) > 0)
     corners = faces.corners()
-    # Height of the corners of face g above the plane of face f.
+    # height of the corners of face g above the plane of face f
     above = np.einsum("fi,fgci->fgc", normal, corners[None] - faces.centre[:, None, None])
     slack = TOUCHING_FRACTION * np.abs(faces.half).max(initial=0.0)
     far = (above <= slack).all(axis=2).T  # [g, f]: g is on the far side of f
@@ -349,16 +348,16 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     order: list[int] = []
     while rest:
         ready = [g for g in rest if not any(must_precede[f, g] for f in rest)]
-        # Faces that overlap in a circle have no order; then the farthest goes first.
+        # Faces that hide each other in a cycle have no order; the farthest is then painted first.
         order.append(int((ready or rest)[0]))
         rest.remove(order[-1])
     return np.array(order, dtype=np.int64)
 
 
 def _apart(corners: FloatArray, slack: float) -> BoolArray:
-    """Return which faces have images apart from each other, (f, f), from corners (f, 4, 3) off the camera.
+    """Return which faces have disjoint images, (f, f), from their corners minus the camera, (f, 4, 3).
 
-    Two convex images are apart if a plane through the camera and an edge of one has the other outside.
+    Two convex images are disjoint if a plane through the camera and an edge of one has the other outside.
     """
     sight = np.cross(corners, np.roll(corners, -1, axis=1))  # normals of these planes
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)
@@ -370,7 +369,7 @@ def _apart(corners: FloatArray, slack: float) -> BoolArray:
 
 @dataclass(frozen=True)
 class ProjectedTargets:
-    """Where each target of the scene is in a photograph."""
+    """Positions of the targets of a scene in a photograph."""
 
     centre: FloatArray  # image of the centre of the circle, px, NaN behind the camera, (n, 2)
     outline_centre: FloatArray  # centre of area of the image of the circle, px, (n, 2)
@@ -381,7 +380,7 @@ class ProjectedTargets:
 def project_targets(
     scene: Scene, camera: Camera, position: FloatArray, rotation: FloatArray
 ) -> ProjectedTargets:
-    """Return where the targets of a scene are in a photograph and which are whole in it."""
+    """Return the positions of the targets of a scene in a photograph, and which are wholly visible."""
     faces, targets = scene.faces, scene.targets
     n = len(targets)
     angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
@@ -405,7 +404,7 @@ def project_targets(
 
 
 def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -> bool:
-    """Return whether any face is between the camera and any of the points of one face."""
+    """Return whether any other face is between the camera and any of the points of one face."""
     faces = scene.faces
     direction = points - position
     for f, normal in enumerate(faces.normals()):
@@ -422,7 +421,7 @@ def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -
 
 
 def _centre_of_area(polygon: FloatArray) -> FloatArray:
-    """Return the centres of area of polygons with corners (n, k, 2), taken about their first corner."""
+    """Return the centres of area of polygons, (n, k, 2), computed about their first corners."""
     p = polygon - polygon[:, :1]
     q = np.roll(p, -1, axis=1)
     cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]

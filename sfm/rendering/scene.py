@@ -1,7 +1,7 @@
-"""Scene: plane faces in space with circular targets and other marks, as `render` photographs them.
+"""Scene: plane faces in space with circular targets and other marks, which `render` photographs.
 
-Each face is a rectangle with plane axes a (right) and b (up) seen from outside; everything painted
-on it is given in these plane coordinates. Intensities are reflectances between 0 and 1.
+Each face is a rectangle with plane axes a (right) and b (up), as seen from outside. Everything painted on it
+is given in these plane coordinates. Intensities are reflectances between 0 and 1.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ DISC, ARC, RECTANGLE = 0, 1, 2
 UNCODED = -1
 # Gap between the arcs around a dot, as measured on the camcal sheet, rad.
 ARC_GAP = np.radians(44.0)
-MAX_ARCS = int(2 * np.pi / (2 * ARC_GAP))  # of a ring, as long as its gaps at least
+MAX_ARCS = int(2 * np.pi / (2 * ARC_GAP))  # of a ring: arcs must be at least as long as the gaps
 
 
 @dataclass(frozen=True)
 class Faces:
-    """Plane rectangles in space, seen from the side that a x b points to."""
+    """Plane rectangles in space, visible from the side to which a x b points."""
 
     centre: FloatArray  # object unit, (f, 3)
     axes: FloatArray  # unit vectors a and b of the plane, (f, 2, 3)
     half: FloatArray  # half lengths along a and b, object unit, (f, 2)
     value: FloatArray  # reflectance, (f,)
-    texture: FloatArray  # amplitude of the texture, part of the reflectance, (f,)
+    texture: FloatArray  # amplitude of the texture, fraction of the reflectance, (f,)
     grain: FloatArray  # size of a grain of the texture, object unit, (f,)
 
     def normals(self) -> FloatArray:
@@ -56,7 +56,7 @@ class Marks:
     kind: IntArray  # DISC, ARC or RECTANGLE, (k,)
     centre: FloatArray  # plane coordinates, object unit, (k, 2)
     shape: FloatArray  # disc: radius; arc: inner, outer radius, start and length (rad, counter-clockwise);
-    # rectangle: half lengths and turn (rad); 0 elsewhere; object unit, (k, 4)
+    # rectangle: half lengths and rotation (rad); 0 elsewhere; object unit, (k, 4)
     value: FloatArray  # reflectance, (k,)
 
     def __len__(self) -> int:
@@ -65,12 +65,12 @@ class Marks:
 
 @dataclass(frozen=True)
 class CircularTargets:
-    """The circular targets among the marks, whose places are the truth of a survey."""
+    """The circular targets among the marks; their positions are the truth of a survey."""
 
     face: IntArray  # (n,)
     centre: FloatArray  # plane coordinates, object unit, (n, 2)
     radius: FloatArray  # of the dot, object unit, (n,)
-    code: IntArray  # UNCODED where there is no ring, (n,)
+    code: IntArray  # UNCODED without a ring, (n,)
 
     def __len__(self) -> int:
         return len(self.face)
@@ -78,11 +78,11 @@ class CircularTargets:
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp and what the surroundings reflect."""
+    """A lamp and ambient light."""
 
     position: FloatArray  # object unit, (3,)
-    reach: float  # distance at which the lamp shines with strength 1 on a face seen square, object unit
-    ambient: float  # light from everywhere
+    reach: float  # distance at which the lamp gives strength 1 on a face at right angles, object unit
+    ambient: float  # light from all directions
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class Optics:
     """Effects of lens and sensor on the light."""
 
     blur_px: float = 0.7  # standard deviation of the point spread, px
-    vignetting: float = 0.0  # part of the light that is lost in the corners
-    exposure: float = 0.9  # part of the full scale that light 1 gives
-    noise: float = 0.0  # standard deviation in the dark, part of the full scale
-    shot_noise: float = 0.0  # standard deviation at full scale that comes on top, part of the full scale
+    vignetting: float = 0.0  # fraction of the light lost in the corners
+    exposure: float = 0.9  # fraction of the full scale for light of strength 1
+    noise: float = 0.0  # standard deviation in the dark, fraction of the full scale
+    shot_noise: float = 0.0  # additional standard deviation at full scale, fraction of the full scale
     bits: int = 8  # 8 or 16
     oversampling: int = 2  # cells along a pixel; a cell knows how much light falls on it but not where in it,
     # which at 2 and a blur of 0.7 px costs 0.3 % of the step of an edge and 0.0015 px in the centre of a dot
@@ -133,7 +133,7 @@ def discs(face: int, centre: FloatArray, radius: float, value: float) -> Marks:
 
 
 def rectangles(face: int, centre: FloatArray, half: FloatArray, turn: FloatArray, value: FloatArray) -> Marks:
-    """Return rectangles on one face: centres (k, 2), half lengths (k, 2), turn in rad (k,), values (k,)."""
+    """Return rectangles on one face: centres (k, 2), half lengths (k, 2), rotation, rad (k,), values (k,)."""
     k = len(centre)
     shape = np.column_stack([half, turn, np.zeros(k)])
     return Marks(np.full(k, face), np.full(k, RECTANGLE), np.asarray(centre, float), shape, value)
@@ -152,7 +152,7 @@ def coded_ring(
     """Return the dot and the ring of one coded target.
 
     Args:
-        face: the face it is on.
+        face: index of the face.
         centre: plane coordinates, (2,), object unit.
         radius: radius of the dot, object unit.
         number: code number; for `arcs` the number of arcs.
@@ -183,9 +183,9 @@ def concentric_rings(
     """Return the rings of one concentric tag.
 
     Args:
-        face: the face it is on.
+        face: index of the face.
         centre: plane coordinates, (2,), object unit.
-        radius: of the outer edge, object unit.
+        radius: radius of the outer edge, object unit.
         number: id of the tag.
         family: the family of tags.
         value: reflectance of the rings.
@@ -217,9 +217,9 @@ def square_tag(
     """Return the black square of a tag and the white modules of its code.
 
     Args:
-        face: the face it is on.
+        face: index of the face.
         centre: plane coordinates, (2,), object unit.
-        half: half a side of the black square, object unit.
+        half: half the side of the black square, object unit.
         number: id of the tag.
         family: the family of tags.
         value: reflectance of the border and of black modules.
@@ -227,8 +227,8 @@ def square_tag(
         turn: direction of the upper side, counter-clockwise from a, rad.
 
     Returns:
-        A rectangle, and one for each run of white modules along a row or a column: where two runs meet, one
-        that crosses them covers the joint.
+        A rectangle for the square, and one for each run of white modules along a row or a column. The joint
+        of two runs is covered by one that crosses them.
 
     Raises:
         GeometryError: the family has no such tag.

@@ -37,18 +37,18 @@ Two = Annotated[tuple[float, float], Field(strict=False)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Part = Annotated[float, Field(ge=0, le=1)]
 Length = Annotated[float, Field(gt=0)]
-Side = Annotated[int, Field(gt=0, le=20_000)]  # px; pictures are drawn whole, with oversampling
+Side = Annotated[int, Field(gt=0, le=20_000)]  # px; photographs are rendered as a whole, with oversampling
 Count = Annotated[int, Field(gt=0, le=1000)]
 
-# A code of 0 in a grid is a dot without ring, this one leaves the place empty.
+# Code 0 in a grid is a dot without a ring; this code leaves the position empty.
 NO_TARGET = -1
-# Lines of clutter that look like print are words of 2 to 6 letters, each a bar or two.
+# Lines that imitate print consist of words of 2 to 6 letters, each of one or two bars.
 WORD_LETTERS = (2, 7)
 
 
 @dataclass(frozen=True)
 class Staging:
-    """A scene with everything that is needed to photograph it."""
+    """A scene with everything needed to photograph it."""
 
     scene: Scene
     camera: Camera
@@ -110,7 +110,7 @@ class _Grid(_Section):
     count: Annotated[tuple[Count, Count], Field(strict=False)] = (1, 1)  # columns and rows
     radius: Length
     reflectance: Part
-    codes: tuple[int, ...] | list[int] = ()  # row by row; 0 = no ring, -1 = no target; all 0 if left out
+    codes: tuple[int, ...] | list[int] = ()  # row by row; 0 = no ring, -1 = no target; all 0 if omitted
     turn_deg: float = 0.0
 
 
@@ -133,7 +133,7 @@ class _Print(_Section):
 class _Face(_Section):
     name: str
     centre: Three
-    a: Three  # direction of the first axis, seen from outside to the right
+    a: Three  # direction of the first axis, to the right as seen from outside
     b: Three  # direction of the second axis, up; made perpendicular to a
     size: Two
     reflectance: Part
@@ -166,10 +166,10 @@ def read_scene(path: Path) -> Staging:
         path: the TOML file.
 
     Returns:
-        The scene, camera, stations and what else is needed to render its photographs.
+        The scene, camera, stations and everything else needed to render its photographs.
 
     Raises:
-        SurveyFileError: the file is missing, is no TOML, or has an entry that a scene file may not have.
+        SurveyFileError: the file is missing, is not TOML, or has an entry that a scene file may not have.
     """
     _, table = read_toml(path, "a scene file")
     try:
@@ -246,7 +246,7 @@ def _rectangle(face: int, one: _Rectangle) -> Marks:
 
 
 def _print(face: int, one: _Print, rng: np.random.Generator) -> Marks:
-    """Return lines of words that look like print from afar."""
+    """Return lines of words that look like print from a distance."""
     centre, half = [], []
     for line in range(one.lines):
         x, y = 0.0, -1.8 * one.height * line
@@ -296,11 +296,11 @@ def _place_grid(
 
 
 def _rotation(station: _Station) -> FloatArray:
-    """Return R of a camera that looks at a point; with roll 0 the image's x axis is horizontal."""
+    """Return R of a camera that looks at a point; with roll 0 the x axis of the image is horizontal."""
     away = np.subtract(station.position, station.look_at)
     z = away / np.linalg.norm(away)
     right = np.cross([0.0, 0.0, 1.0], z)
-    if np.linalg.norm(right) < 1e-9:  # straight down: x of the image along X
+    if np.linalg.norm(right) < 1e-9:  # looking straight down: x of the image along X
         right = np.array([1.0, 0.0, 0.0])
     x = right / np.linalg.norm(right)
     roll = np.radians(station.roll_deg)
