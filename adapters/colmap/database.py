@@ -245,7 +245,7 @@ def _refuse_other_files(path: Path) -> int:
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
     if header[:16] != b"SQLite format 3\0" or len(header) < HEADER_BYTES:
-        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (no SQLite file)")
+        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (not an SQLite file)")
     page = int.from_bytes(header[16:18], "big")
     whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
     if size < whole:
@@ -292,7 +292,7 @@ class _Reader:
                 )
             params = self._array(where, row[4], "<f8", 1, MODELS[model]).ravel()
             if not ((np.abs(params) <= MAX_NUMBER).all() and params[0] > 0):
-                raise self._error(where, "params are no numbers of a camera")
+                raise self._error(where, "params are not the parameters of a camera")
             found.append(DatabaseCamera(number, model, width, height, params))
         return tuple(found)
 
@@ -334,7 +334,7 @@ class _Reader:
                 raise self._error(where, f"more than {MAX_ROWS} keypoints, no more are read")
             if not (np.abs(xy) <= MAX_NUMBER).all():
                 raise SurveyFileError(
-                    f"{self.path}: a keypoint of {images[index[number]]} is no finite number of at most "
+                    f"{self.path}: a keypoint of {images[index[number]]} is not a finite number of at most "
                     f"{MAX_NUMBER:g}"
                 )
             found[index[number]] = xy

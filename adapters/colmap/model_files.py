@@ -195,7 +195,7 @@ def _numbers(text: Lines, words: list[str]) -> list[float]:
 def _pose(text: Lines, words: list[str]) -> None:
     """Check quaternion and translation."""
     if not any(_numbers(text, words)[:4]):
-        raise text.error("a quaternion of zeros is no rotation")
+        raise text.error("a quaternion of zeros is not a rotation")
 
 
 def _check_binary(name: str, path: Path) -> array[int]:

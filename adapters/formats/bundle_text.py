@@ -178,8 +178,8 @@ def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
     if missing:
         raise SurveyFileError(
             f"{folder}: {' and '.join(missing)} missing; the MATLAB program has cams.txt, pts.txt, "
-            f"{INTERIOR} (c x0 y0, mm), maybe sigmas.txt; or as in the thesis NAME_2.txt, NAME_8.txt and "
-            "NAME_8re.txt"
+            f"{INTERIOR} (c x0 y0, mm) and optionally sigmas.txt; or as in the thesis NAME_2.txt, "
+            "NAME_8.txt and NAME_8re.txt"
         )
     return cameras, points, sigmas if sigmas.is_file() else None, folder / INTERIOR
 
@@ -367,9 +367,7 @@ def _millimetres(network: Network, estimate: Estimate) -> tuple[FloatArray, Floa
         raise OutputError("the files of the bundle programs have one camera, in model brown")
     camera = estimate.cameras[0]
     if camera.parameters[3:].any():
-        raise OutputError(
-            f"camera {camera.name}: the files of the bundle programs have no place for distortion"
-        )
+        raise OutputError(f"camera {camera.name}: the files of the bundle programs cannot store distortion")
     if not (estimate.oriented.all() and estimate.determined.all()):
         raise OutputError("the files of the bundle programs need start values of all photographs and points")
     seen = network.image_points

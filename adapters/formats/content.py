@@ -43,7 +43,7 @@ class Kind(NamedTuple):
 
     name: str  # as in the list of a format
     words: str  # for people, in the plural
-    rows: Callable[[Content], FloatArray]  # all of its numbers, a row for each item, (n, d)
+    rows: Callable[[Content], FloatArray]  # all its numbers, one row per item, (n, d)
 
 
 def _points_of(known: ObjectPoints) -> FloatArray:
@@ -276,12 +276,12 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
     """Return a survey with cameras in other models or image points corrected for distortion.
 
     Args:
-        content: of the survey.
-        network: the same, maybe with other image points.
-        estimate: with the other cameras.
+        content: content of the survey.
+        network: its network, possibly with corrected image points.
+        estimate: its solution with the other cameras.
 
     Returns:
-        The survey, and the kinds that went since they are of the former cameras.
+        The survey, and the kinds dropped because they belong to the former cameras.
     """
     result = content.result
     before, after = result.estimate.cameras, estimate.cameras

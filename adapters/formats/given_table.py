@@ -51,14 +51,14 @@ class GivenValues:
 
 
 def read_given(folder: Path, network: Network) -> GivenValues:
-    """Read what the survey of a result was given with a standard deviation, from given.csv.
+    """Read the given values with standard deviations of the survey of a result, from given.csv.
 
     Args:
-        folder: of the result.
-        network: what `read_result` has read of it.
+        folder: folder of the result.
+        network: network of the result from `read_result`.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line number.
+        SurveyFileError: a missing or invalid file, with its line number.
     """
     path = folder / GIVEN.file
     summary = read_json(folder / "summary.json", Statistics, "the summary of a result")

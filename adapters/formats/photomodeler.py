@@ -71,7 +71,7 @@ def read_export(
 
     Photographs with the same interior orientation share a camera, in model `brown_dbat` with the affinity of
     its pixels. The camera is held, except in a calibration project, where everything but the shear is free.
-    Control with a negative or zero standard deviation is fixed. Control that was adjusted is no observation
+    Control with a negative or zero standard deviation is fixed. Adjusted control is not an observation
     and becomes an object point. The covariance of an image point is that in the file, or 1 px^2 if it states
     none. A repeated image point is read once; one with two positions is read with both, for the adjustment
     to decide.

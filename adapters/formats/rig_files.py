@@ -14,7 +14,7 @@ its corner). Lengths are in the unit of the result; for Kalibr, ROS and mrcal in
 
 Rectification follows OpenCV: a common image plane with rows as epipolar lines. Each camera is rotated by half
 of their relative rotation, and then so that the base is along rows (or columns). Focal length and principal
-point are the same in both, and show as much as is possible without empty borders.
+point are the same in both, and show as much as possible without empty borders.
 
 Source: OpenCV 4 documentation, "stereoCalibrate", "stereoRectify" and "XML/YAML Persistence"; COLMAP 4.2
 documentation, "Rigs and Frames"; DICe, DICe_CameraSystem.cpp and its tests/component/cal; pyvale 2026.10, its

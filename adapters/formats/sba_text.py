@@ -54,7 +54,7 @@ def read_sba_text(
             )
     table = np.array([values for _, values in rows])
     for k in np.flatnonzero(np.linalg.norm(table[:, -7:-3], axis=1) < MIN_QUATERNION)[:1]:
-        raise SurveyFileError(f"{cameras}, line {rows[k][0]}: a quaternion of zeros is no rotation")
+        raise SurveyFileError(f"{cameras}, line {rows[k][0]}: a quaternion of zeros is not a rotation")
     image_points, xyz = _points(points, len(rows))
     seen = np.bincount(image_points.image, minlength=len(rows))
     for i in np.flatnonzero(seen == 0)[:1]:
@@ -95,7 +95,7 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
     """
     for camera in estimate.cameras:
         if camera.model != "opencv" or camera.parameters[4:].any():
-            raise OutputError(f"camera {camera.name}: sba's files have no place for distortion")
+            raise OutputError(f"camera {camera.name}: sba's files cannot store distortion")
     if not (estimate.oriented.all() and estimate.determined.all()):
         raise OutputError("sba's files require start values of all photographs and points")
     rotation = AXES @ np.swapaxes(estimate.rotation, 1, 2)
@@ -246,7 +246,7 @@ def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
 
 
 def _rows(path: Path, most: int = MAX_LINES) -> Iterator[tuple[int, list[float]]]:
-    """Yield line number and numbers of each nonempty line, of which there must be one; # starts a comment."""
+    """Yield line number and numbers of each nonempty line, at least one; # starts a comment."""
     text, count = Lines.of(path), 0
     while (words := text.row()) is not None:
         count += 1

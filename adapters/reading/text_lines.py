@@ -16,7 +16,7 @@ from sfm.files.whole_files import whole_file
 
 MAX_LINES = 2 * MAX_ROWS  # as for tables
 MAX_LINE = 10_000_000  # characters; the image points of a photograph can be on one line
-MAX_DIGITS = 20  # of a whole number, as many as COLMAP's largest
+MAX_DIGITS = 20  # digits of a whole number, like COLMAP's largest
 MAX_PHOTOGRAPHS = 100_000
 MAX_POINTS = 5_000_000  # points whose names are kept
 MAX_IMAGE_POINTS = 20_000_000  # about 100 to 200 bytes each

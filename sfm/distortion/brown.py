@@ -16,9 +16,8 @@ The balanced radial distortion is AICON's form of `brown_forward` with a second 
     R = A1 (r2 - R0^2) + A2 (r4 - R0^4) + A3 (r6 - R0^6)
 
 with X = c u, Y = c v. At the radius R0 the radial distortion is 0, because part of the scale is assigned to
-c.
-With s = 1 - A1 R0^2 - A2 R0^4 - A3 R0^6 it is exactly `brown_forward` with s c, A1 / s^3, A2 / s^5, A3 / s^7,
-B1 / s^2, B2 / s^2, C1 / s, C2 / s.
+c. With s = 1 - A1 R0^2 - A2 R0^4 - A3 R0^6 it is exactly `brown_forward` with these parameters: s c,
+A1 / s^3, A2 / s^5, A3 / s^7, B1 / s^2, B2 / s^2, C1 / s, C2 / s.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 3.3.3 (balanced distortion).
 """

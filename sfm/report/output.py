@@ -8,6 +8,7 @@ line, written as events happen. Every line has `time` (UTC) and `event`:
     photograph  image, targets, rejected, features, stored (measured in an earlier run), seconds; or failed
     stage       stage, seconds, steps
     warning     text
+    remark      kind, severity, text, subjects, numbers, cause, remedy
     result      verdict, sigma0_px, rms_px, photographs, points, observations, stored_photographs, ...
     failed      reason
 """

@@ -1,7 +1,7 @@
 """The pages of the program: a row for each, rendered as HTML or as plain text.
 
 The HTML of a page contains everything that it shows, and a Content-Security-Policy. Names, reasons and
-remarks come from files of strangers. The template escapes them. Should that ever fail, a browser still
+remarks come from untrusted files. The template escapes them. Should that ever fail, a browser still
 refuses any script, style or address that is not in the policy.
 
 The plain text of a page contains the first rows of its tables in columns, and facts and sentences in lines.

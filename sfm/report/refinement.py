@@ -100,7 +100,7 @@ def _reasons(found: Refinement) -> tuple[Part, ...]:
             f"robust spread of the model's residuals (at least {general(MIN_SHIFT_PX, 2)} px). Outside: the "
             "window reaches beyond a photograph. Template of a point without a match: the window was found "
             "in no other photograph. Contradict the others: large residual in the adjustment. "
-            "Diverged: no solution, or the window turned inside out."
+            "Diverged: no solution, or the window became degenerate."
         ),
         Note(
             "A key point that was not measured anew is detached from its point if enough others were, and "

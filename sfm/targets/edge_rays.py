@@ -14,7 +14,7 @@ from sfm.kernels.small_algebra import solve_symmetric
 RAYS = 32
 # Spacing of the samples along a ray.
 STEP_PX = 0.5
-# A rise behind the edge by this part of the step, and by so many sigma of the noise, ends the background.
+# A rise behind the edge by this part of the step, and by this many sigmas of the noise, ends the background.
 _DISTURBANCE, _DISTURBANCE_SIGMAS = 0.3, 5.0
 _PHI = 2 * math.pi * np.arange(RAYS) / RAYS
 HARMONICS = np.column_stack([np.ones(RAYS), np.cos(_PHI), np.sin(_PHI), np.cos(2 * _PHI), np.sin(2 * _PHI)])

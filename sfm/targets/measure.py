@@ -22,7 +22,7 @@ from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS, Flag
 SHAPE_REASONS = (Flag.LOBED, Flag.THIN_BACKGROUND, Flag.POOR_FIT)
 # Centres nearer than this part of the smaller radius belong to concentric targets.
 MAX_CENTRE_FRACTION = 0.5
-# The centres of a ring are within this part of the radius, for perspective, plus so many sigmas.
+# The centres of a ring are within this part of the radius, for perspective, plus this many sigmas.
 ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
 # Parts of an unreadable code are smaller than this part of its dot.
 PART_OF_DOT = 0.75
@@ -40,9 +40,9 @@ _STEP_PX, _RISE_PX = 0.5, 3.0
 # Variance of rounding to integer intensities.
 QUANTISATION = 1 / 12
 # Number of targets from which the shading of a photograph is estimated from them. A target whose gain differs
-# from it by more than so many sigma keeps its own.
+# from it by more than this many sigmas keeps its own.
 MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
-# A halo exceeds this part of the contrast (9 of 10 of the retro-panel are below) and so many of its sigmas.
+# A halo exceeds this part of the contrast (9 of 10 of the retro-panel are below) and this many of its sigmas.
 # Flare means a background of which more than this part is saturated, that has glare behind it on more than
 # this part of the circumference, or that changes by more than this part of the contrast.
 HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
@@ -327,8 +327,8 @@ def find_duplicates(
     Also return by how much holes are farther from the centres of their surroundings than perspective
     explains, (k, 2).
 
-    Of concentric ellipses the one with a code is kept, or else the smallest: a retro-reflective dot with a
-    dark rim in glare appears as a bright dot and, larger, as the dark rim. A candidate inside another, not
+    Among concentric ellipses the one with a code is kept, or else the smallest: a retro-reflective dot with
+    a dark rim in glare appears as a bright dot and, larger, as the dark rim. A candidate inside another, not
     shown to be concentric, and of the minority polarity in the photograph, is a stain.
     """
     duplicate, off_centre = np.zeros(len(fit.xy), dtype=bool), np.zeros((len(fit.xy), 2))

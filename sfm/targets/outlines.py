@@ -29,7 +29,7 @@ SMOOTHED_NOISE = 3 / 8
 MIN_STEP = 4 / 255
 # Minor over major axis: 75 degrees of tilt give 0.26; with allowance for perspective and for elliptic blobs.
 MIN_AXIS_RATIO = 0.14
-# Outlines farther than this from their ellipse (in radii, plus so many px for the grid) are not elliptic.
+# Outlines farther than this from their ellipse (in radii, plus this many px for the grid) are not elliptic.
 OUTLINE_TOLERANCE, GRID_TOLERANCE_PX = 0.2, 1.5
 # Minimum number of outline points of a damaged target, in this part of the directions from its centre. The
 # points lie within this distance of the ellipse (radii, plus px for the grid). The hull of an ellipse fills

@@ -35,8 +35,7 @@ EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet
 MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trusted
 RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
 # Contrast of a feature over the full scale; OpenCV's 0.04 keeps only a fifth of the features of a weak
-# texture.
-# Lowe (2004) uses 0.03 of the range 0 to 1, before the division by the layers of an octave.
+# texture. Lowe (2004) uses 0.03 of the range 0 to 1, before the division by the layers of an octave.
 MIN_CONTRAST = 0.01
 # Features are extracted from an image of at most this side, reduced at least by 2: they only start the
 # matching, which measures in the photograph itself. If too few are found, a finer image is used.

@@ -70,9 +70,9 @@ def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ())
 
     It does if it adjusts at least as many camera parameters as unknown coordinates. The coordinates of a
     point are known if all three are given with a standard deviation below a pixel in its photographs.
-    Standard deviations as small as those of a plate do not differ from a fixed point in any way that matters.
-    The points of an additional plate are known relative to one another; the pose of such a plate is no more a
-    result than that of a photograph.
+    Points with standard deviations as small as those of a plate are practically fixed. The points of an
+    additional plate are known relative to one another. The pose of such a plate is not a result, like the
+    pose of a photograph.
 
     Args:
         adjustment: finished.

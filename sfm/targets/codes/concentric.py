@@ -56,7 +56,7 @@ PROFILE_BLURS, PROFILE_SIZES, PROFILE = (0.6, 0.9, 1.3, 1.8, 2.5), (0.96, 0.98, 
 # fitted. On 48 tags of 15 to 60 px the unexplained part was 0.05, and the right tag explained the most.
 MAX_UNEXPLAINED_FRACTION, MAX_FITTED_TAGS = 0.1, 2
 # A code is read if the radii are within a quarter of the way to any other code, the ink spreads by no more
-# than a quarter of a bit, and half the way is at least so many standard deviations.
+# than a quarter of a bit, and half the way is at least this many standard deviations.
 QUARTER, CODE_SIGMAS = 0.25, 5.0
 # A priori sigma of a printed radius, outer radii: 0.05 mm on a tag of 40 mm, one dot at 600 dots per inch.
 PRINT_SIGMA = 0.0025

@@ -26,7 +26,7 @@ SEEDS = 8  # dots from which a lattice is tried to grow
 MIN_SINE = 0.3  # of the angle between rows and columns
 MIN_DOTS, MIN_BENT_DOTS = 9, 20  # dots needed for a plate, and for a quadratic trend of their sizes
 MIN_SCATTER = 0.005  # of the logarithms of radii: smaller than the effect of printing
-# Minimum probability that a dot has any size, uniform over a range of so many standard deviations. It is
+# Minimum probability that a dot has any size, uniform over a range of this many standard deviations. It is
 # raised to the part of dots that are farther off than OUTLYING_SIGMAS. The same probability applies to a
 # plate that is larger than its table.
 STRANGE_PROBABILITY, RANGE_SIGMAS, OUTLYING_SIGMAS = 0.01, 50.0, 5.0
@@ -101,7 +101,7 @@ def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
 
 
 def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> IntArray | None:
-    """Return the plate points at the places of a lattice; None if the marks leave them uncertain."""
+    """Return the plate points at the positions of a lattice; None if the marks leave them uncertain."""
     table = _table(plate)
     marked = np.zeros(plate.count + 1, dtype=bool)
     marked[[row * plate.columns + column for row, column in plate.marks]] = True
@@ -168,7 +168,7 @@ def rings_among(polarity: IntArray) -> BoolArray:
 
 
 def _log_likelihood(z: FloatArray, strange: float) -> FloatArray:
-    """Return log densities of normal deviates, of which a given part may have any size."""
+    """Return log densities of normal deviates, if a given part of them may have any size."""
     normal = np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
     return np.asarray(np.log((1 - strange) * normal + strange / RANGE_SIGMAS))
 
@@ -183,7 +183,7 @@ class Lattice:
 
     @property
     def box(self) -> int:
-        """Number of places in the bounding box of rows and columns."""
+        """Number of positions in the bounding box of rows and columns."""
         return int((np.ptp(self.place, axis=0) + 1).prod())
 
 
@@ -194,7 +194,7 @@ def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
 
     Args:
         xy: centres, px, (k, 2).
-        is_dot: circles along which the lattice grows; others take a place and end it there, (k,).
+        is_dot: circles along which the lattice grows; others occupy a position and end it there, (k,).
     """
     dots = np.flatnonzero(is_dot)
     if len(dots) < 4:

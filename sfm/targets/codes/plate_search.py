@@ -2,7 +2,7 @@
 
 A plate is accepted if two photographs show one of the same size completely. A checkerboard is also accepted
 if one photograph shows it completely and another shows at least half of it, cut by the border. Larger dots or
-rings are marks if both photographs have them in the same places.
+rings are marks if both photographs have them in the same positions.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from sfm.targets.codes.dot_plates import find_lattice, placements, rings_among, 
 from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
 
 MIN_SIDE, MIN_DOTS_OF_PLATE = 3, 20  # dots or crossings along a side, and dots of a plate
-MIN_FILLED_FRACTION = 0.8  # of the places of a plate must contain dots
-# A dot is a mark if it is so many standard deviations larger than its surroundings in two photographs.
+MIN_FILLED_FRACTION = 0.8  # of the positions of a plate must contain dots
+# A dot is a mark if it is this many standard deviations larger than its surroundings in two photographs.
 MARK_SIGMAS = 5.0
 # Maximum side of the reduced photographs in which boards are searched, px.
 SEARCHED_PX = 1600
@@ -54,7 +54,7 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
 def checkerboard_of_parts(
     photographs: Sequence[AnyArray], found: Sequence[Part | None]
 ) -> PlateFamily | None:
-    """Return the checkerboard of which photographs (uint8) show parts; None without one.
+    """Return the checkerboard that photographs (uint8) show in parts; None without one.
 
     Args:
         photographs: intensities, uint8, each (H, W).
@@ -256,7 +256,7 @@ def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2)
 
 
 def _tag_share(number: IntArray, quads: FloatArray, middle: FloatArray) -> float | None:
-    """Return the side of tags in squares, if the tags are at their places on a board with these centres."""
+    """Return the side of tags in squares, if the tags fit their positions on a board with these centres."""
     if len(number) < MIN_TAGS_OF_BOARD:
         return None
     H, _ = cv2.findHomography(quads.mean(axis=1), middle[number])

@@ -58,7 +58,7 @@ APRIL_BORDERS = (2, 1)  # modules of the black border of the tags of an AprilGri
 PLATES = (*GRIDS, *BOARDS)
 UNCODED = -1
 MAX_ROUNDING = 1e-6  # pitches, for rounding errors
-# Maximum distance of a tag from its place under the homography of its board, in distances of tags or squares.
+# Maximum distance of a tag from its position by the homography of its board, in distances of tags or squares.
 # Distortion of 5 % at the corners of a photograph filled by 8 x 8 tags leaves 0.1; a misread tag is off by 1.
 MAX_OFF_PLACE = 0.15
 

@@ -73,10 +73,9 @@ def fit_cells(
 
     Returns:
         For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell
-            (inner,
-        middle and outer); RMS residual in the cell; deviations from the expected level in the clear ring
-        before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink in
-        radii of the dot; (k, 8, cells).
+        (inner, middle and outer); RMS residual in the cell; deviations from the expected level in the clear
+        ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink
+        in radii of the dot; (k, 8, cells).
     """
     m = cells * SAMPLES
     out = np.full((len(xy), ROWS, cells), math.nan)

@@ -1,6 +1,6 @@
 """Square tags (AprilTag, ArUco): found and read by OpenCV, with corners measured to sub-pixel precision.
 
-A tag gives four named points: "7a" is the upper left corner of the black square of tag 7 as it is printed,
+A tag gives four named points: "7a" is the upper left corner of the black square of tag 7 as printed,
 "7b" the upper right, "7c" the lower right and "7d" the lower left one.
 """
 

@@ -9,7 +9,7 @@ change of the gain over L. The intensity is
 
 a is the sharpening of the camera (unsharp masking). Without it, its halo would be mistaken for a change of
 the gain and shift the edge. C is the contribution of the clear modules behind the border, modelled as blurred
-rectangles at their places in the tag; it is recomputed with the estimated blur and corners. The tip, where
+rectangles at their positions in the tag; it is recomputed with the estimated blur and corners. The tip, where
 both edges act and other print may touch the tag, is left out: the corner is the intersection of the two
 edges. The fit stays so near to the corner that distortion does not bend the edges.
 """

@@ -21,7 +21,7 @@ MAX_STEPS = 30
 # The iteration ends with a step below this. Gauss-Newton steps shrink by a factor of ten or more, so the
 # remaining error is far below the precision of any target.
 LAST_STEP_PX = 5e-3
-# Background used in the fit: so many px plus this part of the mean semi-axis, up to the maximum.
+# Background used in the fit: this many px plus this part of the mean semi-axis, up to the maximum.
 MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
 # For targets larger than this (mean semi-axis) only a band inside the edge is used; the rest adds nothing.
 LARGE_PX, BAND_PX = 25.0, 15.0
@@ -29,7 +29,7 @@ LARGE_PX, BAND_PX = 25.0, 15.0
 BLUR_START, MIN_BLUR = 0.9, 0.25
 # A rise to a neighbour is detected at three tenths of its step, half a blur before its edge.
 RISE_BLURS = 0.5
-# The outline is traced again if it changed by more than this part of the radius; so many rays must agree.
+# The outline is traced again if it changed by more than this part of the radius; this many rays must agree.
 MAX_TRACES, SMALL_CHANGE, MIN_AGREEMENT = 2, 0.08, 0.7
 _NONE = int(Flag.NONE)
 _SATURATED = int(Flag.SATURATED)

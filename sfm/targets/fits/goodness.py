@@ -30,7 +30,7 @@ EDGE_ENDS_BLURS, HALO_PX = 2.5, 2.0
 SHAPES = 8
 # Standard deviation of rounding intensities.
 ROUNDING = 12**-0.5
-# Residuals of the edge are used within this many blurs of it, plus so many px.
+# Residuals of the edge are used within this many blurs of it, plus this many px.
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
 
@@ -61,8 +61,7 @@ def judge_residuals(
     """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
 
     The unevenness is the largest mean residual of an eighth of the edge, inside or outside, over the
-    contrast.
-    An eighth without any background is uneven, unless damage was left out there.
+    contrast. An eighth without any background is uneven, unless damage was left out there.
     """
     A, band = theta[model.CONTRAST], _BAND_PX + _BAND_BLURS * theta[model.BLUR]
     mean, count = np.zeros(16), np.zeros(16)

@@ -33,9 +33,9 @@ MIN_POPULATION = 8
 # Median over circles of the largest scan statistic, by simulation (tests/targets/test_outline_noise.py).
 USUAL_SCAN = 2.18
 # Factor over the usual up to which scatter along an edge, and the largest scan statistic, are tolerated; more
-# means damage in many places or on many targets.
+# means damage in many sectors or on many targets.
 MAX_LEVEL = 3.0
-# If too few other targets show what is shape, damage is in at most so many places; a scratch is in two.
+# If too few other targets show what is shape, damage is in at most this many places; a scratch is in two.
 MAX_PLACES = 2
 # Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
 ROUNDS, BIWEIGHT = 10, 4.685
@@ -43,7 +43,7 @@ MAD = 1.4826
 _PHI = 2 * np.pi * (np.arange(RAYS) + 0.5) / RAYS
 # The spectrum of outlines covers harmonics 3 to this one, if blur leaves at least this part of their power.
 MAX_HARMONIC, MIN_DAMPED = 12, 0.2
-# The exponent of the spectrum is used if it is so many sigmas above 0, and up to this value.
+# The exponent of the spectrum is used if it is this many sigmas above 0, and up to this value.
 EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
 # Larger than any degree of freedom that a population can show.
 _MAX_HALF_FREEDOM = 1e4

@@ -34,19 +34,18 @@ from sfm.targets.outlines import Flag
 # Limits of a sound target: the mean residual on an eighth of the edge over the contrast, and its contrast as
 # a part of that which a tenth of the targets exceeds, since compression produces faint blobs by the hundred.
 UNEVEN_EDGE, MIN_CONTRAST_SHARE = 0.18, 0.2
-# Largest lobes of an outline, in radii, plus so many sigma of a component for noise (four components are
-# seen).
-# Only half of it is permitted if the background is a thin stroke, as in letters, on this part of the
+# Largest lobes of an outline, in radii, plus this many sigmas of a component for noise (four components are
+# seen). Only half of it is permitted if the background is a thin stroke, as in letters, on this part of the
 # circumference.
 LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
 # Largest RMS of the residuals over the contrast.
 POOR_FIT = 0.12
 # Number of rounds in which damage is searched; each fit shows more of it.
 ROUNDS = 3
-# Intensities are changed up to so many blurs beside damage in the edge, by up to 7 % of the step.
+# Intensities are changed up to this many blurs beside damage in the edge, by up to 7 % of the step.
 SKIRT_BLURS = 1.5
-# Residuals larger than usual by so many robust sigmas of their logarithms over the photograph stand out. The
-# scatter is at least that of the variance of 200 pixels.
+# Residuals larger than usual by this many robust sigmas of their logarithms over the photograph stand out.
+# The scatter is at least that of the variance of 200 pixels.
 POPULATION_SIGMAS, MIN_SCATTER = 5.0, 0.1
 # If an edge is more curved than this, the model of its blur is not exact, and shape is not taken as damage.
 MIN_CURVATURE_BLURS = 2.0

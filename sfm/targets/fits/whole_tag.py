@@ -40,9 +40,9 @@ from sfm.targets.fits.corner import (
 )
 from sfm.targets.outlines import Flag
 
-# Tags are printed with one clear module around them. Objects behind it affect so many blurs of it.
+# Tags are printed with one clear module around them. Objects behind it affect this many blurs of it.
 BEHIND_BLURS = 2.0
-# Light on a tag is a random field whose correlation falls to 1/e over so many modules. It changes reflected
+# Light on a tag is a random field whose correlation falls to 1/e over this many modules. It changes reflected
 # light by a factor, like levels of 1 and 0.6 about their mean (a shadow of 40 %), and adds a part of the step
 # (glare).
 LIGHT_SIGMA, GLARE_SIGMA, LIGHT_MODULES = 0.25, 0.05, 3.0
@@ -244,7 +244,7 @@ def _square(modules: int) -> FloatArray:
 
 
 def _pixels_of(H: FloatArray, places: FloatArray) -> FloatArray:
-    """Return places on the tag in the scaled frame of the pixels, shape (n, 2)."""
+    """Return positions on the tag in the scaled frame of the pixels, shape (n, 2)."""
     found = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(H).T
     return np.asarray(found[:, :2] / found[:, 2:])
 
@@ -332,7 +332,7 @@ class _Modules:
         return np.asarray(self.background + self.step * self.printed, dtype=float)
 
     def covariance(self, at: FloatArray, level_at: FloatArray) -> FloatArray:
-        """Return covariances of the light at places (k, 2), of intensity (k,), with the light at modules."""
+        """Return covariances of the light at positions (k, 2), intensity (k,), with the light at modules."""
         shade = LIGHT_SIGMA**2 * np.outer(level_at, self.level)
         return np.asarray(
             (shade + (GLARE_SIGMA * max(abs(self.step), np.finfo(float).eps)) ** 2)
