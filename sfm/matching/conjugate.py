@@ -57,7 +57,7 @@ NEAR_KEY_POINTS = 12  # key points nearest to a point
 MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it
 FARTHEST_PX = 150.0  # of the third-nearest key point: farther away it may lie on another surface
 MARGIN_PX = 300.0  # around the points, within which key points are extracted
-MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
+MAX_STRETCH = 4.0  # largest ratio of lengths that a map may have in any direction
 LOCALISATION_PX = 1.0  # smallest standard deviation of a key point
 GROSS_SPREADS = 3.0  # multiple of the robust spread beyond which a key point belongs to another map
 MAX_SPREAD_PX = 5.0  # of the key points of one map; with a large spread, half of any set fits some map
@@ -198,7 +198,7 @@ def _match(
     *,
     given: bool,
 ) -> ConjugatePoints:
-    """Match points with templates of one size: upright, then as key points predict or rotated.
+    """Match points with templates of one size: upright, then as key points predict, or else rotated.
 
     Args:
         left: the left photograph.
@@ -339,7 +339,7 @@ def local_affinities(
     at = np.asarray(xy, dtype=float).reshape(-1, 2)
     if not len(at):
         return affinities_around(at, at, at)
-    low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # what is near no point is no use
+    low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # only the part near points matters
     high = np.ceil(at.max(axis=0) + MARGIN_PX).astype(int)
     part = left[low[1] : high[1], low[0] : high[0]]
     a, b = (sift_features(one, max_features=max_features) for one in (part, right))

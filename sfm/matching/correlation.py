@@ -2,8 +2,8 @@
 
 The coefficient r is equation (2.6) of document 002; cv2.matchTemplate computes the sums. A parabola refines
 the peak to a tenth of a pixel if the patches differ only by a shift. The standard deviation includes the
-misfit of the parabola. On the textures tried, the errors were 0.5 to 1.9 times as large as it. On a smooth
-texture without noise they were 2.6 times as large at whole pixels, because nine values do not show the
+misfit of the parabola. On the textures tried, errors were 0.5 to 1.9 times the standard deviation. They were
+2.6 times as large at whole pixels of a smooth texture without noise, because nine values do not show the
 third-order terms.
 """
 
@@ -191,7 +191,7 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
     """Return whether the second-best position may be as good as the best.
 
     The difference of their Fisher's z is compared with its standard error. This is the standard error for
-    independent coefficients of that number of pixels. With 3 independent pixels or fewer nothing can be
+    independent coefficients from that number of pixels. With 3 independent pixels or fewer nothing can be
     concluded, and any second position makes the match ambiguous.
 
     Args:

@@ -76,9 +76,7 @@ def grey_of(photograph: AnyArray | Grey) -> AnyArray:
     if array.ndim != 2 or array.size == 0:
         raise PhotographError(f"found a photograph of shape {array.shape}, expected (H, W) or (H, W, 3)")
     if array.dtype.kind == "f" and not _finite(array):
-        raise PhotographError(
-            "found intensities that are not finite, needed numbers in all of the photograph"
-        )
+        raise PhotographError("found intensities that are not finite, needed finite numbers everywhere")
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
@@ -161,7 +159,7 @@ def histogram(photograph: AnyArray) -> IntArray:
     """Return the number of pixels at each intensity, (256,) or (65536,) for 16 bit.
 
     Args:
-        photograph: shape (H, W) or (H, W, 3); colour is turned grey.
+        photograph: shape (H, W) or (H, W, 3); colour is converted to grey.
 
     Raises:
         PhotographError: intensities beyond the scale.

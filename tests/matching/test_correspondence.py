@@ -304,32 +304,29 @@ def pair_over_hills(*, along_px: float) -> tuple[ImagePoints, Estimate, BoolArra
     return seen, Estimate((lens,), position, np.tile(np.eye(3), (2, 1, 1)), points), wrong
 
 
-ONE_CAMERA = np.zeros(2, dtype=np.int64)
-
-
 @pytest.mark.parametrize("along_px", [2.0, 20.0])
 def test_points_off_the_surface_leave_and_their_neighbours_stay(along_px: float) -> None:
     seen, estimate, wrong = pair_over_hills(along_px=along_px)
-    good = on_surface(seen, ONE_CAMERA, estimate, np.ones(300, dtype=bool))
+    good = on_surface(seen, estimate, np.ones(300, dtype=bool))
     assert not good[wrong].any()
     assert good[~wrong].sum() >= 290
 
 
 def test_points_that_a_third_ray_checks_stay() -> None:
     seen, estimate, wrong = pair_over_hills(along_px=20.0)
-    assert on_surface(seen, ONE_CAMERA, estimate, np.zeros(300, dtype=bool)).all()
-    assert on_surface(seen, ONE_CAMERA, estimate, ~wrong)[wrong].all()
+    assert on_surface(seen, estimate, np.zeros(300, dtype=bool)).all()
+    assert on_surface(seen, estimate, ~wrong)[wrong].all()
 
 
 def test_points_without_neighbours_are_on_no_surface() -> None:
     seen, estimate, _ = pair_over_hills(along_px=0.0)
     few = seen.select(seen.point < 6)
     alone = Estimate(estimate.cameras, estimate.position, estimate.rotation, estimate.points[:6])
-    assert not on_surface(few, ONE_CAMERA, alone, np.ones(6, dtype=bool)).any()
+    assert not on_surface(few, alone, np.ones(6, dtype=bool)).any()
     behind: FloatArray = estimate.points.copy()
     behind[40] = [0.0, 0.0, 9.0]
     turned = Estimate(estimate.cameras, estimate.position, estimate.rotation, behind)
-    assert not on_surface(seen, ONE_CAMERA, turned, np.ones(300, dtype=bool))[40]
+    assert not on_surface(seen, turned, np.ones(300, dtype=bool))[40]
 
 
 PICTURE_PX = (420, 380)

@@ -213,11 +213,11 @@ def test_windows_are_taken_whose_rays_together_are_precise(
 def test_windows_that_agree_off_the_surface_do_not_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of ten points of two rays half are left out: no window of the 20 contradicts another."""
     network, truth = make_network(seed_of("off the surface"), images=2, points=10)
-    seen, camera = network.image_points, network.camera
+    seen = network.image_points
     good = np.arange(len(truth.points)) % 2 == 0
     monkeypatch.setattr(surface_points, "on_surface", lambda *_: good)
     found = CoveringPoints(seen, truth.points, np.zeros((len(seen), 2)), len(seen))
-    left = surface_points.without_far_points(found, truth, camera)
+    left = surface_points.without_far_points(found, truth)
     assert len(left.points) == good.sum() < len(good)
     assert left.matched == len(left.image_points) > 0
     assert surface_points.remarks_on_disagreement(left) == ()

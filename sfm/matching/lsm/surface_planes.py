@@ -70,7 +70,7 @@ def planes_at(
     return points, normal
 
 
-def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful: BoolArray) -> BoolArray:
+def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> BoolArray:
     """Return which object points lie on the surface of their neighbours in all their photographs, (n,).
 
     An error along the epipolar line moves a point with two rays towards its photographs or away from them,
@@ -80,7 +80,6 @@ def on_surface(seen: ImagePoints, camera: IntArray, estimate: Estimate, doubtful
 
     Args:
         seen: image points of n object points.
-        camera: index of the camera of each photograph, (m,).
         estimate: orientation and object points.
         doubtful: points that may be wrong, (n,); the others are assumed to be right.
     """

@@ -18,7 +18,7 @@ from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import Windows, first_alike, pictures_of
 from sfm.matching.lsm.surface_planes import on_surface
@@ -104,7 +104,7 @@ def cover_photographs(
         side_px=_side(estimate, windows.side_px, settings.max_points),
         threads=jobs,
     )
-    found = without_far_points(found, estimate, network.camera)
+    found = without_far_points(found, estimate)
     if len(found.image_points) < fits.sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
@@ -180,18 +180,18 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
     fits = known & (off <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off[known]))
     rays = np.bincount(seen.point[fits], minlength=len(network.points))
     needed = needed_rays(network)
-    enough = (rays >= needed) & on_surface(seen.select(fits), network.camera, estimate, needed < MIN_RAYS)
+    enough = (rays >= needed) & on_surface(seen.select(fits), estimate, needed < MIN_RAYS)
     return np.asarray(fits & enough[seen.point])
 
 
-def without_far_points(found: CoveringPoints, estimate: Estimate, camera: IntArray) -> CoveringPoints:
+def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoints:
     """Return the points without those of two rays that are off the surface of their neighbours.
 
     Their windows agree with each other, so that they are no longer among the matched ones.
     """
     seen, n = found.image_points, len(found.points)
     two = np.bincount(seen.point, minlength=n) < MIN_RAYS
-    good = on_surface(seen, camera, replace(estimate, points=found.points), two)
+    good = on_surface(seen, replace(estimate, points=found.points), two)
     kept = good[seen.point]
     number = np.cumsum(good) - 1
     return CoveringPoints(
