@@ -266,7 +266,7 @@ class DaskEngine:
                 try:
                     kind, what = events.get(timeout=LOOK_SECONDS)
                 except queue.Empty:
-                    someone = self._look(someone)
+                    someone = self._last_seen(someone)
                     continue
                 if kind == "sent":
                     yield Sent(what["key"], what["message"])
@@ -298,7 +298,7 @@ class DaskEngine:
         parts = [submit(part, "part") for part in work.parts]
         return [submit(work.whole, "whole", parts), *parts]
 
-    def _look(self, someone: float) -> float:
+    def _last_seen(self, someone: float) -> float:
         """Return when a worker was last seen; raise BackendError if that is too long ago."""
         try:
             if self.client.status not in ("running", "connecting"):

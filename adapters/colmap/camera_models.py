@@ -80,7 +80,7 @@ def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
                 scene.write_text(str(folder))
             else:
                 scene.write_binary(str(folder))
-            _refuse_short(pycolmap, folder, scene, text=text)
+            _refuse_incomplete(pycolmap, folder, scene, text=text)
         except OSError as error:
             reason = error.strerror or error
             raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason}") from error
@@ -88,7 +88,7 @@ def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
             raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason_of(error)}") from error
 
 
-def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
+def _refuse_incomplete(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
     """Raise OSError unless a model can be read back complete: COLMAP ignores a full disk."""
     try:
         written = _opened(pycolmap, folder, text=text)

@@ -69,14 +69,14 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
     return vertices, triangles
 
 
-def _soup(corners: FloatArray) -> tuple[FloatArray, IntArray]:
+def _unconnected(corners: FloatArray) -> tuple[FloatArray, IntArray]:
     return corners.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int64).reshape(-1, 3)
 
 
 def _binary_stl(path: Path) -> tuple[FloatArray, IntArray]:
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     table = np.fromfile(path, dtype=record, offset=STL_HEADER)
-    return _soup(table["corners"].astype(float))
+    return _unconnected(table["corners"].astype(float))
 
 
 def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
@@ -96,7 +96,7 @@ def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
             corners += [text.number_of(word) for word in words[1:]]
     if len(corners) % 9:
         raise text.error(f"{len(corners) // 3} vertices, each triangle needs three")
-    return _soup(np.array(corners).reshape(-1, 3, 3))
+    return _unconnected(np.array(corners).reshape(-1, 3, 3))
 
 
 def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
@@ -176,17 +176,17 @@ class _Values:
             for one in properties:
                 many = 1
                 if one[0] == "list":
-                    many = int(self._some(1, one[1])[0])
+                    many = int(self._numbers(1, one[1])[0])
                     if not 0 <= many <= MAX_CORNERS:
                         raise SurveyFileError(f"{self.path}: a polygon of {many} corners")
-                values = self._some(many, one[2] if one[0] == "list" else one[0])
+                values = self._numbers(many, one[2] if one[0] == "list" else one[0])
                 if one[0] == "list" and polygon is None:
                     polygon = [int(value) for value in values]
             if keep and polygon is not None:
                 found += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
         return np.array(found, dtype=np.int64).reshape(-1, 3)
 
-    def _some(self, count: int, kind: str) -> FloatArray:
+    def _numbers(self, count: int, kind: str) -> FloatArray:
         if self.form == "ascii":
             return self._words(count)
         dtype = np.dtype(self.order + TYPES[kind])

@@ -308,7 +308,7 @@ class Markers:
 
     def taken(self) -> Taken:
         """Return the functions that receive the elements of a file."""
-        return {("markers", "marker"): self._take_marker, ("marker", "location"): self._take_location}
+        return {("markers", "marker"): self._add_marker, ("marker", "location"): self._add_location}
 
     def control(self) -> ObjectPoints:
         """Return the markers whose reference is enabled."""
@@ -349,7 +349,7 @@ class Markers:
         xy, stated = np.array(self._xy).reshape(-1, 2) - HALF_PIXEL, np.zeros(len(seen), dtype=bool)
         return ImagePoints(image, point, xy, covariance, stated)
 
-    def _take_marker(self, nodes: list[Node]) -> None:
+    def _add_marker(self, nodes: list[Node]) -> None:
         if self._below_chunk(nodes) != MARKER:
             return
         node, j = nodes[-1], len(self.labels)
@@ -370,7 +370,7 @@ class Markers:
             named = [f"s{axis}" for axis in "xyz"]
             self._sigma.extend(reference.number(n) if n in reference.attributes else 0.0 for n in named)
 
-    def _take_location(self, nodes: list[Node]) -> None:
+    def _add_location(self, nodes: list[Node]) -> None:
         if self._below_chunk(nodes) != LOCATION:
             return
         frames, frame, _, marker, node = nodes[-5:]

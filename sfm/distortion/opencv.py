@@ -7,7 +7,7 @@ in `radial`, and from there to the distorted point. The outputs are described in
 from __future__ import annotations
 
 from sfm.conventions import FloatArray
-from sfm.distortion.radial import along, equidistant, seen
+from sfm.distortion.radial import equidistant, fill_derivative, fill_residual
 from sfm.kernels.compiling import inlined
 
 
@@ -33,7 +33,7 @@ def thin_prism_fisheye(
     slope = 2.0 * (k1 + t2 * (2.0 * k2 + t2 * (3.0 * k3 + t2 * 4.0 * k4)))
     aa2, ab2, bb2 = t2 + 2.0 * ea * ea, 2.0 * ea * eb, t2 + 2.0 * eb * eb
     cross = slope * ea * eb + 2.0 * p1 * ea + 2.0 * p2 * eb
-    _through(
+    _fill_distorted(
         frame, p, x, y, a, b, s, ds,
         ea * P + p1 * ab2 + p2 * aa2 + sx1 * t2, eb * P + p2 * ab2 + p1 * bb2 + sy1 * t2,
         P + slope * ea * ea + 2.0 * p1 * eb + 6.0 * p2 * ea + 2.0 * sx1 * ea, cross + 2.0 * sx1 * eb,
@@ -42,12 +42,12 @@ def thin_prism_fisheye(
     )  # fmt: skip
     power = t2
     for j in range(4):
-        along(frame, p, 4 + j if j < 2 else 6 + j, ea * power, eb * power, Jp)
+        fill_derivative(frame, p, 4 + j if j < 2 else 6 + j, ea * power, eb * power, Jp)
         power *= t2
-    along(frame, p, 6, ab2, bb2, Jp)
-    along(frame, p, 7, aa2, ab2, Jp)
-    along(frame, p, 10, t2, 0.0, Jp)
-    along(frame, p, 11, 0.0, t2, Jp)
+    fill_derivative(frame, p, 6, ab2, bb2, Jp)
+    fill_derivative(frame, p, 7, aa2, ab2, Jp)
+    fill_derivative(frame, p, 10, t2, 0.0, Jp)
+    fill_derivative(frame, p, 11, 0.0, t2, Jp)
 
 
 @inlined
@@ -81,7 +81,7 @@ def rad_tan_thin_prism_fisheye(
     cross = 2.0 * p0 * eb + 2.0 * p1 * ea
     aa, ab = 1.0 + 6.0 * p0 * ea + 2.0 * p1 * eb + sa * ea, cross + sa * eb
     ba, bb = cross + sb * ea, 1.0 + 6.0 * p1 * eb + 2.0 * p0 * ea + sb * eb
-    _through(
+    _fill_distorted(
         frame, p, x, y, a, b, s, ds,
         ea + p0 * aa2 + p1 * ab2 + e2 * (s0 + s1 * e2), eb + p1 * bb2 + p0 * ab2 + e2 * (s2 + s3 * e2),
         aa, ab, ba, bb, residual, Ju, Jp,
@@ -89,24 +89,24 @@ def rad_tan_thin_prism_fisheye(
     power = q
     for j in range(6):
         power *= t2
-        along(frame, p, 4 + j, (aa * a + ab * b) * power, (ba * a + bb * b) * power, Jp)
-    along(frame, p, 10, aa2, ab2, Jp)
-    along(frame, p, 11, ab2, bb2, Jp)
-    along(frame, p, 12, e2, 0.0, Jp)
-    along(frame, p, 13, e2 * e2, 0.0, Jp)
-    along(frame, p, 14, 0.0, e2, Jp)
-    along(frame, p, 15, 0.0, e2 * e2, Jp)
+        fill_derivative(frame, p, 4 + j, (aa * a + ab * b) * power, (ba * a + bb * b) * power, Jp)
+    fill_derivative(frame, p, 10, aa2, ab2, Jp)
+    fill_derivative(frame, p, 11, ab2, bb2, Jp)
+    fill_derivative(frame, p, 12, e2, 0.0, Jp)
+    fill_derivative(frame, p, 13, e2 * e2, 0.0, Jp)
+    fill_derivative(frame, p, 14, 0.0, e2, Jp)
+    fill_derivative(frame, p, 15, 0.0, e2 * e2, Jp)
 
 
 @inlined
-def _through(
+def _fill_distorted(
     frame: FloatArray, p: FloatArray, x: float, y: float, a: float, b: float, s: float, ds: float,
     ad: float, bd: float, aa: float, ab: float, ba: float, bb: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
     """Fill all outputs from the distorted point and its derivatives aa, ab, ba, bb by e = s(r2) (a, b)."""
     xx, xy, yy = s + 2.0 * a * a * ds, 2.0 * a * b * ds, s + 2.0 * b * b * ds  # d e / d (a, b)
-    seen(
+    fill_residual(
         frame, p, x, y, ad, bd,
         aa * xx + ab * xy, aa * xy + ab * yy, ba * xx + bb * xy, ba * xy + bb * yy,
         residual, Ju, Jp,

@@ -34,8 +34,8 @@ def radial(
         ds += (j + 1) * k * power
         power *= r2
         s += k * power
-        along(frame, p, first + j, a * power, b * power, Jp)
-    _scaled(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
+        fill_derivative(frame, p, first + j, a * power, b * power, Jp)
+    _fill_radial(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
 
 
 @inlined
@@ -58,9 +58,9 @@ def fisheye(
         dP += (j + 1) * k * power
         power *= theta2
         P += k * power
-        along(frame, p, first + j, a * q * power, b * q * power, Jp)
+        fill_derivative(frame, p, first + j, a * q * power, b * q * power, Jp)
     # d theta^2 / d r2 = theta / (r (1 + r2))
-    _scaled(frame, p, x, y, a, b, q * P, dq * P + q * dP * q / (1.0 + r2), residual, Ju, Jp)
+    _fill_radial(frame, p, x, y, a, b, q * P, dq * P + q * dP * q / (1.0 + r2), residual, Ju, Jp)
 
 
 @inlined
@@ -80,8 +80,8 @@ def fov(
     ratio, dratio = _ratio_of_tangent(omega, w, dw)  # w / omega
     q, dq = equidistant(w * w * r2)
     by_omega = dratio * q + ratio * dq * 2.0 * w * dw * r2
-    along(frame, p, first, a * by_omega, b * by_omega, Jp)
-    _scaled(frame, p, x, y, a, b, ratio * q, ratio * dq * w * w, residual, Ju, Jp)
+    fill_derivative(frame, p, first, a * by_omega, b * by_omega, Jp)
+    _fill_radial(frame, p, x, y, a, b, ratio * q, ratio * dq * w * w, residual, Ju, Jp)
 
 
 @inlined
@@ -100,8 +100,8 @@ def division(
     s = 2.0 / (1.0 + root)
     ds = s * s * k / root
     by_k = s * s * r2 / root
-    along(frame, p, first, a * by_k, b * by_k, Jp)
-    _scaled(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
+    fill_derivative(frame, p, first, a * by_k, b * by_k, Jp)
+    _fill_radial(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
 
 
 @inlined
@@ -119,9 +119,9 @@ def eucm(
     d = math.sqrt(beta * r2 + 1.0)
     s = 1.0 / (alpha * d + 1.0 - alpha)
     by_alpha, by_beta = s * s * (1.0 - d), -s * s * alpha * r2 / (2.0 * d)
-    along(frame, p, first, a * by_alpha, b * by_alpha, Jp)
-    along(frame, p, first + 1, a * by_beta, b * by_beta, Jp)
-    _scaled(frame, p, x, y, a, b, s, -s * s * alpha * beta / (2.0 * d), residual, Ju, Jp)
+    fill_derivative(frame, p, first, a * by_alpha, b * by_alpha, Jp)
+    fill_derivative(frame, p, first + 1, a * by_beta, b * by_beta, Jp)
+    _fill_radial(frame, p, x, y, a, b, s, -s * s * alpha * beta / (2.0 * d), residual, Ju, Jp)
 
 
 @inlined
@@ -150,17 +150,19 @@ def _ratio_of_tangent(omega: float, w: float, dw: float) -> tuple[float, float]:
 
 
 @inlined
-def _scaled(
+def _fill_radial(
     frame: FloatArray, p: FloatArray, x: float, y: float, a: float, b: float, s: float, ds: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
     """Fill all outputs from s and ds = d s / d(r2) of a radial distortion."""
     ab = 2.0 * a * b * ds
-    seen(frame, p, x, y, s * a, s * b, s + 2.0 * a * a * ds, ab, ab, s + 2.0 * b * b * ds, residual, Ju, Jp)
+    fill_residual(
+        frame, p, x, y, s * a, s * b, s + 2.0 * a * a * ds, ab, ab, s + 2.0 * b * b * ds, residual, Ju, Jp
+    )
 
 
 @inlined
-def seen(
+def fill_residual(
     frame: FloatArray, p: FloatArray, x: float, y: float, ad: float, bd: float,
     aa: float, ab: float, ba: float, bb: float, residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
@@ -194,7 +196,9 @@ def seen(
 
 
 @inlined
-def along(frame: FloatArray, p: FloatArray, column: int, da: float, db: float, Jp: FloatArray) -> None:
+def fill_derivative(
+    frame: FloatArray, p: FloatArray, column: int, da: float, db: float, Jp: FloatArray
+) -> None:
     """Fill the derivatives by a parameter that moves the distorted point by (da, db)."""
     Jp[0, column] = p[0] * da
     Jp[1, column] = p[int(frame[4]) - 1] * db

@@ -58,8 +58,10 @@ def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_
     through the six nearest pixels (Schafer and Rabiner 1973, Proc. IEEE 61(6)).
     """
     kind = interpolation_index(interpolation)
-    places = np.ascontiguousarray(xy, dtype=float)
-    return np.asarray(_resample(as_grey(photograph), places.reshape(-1, 2), kind)).reshape(places.shape[:-1])
+    positions = np.ascontiguousarray(xy, dtype=float)
+    return np.asarray(_resample(as_grey(photograph), positions.reshape(-1, 2), kind)).reshape(
+        positions.shape[:-1]
+    )
 
 
 @compiled

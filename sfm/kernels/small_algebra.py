@@ -149,16 +149,16 @@ def _subtract_pair(_: Any, flat: Any, at: Any, stride: Any, Y: Any, s: Any, t: A
         numbers = _data(context, builder, signature.args[0], flat)
         rows = _data(context, builder, signature.args[3], Y)
         first, second = (builder.mul(k, _integer(18)) for k in (s, t))
-        others = [_six(builder, _place(builder, rows, second, 6 * r)) for r in range(3)]
+        others = [_load_six(builder, _pointer(builder, rows, second, 6 * r)) for r in range(3)]
         for q in range(6):
-            place = builder.bitcast(
+            pointer = builder.bitcast(
                 builder.gep(numbers, [builder.add(at, builder.mul(stride, _integer(q)))]), SIX.as_pointer()
             )
-            value = builder.load(place, align=ALIGNED)
+            value = builder.load(pointer, align=ALIGNED)
             for r in range(3):
-                one = _repeated(builder, builder.load(_place(builder, rows, first, 6 * r + q)))
+                one = _repeated(builder, builder.load(_pointer(builder, rows, first, 6 * r + q)))
                 value = builder.fsub(value, builder.fmul(one, others[r], flags=FUSED), flags=FUSED)
-            builder.store(value, place, align=ALIGNED)
+            builder.store(value, pointer, align=ALIGNED)
         return context.get_dummy_value()
 
     return types.void(flat, types.intp, types.intp, Y, types.intp, types.intp), generate
@@ -183,15 +183,19 @@ def _add_product(_: Any, YQ: Any, s: Any, Y: Any, t: Any, flat: Any, at: Any, st
         rows = _data(context, builder, signature.args[2], Y)
         numbers = _data(context, builder, signature.args[4], flat)
         first, second = (builder.mul(k, _integer(18)) for k in (s, t))
-        places = [builder.bitcast(_place(builder, sums, first, 6 * r), SIX.as_pointer()) for r in range(3)]
-        values = [builder.load(place, align=ALIGNED) for place in places]
+        pointers = [
+            builder.bitcast(_pointer(builder, sums, first, 6 * r), SIX.as_pointer()) for r in range(3)
+        ]
+        values = [builder.load(pointer, align=ALIGNED) for pointer in pointers]
         for q in range(6):
-            row = _six(builder, builder.gep(numbers, [builder.add(at, builder.mul(stride, _integer(q)))]))
+            row = _load_six(
+                builder, builder.gep(numbers, [builder.add(at, builder.mul(stride, _integer(q)))])
+            )
             for r in range(3):
-                one = _repeated(builder, builder.load(_place(builder, rows, second, 6 * r + q)))
+                one = _repeated(builder, builder.load(_pointer(builder, rows, second, 6 * r + q)))
                 values[r] = builder.fadd(values[r], builder.fmul(one, row, flags=FUSED), flags=FUSED)
-        for place, value in zip(places, values, strict=True):
-            builder.store(value, place, align=ALIGNED)
+        for pointer, value in zip(pointers, values, strict=True):
+            builder.store(value, pointer, align=ALIGNED)
         return context.get_dummy_value()
 
     return types.void(YQ, types.intp, Y, types.intp, flat, types.intp, types.intp), generate
@@ -212,13 +216,13 @@ def _integer(value: int) -> ir.Constant:
     return ir.Constant(ir.IntType(64), value)
 
 
-def _place(builder: Any, numbers: Any, start: Any, offset: int) -> Any:
+def _pointer(builder: Any, numbers: Any, start: Any, offset: int) -> Any:
     return builder.gep(numbers, [builder.add(start, _integer(offset))])
 
 
-def _six(builder: Any, place: Any) -> Any:
+def _load_six(builder: Any, pointer: Any) -> Any:
     """Return the six numbers that begin at a pointer."""
-    return builder.load(builder.bitcast(place, SIX.as_pointer()), align=ALIGNED)
+    return builder.load(builder.bitcast(pointer, SIX.as_pointer()), align=ALIGNED)
 
 
 def _repeated(builder: Any, number: Any) -> Any:

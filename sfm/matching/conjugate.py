@@ -297,14 +297,14 @@ def _starts(
             peaks.append(found.peak)
             r.append(np.nan_to_num(found.correlation, nan=-1.0))
             second.append(np.nan_to_num(found.second, nan=-1.0))
-    every, places, one = np.array(r), np.array(peaks), np.arange(len(xy_left))
+    every, positions, one = np.array(r), np.array(peaks), np.arange(len(xy_left))
     best = every.argmax(axis=0)
-    elsewhere = np.where(np.linalg.norm(places - places[best, one], axis=2) > SAME_PX, every, -1.0)
+    elsewhere = np.where(np.linalg.norm(positions - positions[best, one], axis=2) > SAME_PX, every, -1.0)
     rival = elsewhere.argmax(axis=0)
     starts = []
     for number, least in ((best, every[best, one]), (rival, elsewhere[rival, one])):
-        place = np.where((least >= by.start_correlation)[:, None], places[number, one], np.nan)
-        starts.append(Starts(place, np.array(shapes)[number, one], np.full(len(one), REACH_PX)))
+        position = np.where((least >= by.start_correlation)[:, None], positions[number, one], np.nan)
+        starts.append(Starts(position, np.array(shapes)[number, one], np.full(len(one), REACH_PX)))
     return starts[0], starts[1], np.array(second)[best, one]
 
 

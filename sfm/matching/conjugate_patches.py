@@ -138,7 +138,7 @@ def match_upright(
         search_px=by.search_px,
         min_correlation=by.start_correlation,
     )
-    return _finished(left, right, xy_left, found, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
+    return _refined(left, right, xy_left, found, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
 
 
 def match_warped(
@@ -155,7 +155,7 @@ def match_warped(
         template_px=by.template_px,
         min_correlation=by.start_correlation,
     )
-    return _finished(left, right, xy_left, found, start.linear, by)
+    return _refined(left, right, xy_left, found, start.linear, by)
 
 
 def confirmed(
@@ -208,7 +208,7 @@ def confirmed(
     return replace(matched, covariance=covariance, reason=tuple(why.tolist()))
 
 
-def _finished(
+def _refined(
     left: AnyArray, right: AnyArray, a: FloatArray, found: NccMatches, linear: FloatArray, by: Settings
 ) -> ConjugatePoints:
     """Return the positions found by correlation, or refine them by least squares matching."""

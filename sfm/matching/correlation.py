@@ -406,7 +406,7 @@ def match_ncc_warped(
     fraction = a - np.rint(a)
     for k in range(len(a)):
         reach = int(reach_px[k])
-        inside = _inside(A[k], b[k], fraction[k], half, reach, grey_right.shape) if usable[k] else None
+        inside = _inside_right(A[k], b[k], fraction[k], half, reach, grey_right.shape) if usable[k] else None
         if inside is None or not inside.any():
             out[k] = NOT_COMPARED
             continue
@@ -433,7 +433,7 @@ def match_ncc_warped(
     )
 
 
-def _inside(
+def _inside_right(
     A: FloatArray, b: FloatArray, fraction: FloatArray, half: int, reach: int, shape: tuple[int, ...]
 ) -> BoolArray:
     """Return at which positions in the window the whole template is inside the right photograph, (n, n)."""

@@ -278,13 +278,13 @@ class GreyPhotographs:
         with self._lock:
             grey, stored = self._grey.get(i), self._stored.get(i)
             if grey is not None:
-                self._use(i, grey)
+                self._mark_used(i, grey)
         if grey is None:
             if stored is None:
                 stored = self._read(i)
             grey = grey_of(stored)
             with self._lock:
-                self._use(i, grey)
+                self._mark_used(i, grey)
                 self._stored[i] = stored
                 while _bytes(self._stored) > self._most[0]:
                     del self._stored[self._chance.choice(list(self._stored))]
@@ -292,7 +292,7 @@ class GreyPhotographs:
                     del self._grey[next(iter(self._grey))]
         return Grey(grey)
 
-    def _use(self, i: int, grey: AnyArray) -> None:
+    def _mark_used(self, i: int, grey: AnyArray) -> None:
         """Mark a photograph as used last."""
         self._grey.pop(i, None)
         self._grey[i] = grey

@@ -177,8 +177,8 @@ def _paint_face(
 
     def windows(centre: FloatArray, half: FloatArray) -> IntArray:
         around = (centre[:, None] + half[:, None] * SQUARE).reshape(-1, 2)
-        places = faces.place(np.full(len(around), face), around)
-        xy = project(camera, position, rotation, places).reshape(len(centre), len(SQUARE), 2)
+        points = faces.place(np.full(len(around), face), around)
+        xy = project(camera, position, rotation, points).reshape(len(centre), len(SQUARE), 2)
         return _windows(xy, fine.shape, n)
 
     box = windows(np.zeros((1, 2)), faces.half[face][None])[0]
@@ -266,7 +266,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     photographs, projected = render_photographs(
         scene, staging.camera, staging.positions, staging.rotations, optics=staging.optics, seed=staging.seed
     )
-    places = scene.faces.place(scene.targets.face, scene.targets.centre)
+    points = scene.faces.place(scene.targets.face, scene.targets.centre)
     code = scene.targets.code
     names = [f"t{k + 1:03d}" if code[k] == UNCODED else str(code[k]) for k in range(len(code))]
     angles = np.degrees(angles_from_rotation(staging.rotations))
@@ -277,7 +277,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
         _write_table(
             part / TRUTH[0],
             ("target", "code", "X", "Y", "Z", "radius"),
-            [(n, c, *X, r) for n, c, X, r in zip(names, code, places, scene.targets.radius, strict=True)],
+            [(n, c, *X, r) for n, c, X, r in zip(names, code, points, scene.targets.radius, strict=True)],
         )
         _write_table(
             part / TRUTH[1],
@@ -344,7 +344,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     must_precede = may_precede & ~may_precede.T
     distance = np.linalg.norm(faces.centre - position, axis=1)
     rest = list(turned[np.argsort(-distance[turned], kind="stable")])
-    must_precede &= ~_apart(corners - position, slack)
+    must_precede &= ~_disjoint(corners - position, slack)
     order: list[int] = []
     while rest:
         ready = [g for g in rest if not any(must_precede[f, g] for f in rest)]
@@ -354,7 +354,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     return np.array(order, dtype=np.int64)
 
 
-def _apart(corners: FloatArray, slack: float) -> BoolArray:
+def _disjoint(corners: FloatArray, slack: float) -> BoolArray:
     """Return which faces have disjoint images, (f, f), from their corners minus the camera, (f, 4, 3).
 
     Two convex images are disjoint if a plane through the camera and an edge of one has the other outside.

@@ -245,10 +245,10 @@ def square_tag(
                 at.append(np.array([x * module - half, half - y * module]))
                 size.append(module * (length[::-1] if across else length))
     cos, sin = np.cos(turn), np.sin(turn)
-    places = np.array(at) @ np.array([[cos, sin], [-sin, cos]]) + centre
-    k = len(places)
+    centres = np.array(at) @ np.array([[cos, sin], [-sin, cos]]) + centre
+    k = len(centres)
     reflectance = np.concatenate([[value], np.full(k - 1, paper)])
-    return rectangles(face, places, np.array(size), np.full(k, turn), reflectance)
+    return rectangles(face, centres, np.array(size), np.full(k, turn), reflectance)
 
 
 def _runs(number: int, family: CodeFamily) -> FloatArray:

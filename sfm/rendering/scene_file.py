@@ -188,7 +188,7 @@ def read_scene(path: Path) -> Staging:
     targets: list[tuple[int, float, float, float, int]] = []
     for k, face in enumerate(file.face):
         marks += [_rectangle(k, one) for one in face.rectangle]
-        marks += [_print(k, one, rng) for one in face.print]
+        marks += [_printed_lines(k, one, rng) for one in face.print]
         for grid in face.grid:
             _place_grid(path, k, face.name, grid, family, marks, targets)
     row = np.array(targets, dtype=float).reshape(-1, 5)
@@ -245,7 +245,7 @@ def _rectangle(face: int, one: _Rectangle) -> Marks:
     return rectangles(face, np.array([one.centre]), half, turn, value)
 
 
-def _print(face: int, one: _Print, rng: np.random.Generator) -> Marks:
+def _printed_lines(face: int, one: _Print, rng: np.random.Generator) -> Marks:
     """Return lines of words that look like print from a distance."""
     centre, half = [], []
     for line in range(one.lines):

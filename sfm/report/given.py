@@ -136,7 +136,7 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
 
 def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
     """Yield the residuals of the values of a kind, largest w first."""
-    rows = [_to_its_sigma(row) for row in found.table_rows]
+    rows = [_to_second_digit(row) for row in found.table_rows]
     if not rows:
         return
     yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
@@ -156,7 +156,7 @@ def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Pa
         yield Note("A single bar gives the scale but cannot be checked; two or more check one another.")
 
 
-def _to_its_sigma(row: Sequence[Any]) -> tuple[Any, ...]:
+def _to_second_digit(row: Sequence[Any]) -> tuple[Any, ...]:
     """Return a row of given.csv with the given value written to the second digit of its sigma."""
     names = GIVEN.names_of()
     given, sigma = names.index("given"), names.index("sigma")

@@ -60,7 +60,7 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
     r = f"{test.redundancy:.1f}".removesuffix(".0")
     said = "passed" if test.passed else "NOT passed, worse than stated"
     if not test.passed and test.statistic < test.lower:
-        said = f"better than stated, {_fitting(test, adjustment)} would fit"
+        said = f"better than stated, {_fitting_sigmas(test, adjustment)} would fit"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
@@ -73,7 +73,7 @@ def _why_untested(test: GlobalTest) -> str:
     return f"its redundancy, {test.redundancy:.2g}, is too small"
 
 
-def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
+def _fitting_sigmas(test: GlobalTest, a: Adjustment | None) -> str:
     """Return the stated standard deviations that would pass a test, as sigma_px if that determines them."""
     factor = float(np.sqrt(test.statistic / test.redundancy))
     if a is not None and a.observations == 2 * int((~a.rejected).sum()):

@@ -83,10 +83,10 @@ def refuse_outputs(out: Path | None, picture: Path | None, inputs: tuple[Path, .
     if out is not None:
         endings = (".json",) if as_json else TABLE_ENDINGS
         _refuse_ending("--out", out, endings)
-        _refuse_taken("--out", out, inputs, (",".join(NAMES).encode() + b"\n", b'{\n "method": '))
+        _refuse_existing("--out", out, inputs, (",".join(NAMES).encode() + b"\n", b'{\n "method": '))
     if picture is not None:
         _refuse_ending("--picture", picture, (PICTURE_ENDING,))
-        _refuse_taken("--picture", picture, inputs, ())
+        _refuse_existing("--picture", picture, inputs, ())
 
 
 @contextmanager
@@ -120,7 +120,7 @@ def _refuse_ending(option: str, path: Path, endings: tuple[str, ...]) -> None:
         raise OutputError(f"{option} {path}: {found}, needed {' or '.join(endings)}")
 
 
-def _refuse_taken(option: str, path: Path, inputs: tuple[Path, ...], heads: tuple[bytes, ...]) -> None:
+def _refuse_existing(option: str, path: Path, inputs: tuple[Path, ...], heads: tuple[bytes, ...]) -> None:
     """Refuse an input, by any path, and a file that does not begin like an earlier output."""
     if not path.exists() and not path.is_symlink():
         return

@@ -160,10 +160,10 @@ def _keep_apart(
 
 def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the image of one object point per row, px, NaN behind the photograph, (k, 2)."""
-    UVW = _in_photographs(estimate, image, points)
+    UVW = _in_image_axes(estimate, image, points)
     out = np.full((len(image), 2), np.nan)
-    for lens, rows in _of_cameras(estimate, camera, image):
-        out[rows] = pixel_from_tangents(lens, _in_front(UVW[rows]))
+    for lens, rows in _rows_by_camera(estimate, camera, image):
+        out[rows] = pixel_from_tangents(lens, _tangents_in_front(UVW[rows]))
     return out
 
 
@@ -214,18 +214,20 @@ def plane_warps(
     return warps
 
 
-def _in_photographs(estimate: Estimate, image: IntArray, points: FloatArray) -> FloatArray:
+def _in_image_axes(estimate: Estimate, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the point of each row in the axes of its photograph, (k, 3)."""
     return np.asarray(np.einsum("ki,kij->kj", points - estimate.position[image], estimate.rotation[image]))
 
 
-def _in_front(UVW: FloatArray) -> FloatArray:
+def _tangents_in_front(UVW: FloatArray) -> FloatArray:
     """Return the tangents of rays, NaN behind the photograph, (k, 2)."""
     W = np.where(UVW[:, 2:] < 0, UVW[:, 2:], np.nan)
     return np.asarray(-UVW[:, :2] / W)
 
 
-def _of_cameras(estimate: Estimate, camera: IntArray, image: IntArray) -> Iterator[tuple[Camera, IntArray]]:
+def _rows_by_camera(
+    estimate: Estimate, camera: IntArray, image: IntArray
+) -> Iterator[tuple[Camera, IntArray]]:
     """Yield each camera that has rows, and its rows."""
     for lens, rows in zip(estimate.cameras, rows_of(camera[image], len(estimate.cameras)), strict=True):
         if len(rows):

@@ -98,7 +98,7 @@ def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> Bo
                 break
             uv, inverse = -UVW[on, :2] / UVW[on, 2:], -1 / UVW[on, 2]
             near = cKDTree(uv).query(uv, k=NEIGHBOURS + 1)[1]
-            near = _others(near)
+            near = _without_self(near)
             plane, N = _planes(uv[near] - uv[:, None], inverse[near])
             off = np.abs(inverse - plane[:, 2]) / np.sqrt(1 + np.linalg.inv(N)[:, 2, 2])
             out = doubtful[point[on]] & (off > TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off))
@@ -109,7 +109,7 @@ def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> Bo
     return good
 
 
-def _others(near: IntArray) -> IntArray:
+def _without_self(near: IntArray) -> IntArray:
     """Return the neighbours of each point without itself; `near`, (k, NEIGHBOURS + 1), contains it."""
     itself = near == np.arange(len(near))[:, None]
     itself[~itself.any(axis=1), -1] = True  # several at one position

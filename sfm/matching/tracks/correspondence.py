@@ -150,7 +150,7 @@ class _Search:
     cos_angle: float  # of the smallest angle between rays
     used: BoolArray  # targets that no longer take part, (N,)
     tracks: list[IntArray]  # of each accepted point, its target in each photograph or -1, (m,)
-    places: list[FloatArray]  # of each accepted point, its coordinates, (3,)
+    points: list[FloatArray]  # of each accepted point, its coordinates, (3,)
 
     def seeds(self) -> IntArray:
         """Return pairs of unused targets on each other's epipolar lines, (s, 2)."""
@@ -159,18 +159,18 @@ class _Search:
         list_seeds(seeds, *arguments)
         return seeds
 
-    def accept(self, track: IntArray, place: FloatArray) -> None:
+    def accept(self, track: IntArray, point: FloatArray) -> None:
         """Use up the targets of a point, and keep the point unless it repeats an accepted one.
 
         If the orientation is off by more than the tolerance, one target may split into two points.
         """
         self.used[track[track >= 0]] = True
         reach = SAME_TOLERANCES * self.scene.tolerance
-        for other, its_place in zip(self.tracks, self.places, strict=True):
-            if same_target(self.scene, track, place, other, its_place, reach):
+        for other, its_point in zip(self.tracks, self.points, strict=True):
+            if same_target(self.scene, track, point, other, its_point, reach):
                 return
         self.tracks.append(track.copy())
-        self.places.append(place.copy())
+        self.points.append(point.copy())
 
 
 def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
@@ -180,7 +180,7 @@ def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
         return 0
     scene = search.scene
     free = np.bincount(search.photograph[~search.used], minlength=len(scene.c))
-    best, place, score = grow(
+    best, points, score = grow(
         scene, seeds, search.photograph, search.used, free / scene.area, math.log(len(seeds)), min_rays,
         search.cos_angle,
     )  # fmt: skip
@@ -191,7 +191,7 @@ def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
         members = best[a][best[a] >= 0]
         # A target that belongs to a better point waits until that point is accepted or ruled out.
         if not search.used[members].any() and (score[members] >= score[a]).all():
-            search.accept(best[a], place[a])
+            search.accept(best[a], points[a])
             accepted += 1
     return accepted
 
@@ -219,7 +219,7 @@ def _collect(search: _Search) -> Correspondences:
         none = np.zeros(0, dtype=np.int64)
         return Correspondences(none, none, none, np.zeros(0), np.zeros((0, 3)))
     scene = search.scene
-    tracks, points = np.array(search.tracks), np.array(search.places)
+    tracks, points = np.array(search.tracks), np.array(search.points)
     order = np.argsort(np.where(tracks >= 0, tracks, len(search.used)).min(axis=1), kind="stable")
     tracks, points = tracks[order], points[order]
     residual = np.zeros(tracks.shape)
@@ -250,7 +250,7 @@ def _scene(
     windows = [_window(one) for one in estimate.cameras]
     area, corner, cell = np.ones(m), np.zeros((m, 2)), np.ones(m)
     columns, cells = np.ones((m, 2), dtype=np.int64), np.zeros(m + 1, dtype=np.int64)
-    place = np.zeros(total, dtype=np.int64)
+    cell_of = np.zeros(total, dtype=np.int64)
     for i in range(m):
         part = slice(first[i], first[i + 1])
         uv[part] = tangents_from_pixel(estimate.cameras[camera[i]], targets[i])
@@ -268,14 +268,14 @@ def _scene(
             cell[i] = max(widest, extent.max() / RASTER)
             columns[i] = (extent / cell[i]).astype(np.int64) + 1
         at = np.clip(((uv[part] - corner[i]) / cell[i]).astype(np.int64), 0, columns[i] - 1)
-        place[part] = cells[i] + at[:, 1] * columns[i, 0] + at[:, 0]
+        cell_of[part] = cells[i] + at[:, 1] * columns[i, 0] + at[:, 0]
         cells[i + 1] = cells[i] + columns[i].prod()
-    start = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=cells[-1]))]).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(np.bincount(cell_of, minlength=cells[-1]))]).astype(np.int64)
     scene = Scene(
         first, uv, kind, size, float(ratio), float(tolerance), estimate.oriented, c,
         np.ascontiguousarray(estimate.position),  # kernels are compiled for each layout
         np.swapaxes(estimate.rotation, 1, 2).copy(), np.array([windows[k] for k in camera]), area, corner,
-        cell, columns, cells[:-1], start, np.argsort(place, kind="stable"),
+        cell, columns, cells[:-1], start, np.argsort(cell_of, kind="stable"),
     )  # fmt: skip
     return scene, unusable
 

@@ -107,7 +107,7 @@ def grow(
     """
     m = len(scene.c)
     best = np.full((len(used), m), -1, dtype=np.int64)
-    place = np.full((len(used), 3), np.nan)
+    points = np.full((len(used), 3), np.nan)
     score = np.full(len(used), np.inf)
     track, residual = np.empty(m, dtype=np.int64), np.empty(m)
     X = np.empty(3)
@@ -139,8 +139,8 @@ def grow(
             if track[k] >= 0 and value < score[track[k]]:
                 score[track[k]] = value
                 best[track[k]] = track
-                place[track[k]] = X
-    return best, place, score
+                points[track[k]] = X
+    return best, points, score
 
 
 @compiled

@@ -260,18 +260,18 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: number of pairs of photographs matched at the same time.
     """
-    xy = _of_tracks([one.xy for one in natural], tracks)
-    scale = _of_tracks([one.scale for one in natural], tracks)
-    angle = _of_tracks([one.angle for one in natural], tracks)
+    xy = _values_of_tracks([one.xy for one in natural], tracks)
+    scale = _values_of_tracks([one.scale for one in natural], tracks)
+    angle = _values_of_tracks([one.angle for one in natural], tracks)
     n = int(tracks.point.max(initial=-1)) + 1
     reference = _middle_scale(tracks.point, scale, n)
-    place = xy[reference].copy()
+    position = xy[reference].copy()
     for i, one in enumerate(natural):
         of_reference = np.flatnonzero(tracks.image[reference] == i)
-        place[of_reference] = _snapped(place[of_reference], one.corners)
-    place = np.rint(place)  # a template of whole pixels needs no resampling
+        position[of_reference] = _snapped(position[of_reference], one.corners)
+    position = np.rint(position)  # a template of whole pixels needs no resampling
     ref = reference[tracks.point]
-    offset = (place - xy[reference])[tracks.point]
+    offset = (position - xy[reference])[tracks.point]
     turn, stretch = angle - angle[ref], scale / scale[ref]
     A = stretch[:, None, None] * np.stack(
         [np.stack([np.cos(turn), -np.sin(turn)], -1), np.stack([np.sin(turn), np.cos(turn)], -1)], axis=1
@@ -291,7 +291,7 @@ def measure_tracks(
         found = match_lsm(
             grey[i],
             grey[j],
-            place[tracks.point[rows]],
+            position[tracks.point[rows]],
             start[rows],
             window_px=window_px,
             start=A[rows],
@@ -311,7 +311,7 @@ def measure_tracks(
         for b in range(2):
             total = np.bincount(tracks.point[good], at_reference[good, a, b], minlength=n)
             covariance[reference, a, b] = total / np.maximum(matched, 1)
-    measured[reference] = place
+    measured[reference] = position
     keep = np.flatnonzero(np.isfinite(measured).all(axis=1))
     needed = _needed(tracks.image[keep], tracks.point[keep], len(photographs), min_rays, min_image_points)
     keep = keep[needed]
@@ -322,7 +322,7 @@ def measure_tracks(
     )
 
 
-def _of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
+def _values_of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
     """Return the values of the features of tracks, from the values of m photographs, (k, ...)."""
     first = np.cumsum([0, *(len(one) for one in values)])
     return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])

@@ -83,7 +83,7 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
             break
         shrink //= 2
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
-    kept = _spread_out(xy, np.array([p.response for p in points]), picture.shape, max_features)
+    kept = _strongest_per_cell(xy, np.array([p.response for p in points]), picture.shape, max_features)
     points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
     if descriptor is None:
         descriptor = np.zeros((0, 128), np.float32)
@@ -97,7 +97,7 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
     )
 
 
-def _spread_out(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
+def _strongest_per_cell(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
     """Return the rows of the features to keep: the strongest of each cell, then the second ones and so on.
 
     Args:
@@ -170,12 +170,12 @@ def _nearest_descriptors(first: AnyArray, second: AnyArray) -> _Nearest:
     of_back = np.full(size, -np.inf, np.float32)
     transposed = np.ascontiguousarray(second.T)
     for begin in range(0, k, BLOCK):
-        _take_nearest(first[begin : begin + BLOCK] @ transposed, begin, found, of_back)
+        _update_nearest(first[begin : begin + BLOCK] @ transposed, begin, found, of_back)
     return found
 
 
 @compiled
-def _take_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: AnyArray) -> None:
+def _update_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: AnyArray) -> None:
     """Update the largest of some rows, and the largest of all columns so far."""
     for i in range(similarity.shape[0]):
         best, second, at = np.float32(-np.inf), np.float32(-np.inf), 0
@@ -209,7 +209,7 @@ def overlapping_pairs(
         return np.column_stack(np.triu_indices(m, 1))
     both = score + score.T
     lost = (both >= MIN_MUTUAL_FEATURES).sum(axis=1) < partners / 2
-    wanted = _best(both, np.where(lost, MANY_PARTNERS, partners))
+    wanted = _best_partners(both, np.where(lost, MANY_PARTNERS, partners))
     for near in neighbours:
         used = (near >= 0) & (lost[:, None] | (np.arange(near.shape[1]) < NEIGHBOURS))
         wanted[np.nonzero(used)[0], near[used]] = True
@@ -226,11 +226,11 @@ def connecting_pairs(score: IntArray, part: IntArray, tried: IntArray) -> IntArr
     """
     apart = part[:, None] != part
     apart[tried[:, 0], tried[:, 1]] = apart[tried[:, 1], tried[:, 0]] = False
-    wanted = _best(np.where(apart, score + score.T, -1), np.full(len(score), MANY_PARTNERS)) & apart
+    wanted = _best_partners(np.where(apart, score + score.T, -1), np.full(len(score), MANY_PARTNERS)) & apart
     return np.argwhere(np.triu(wanted | wanted.T, 1))
 
 
-def _best(score: IntArray, count: IntArray) -> BoolArray:
+def _best_partners(score: IntArray, count: IntArray) -> BoolArray:
     """Return which others have the highest scores with each photograph, `count` of them, (m, m)."""
     ranked = np.where(np.eye(len(score), dtype=bool), -2, score)
     order = np.argsort(-ranked, axis=1, kind="stable")[:, : len(score) - 1]

@@ -92,17 +92,17 @@ def foerstner_points(
     row, col = row[order], col[order]
     kept = np.zeros(len(row), dtype=np.bool_)
     near = np.zeros(grey.shape, dtype=np.bool_)
-    _thin(row, col, float(min_distance_px), max_points, near, kept)
+    _keep_distant(row, col, float(min_distance_px), max_points, near, kept)
     row, col = row[kept], col[kept]
-    place, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
+    position, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
     roundness = np.empty(len(row))
     for first, end, begin, gx, gy in _strips(grey, side // 2):
         rows = np.flatnonzero((row >= first) & (row < end))
         part, C = np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
         _intersect_edges(gx, gy, begin, row[rows], col[rows], side // 2, part, C)
-        place[rows], covariance[rows] = part, C
+        position[rows], covariance[rows] = part, C
         roundness[rows] = _texture(gx, gy, side)[1][row[rows] - begin, col[rows]]
-    return InterestPoints(place, covariance, weight[row, col], roundness)
+    return InterestPoints(position, covariance, weight[row, col], roundness)
 
 
 def textured_squares(
@@ -182,7 +182,9 @@ def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
 
 
 @compiled
-def _thin(row: IntArray, col: IntArray, distance: float, most: int, near: BoolArray, kept: BoolArray) -> None:
+def _keep_distant(
+    row: IntArray, col: IntArray, distance: float, most: int, near: BoolArray, kept: BoolArray
+) -> None:
     """Mark points, strongest first, that have no stronger one within the distance."""
     count = 0
     for k in range(len(row)):
@@ -192,11 +194,11 @@ def _thin(row: IntArray, col: IntArray, distance: float, most: int, near: BoolAr
         count += 1
         if count == most:
             return
-        _take(near, row[k], col[k], distance)
+        _mark_near(near, row[k], col[k], distance)
 
 
 @compiled
-def _take(near: BoolArray, row: int, col: int, distance: float) -> None:
+def _mark_near(near: BoolArray, row: int, col: int, distance: float) -> None:
     """Mark the pixels within the distance of a pixel."""
     height, width = near.shape
     reach = int(np.ceil(distance))
@@ -214,7 +216,7 @@ def _intersect_edges(
     row: IntArray,
     col: IntArray,
     half: int,
-    place: FloatArray,
+    position: FloatArray,
     covariance: FloatArray,
 ) -> None:
     """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, with their gradients g.
@@ -239,8 +241,8 @@ def _intersect_edges(
         variance = max(rest - dx * bx - dy * by, 0.0) / (n - 2)
         # a centre of curvature far from the centre of the window is not a corner of this window
         inside = abs(dx) <= half and abs(dy) <= half
-        place[k, 0] = col[k] + (dx if inside else 0.0)
-        place[k, 1] = row[k] + (dy if inside else 0.0)
+        position[k, 0] = col[k] + (dx if inside else 0.0)
+        position[k, 1] = row[k] + (dy if inside else 0.0)
         covariance[k, 0, 0], covariance[k, 1, 1] = variance * yy / det, variance * xx / det
         covariance[k, 0, 1] = covariance[k, 1, 0] = -variance * xy / det
 

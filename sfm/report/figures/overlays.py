@@ -342,7 +342,7 @@ def draw_patches(
     for k, line in enumerate(lines):
         rows += [
             _text(line, width),
-            *(_widened(row, width) for row in _panels(left, right, found, k, template_px, zoom)),
+            *(_padded(row, width) for row in _panels(left, right, found, k, template_px, zoom)),
         ]
     return np.vstack([*rows, _text(last, width)] if last else rows)
 
@@ -388,6 +388,6 @@ def _text(line: str, width: int) -> AnyArray:
     return row
 
 
-def _widened(row: AnyArray, width: int) -> AnyArray:
+def _padded(row: AnyArray, width: int) -> AnyArray:
     """Return a picture padded with white on the right."""
     return np.pad(row, ((0, 0), (0, width - row.shape[1])), constant_values=255)

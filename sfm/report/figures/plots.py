@@ -81,8 +81,8 @@ def _cells(figure: Figure) -> list[tuple[slice, slice]]:
     width, height = figure.get_size_inches() * DPI
     x = [0, *np.rint(lefts[1:] * width - LEFT_IN * DPI).astype(int), round(width)]
     y = [0, *np.rint((1 - tops[1:]) * height - TOP_IN * DPI).astype(int), round(height)]
-    places = dict.fromkeys((spec.rowspan.start, spec.colspan.start) for spec in shown)
-    return [(slice(y[r], y[r + 1]), slice(x[c], x[c + 1])) for r, c in places]
+    positions = dict.fromkeys((spec.rowspan.start, spec.colspan.start) for spec in shown)
+    return [(slice(y[r], y[r + 1]), slice(x[c], x[c + 1])) for r, c in positions]
 
 
 def alone(height_in: float) -> Figure:
@@ -202,7 +202,7 @@ def _show_object(panel: Axes, across: str, up: str, unit: str, title: str) -> No
     entitled(panel, title)
 
 
-def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
+def _write_names(panel: Axes, names: Sequence[str], at: FloatArray) -> None:
     """Write names beside positions, preferably above and inwards; omit a name without room."""
     figure = panel.get_figure(root=True)
     assert figure is not None
@@ -210,7 +210,7 @@ def _write_names(panel: Axes, names: Sequence[str], places: FloatArray) -> None:
     legend = panel.get_legend()
     taken = [legend.get_window_extent()] if legend is not None else []
     middle = sum(panel.get_xlim()) / 2
-    for name, (x, y) in zip(names, places, strict=True):
+    for name, (x, y) in zip(names, at, strict=True):
         inwards = -1 if x > middle else 1
         for side, height in ((inwards, 4), (inwards, -9), (-inwards, 4), (-inwards, -9)):
             near = "left" if side > 0 else "right"

@@ -117,10 +117,10 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
         rms = largest = inner = np.inf
         seen = adjustment.network.image_points.select(~adjustment.rejected)
         xy = seen.xy[(interior.family == f)[seen.image]]
-        places = np.zeros((0, 2))
+        nodes = np.zeros((0, 2))
         if projection is not None:
-            places = np.stack(np.meshgrid(*projection[:2]), axis=-1).reshape(-1, 2)
-        area, inside = observed_part(xy, places)
+            nodes = np.stack(np.meshgrid(*projection[:2]), axis=-1).reshape(-1, 2)
+        area, inside = observed_part(xy, nodes)
         if projection is not None:
             sigma = projection[2]
             known = np.isfinite(sigma)

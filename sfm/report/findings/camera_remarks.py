@@ -23,7 +23,7 @@ DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to
 
 def camera_remarks(result: SurveyResult, calibrated: tuple[CalibratedCamera, ...]) -> tuple[Remark, ...]:
     """Return the remarks on all cameras; on calibrated cameras, the remarks on how well they are known."""
-    weak = _not_calibrated(result, calibrated) if calibrated else _hardly_determined(result)
+    weak = _not_calibrated(result, calibrated) if calibrated else _poorly_determined(result)
     return (*weak, *_principal_points(result), *_pixels(result))
 
 
@@ -48,7 +48,7 @@ def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ..
     return tuple(found)
 
 
-def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
+def _poorly_determined(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on principal distances that the photographs hardly determine, as with long lenses."""
     strong = {one.parameter: one.partners for one in result.orientation_correlations}
     found: dict[str, tuple[Remark, ...]] = {}

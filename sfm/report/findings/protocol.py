@@ -154,8 +154,8 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
     if check is None:
         return []
     control = a.network.control
-    place = {a.network.points[j]: k for k, j in enumerate(control.point)}
-    rows = [(n, place[name]) for n, name in enumerate(check.points) if name in place]
+    index_of = {a.network.points[j]: k for k, j in enumerate(control.point)}
+    rows = [(n, index_of[name]) for n, name in enumerate(check.points) if name in index_of]
     prior, posterior = (
         standard_deviations(control.covariance),
         standard_deviations(a.covariance.points[control.point]),
@@ -171,13 +171,13 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
 def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
     """Return the coordinates that check a datum of control, with the test of their differences."""
     a = result.adjustment
-    place = {name: j for j, name in enumerate(a.network.points)}
+    index_of = {name: j for j, name in enumerate(a.network.points)}
     posterior = standard_deviations(a.covariance.points)
     points = a.estimate.points
     return tuple(
         _check(one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given)
         for one in (result.check_points if a.datum == "control" else ())
-        if (j := place.get(one.point)) is not None
+        if (j := index_of.get(one.point)) is not None
         for c, given in enumerate(one.xyz)
         if np.isfinite(given)
     )

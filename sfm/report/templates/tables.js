@@ -1,5 +1,5 @@
-// Tables of a page: sorted by a click on a column's name, filtered by text, copied as CSV. Without it they are
-// plain tables. Texts are set as text: names are data, never markup.
+// Tables of a page: sorted by a click on the name of a column, filtered by text, copied as CSV. Without this
+// script they are plain tables. Texts are set as text: names are data, never markup.
 (() => {
   const MIN_ROWS = 6 // shorter tables are read at a glance
   const make = (tag, properties, ...children) => {
@@ -35,7 +35,7 @@
     const fits = (row) => [...row.cells].every((cell) => cell.colSpan === 1) && row.cells.length === heads.length
     const last = body ? [...body.rows].filter((row) => row.classList.contains("sum")) : []
     const rows = body ? [...body.rows].filter((row) => !row.classList.contains("sum")) : []
-    const facts = heads.length === 0 || text(heads[0]) === "" // a list of figures, not of things of one kind
+    const facts = heads.length === 0 || text(heads[0]) === "" // a list of facts, not of items of one kind
     if (facts || table.closest("#explore") || rows.length < MIN_ROWS || !rows.every(fits)) return
 
     heads.forEach((head, column) => {
@@ -47,7 +47,7 @@
         const keys = new Map(rows.map((row) => [row, text(row.cells[column])]))
         const order = (one, other) => {
           const [a, b] = [number(keys.get(one)), number(keys.get(other))]
-          if (Number.isNaN(a) !== Number.isNaN(b)) return Number.isNaN(a) ? 1 : -1 // what is no number comes last
+          if (Number.isNaN(a) !== Number.isNaN(b)) return Number.isNaN(a) ? 1 : -1 // texts come after numbers
           const sign = down ? -1 : 1
           return sign * (Number.isNaN(a) ? keys.get(one).localeCompare(keys.get(other), "en", { numeric: true }) : a - b)
         }
@@ -71,8 +71,8 @@
       await copy(shown.map((row) => [...row.cells].map((cell) => quoted(text(cell))).join(",") + "\n").join(""))
       csv.textContent = "copied"
     })
-    const place = table.closest(".scroll") ?? table
-    place.before(make("div", { className: "tools" }, filter, csv, count))
+    const box = table.closest(".scroll") ?? table
+    box.before(make("div", { className: "tools" }, filter, csv, count))
   }
 
   for (const table of document.querySelectorAll("main table")) equip(table)

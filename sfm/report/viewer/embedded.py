@@ -180,12 +180,12 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
 
 
 def _packed(header: dict[str, Any], arrays: dict[str, tuple[str, AnyArray]]) -> str:
-    places: dict[str, tuple[str, int, int]] = {}
+    entries: dict[str, tuple[str, int, int]] = {}
     parts: list[bytes] = []
     at = 0
     for name, (kind, values) in arrays.items():
         array = np.ascontiguousarray(values, dtype=TYPES[kind])
-        places[name] = (kind, at, array.size)
+        entries[name] = (kind, at, array.size)
         raw = array.tobytes()
         raw += bytes(-len(raw) % ALIGNED)
         parts.append(raw)
@@ -193,7 +193,7 @@ def _packed(header: dict[str, Any], arrays: dict[str, tuple[str, AnyArray]]) -> 
     body = b"".join(parts)
 
     def head(start: int) -> bytes:
-        moved = {name: [kind, start + first, count] for name, (kind, first, count) in places.items()}
+        moved = {name: [kind, start + first, count] for name, (kind, first, count) in entries.items()}
         text = json.dumps({**header, "arrays": moved}, ensure_ascii=False, allow_nan=False).encode()
         return text + b" " * (-(4 + len(text)) % ALIGNED)
 
@@ -270,7 +270,7 @@ def scene_of_stored(
     if stored.position_covariance is not None:
         sigma[:, :3] = np.sqrt(np.diagonal(stored.position_covariance[oriented], axis1=1, axis2=2))
     joint = stored.covariance
-    bars, place = network.scale_bars, {int(j): k for k, j in enumerate(determined)}
+    bars, index = network.scale_bars, {int(j): k for k, j in enumerate(determined)}
     notes = []
     for kind, found, names in (
         ("photographs", oriented, network.images),
@@ -298,13 +298,13 @@ def scene_of_stored(
         rays,
         marks,
         tuple(
-            Bar(place[i], place[j], length, s, float(np.linalg.norm(xyz[place[i]] - xyz[place[j]])) - length)
+            Bar(index[i], index[j], length, s, float(np.linalg.norm(xyz[index[i]] - xyz[index[j]])) - length)
             for i, j, length, s in zip(
                 *(x.tolist() for x in (bars.start, bars.end, bars.length, bars.sigma)), strict=True
             )
-            if i in place and j in place
+            if i in index and j in index
         ),
-        tuple(place[int(j)] for j in network.control.point if int(j) in place),
+        tuple(index[int(j)] for j in network.control.point if int(j) in index),
         None
         if joint is None or stored.covariance_points is not None or n < len(network.points)
         else distance_sigmas(xyz, joint),

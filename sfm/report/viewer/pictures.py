@@ -243,12 +243,12 @@ def _embed(
         np.array(crop_of, dtype=np.int64).reshape(-1, 2),
         np.array(cell, dtype=np.int64),
         tuple(
-            _left_out(len(read), m, views, len(kept), sum(len(one.frames) for _, one in read), bool(beside))
+            _notes_of(len(read), m, views, len(kept), sum(len(one.frames) for _, one in read), bool(beside))
         ),
     )
 
 
-def _left_out(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:
+def _notes_of(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:
     """Return in words what the page omits."""
     rest = "the rest is in the folder pictures beside it" if beside else "there was no room for the rest"
     lines = []

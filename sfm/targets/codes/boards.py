@@ -231,8 +231,8 @@ def find_saddles(grey: AnyArray) -> FloatArray:
     if len(value) < STRONG_RANK:
         return np.zeros((0, 2))
     strong = value > MIN_SADDLE * np.sort(value)[-STRONG_RANK]
-    places = np.stack([column, row], axis=1)[strong].astype(np.float64)
-    return np.asarray(places[_has_four_sectors(smooth, places)])
+    candidates = np.stack([column, row], axis=1)[strong].astype(np.float64)
+    return np.asarray(candidates[_has_four_sectors(smooth, candidates)])
 
 
 def _has_four_sectors(smooth: AnyArray, xy: FloatArray) -> BoolArray:

@@ -190,12 +190,12 @@ def _resembles_rings(grey: AnyArray, outlines: Outlines, least: float) -> BoolAr
     det = p * r - q * q
     ray = np.stack([(r * c - q * s) / det, (p * s - q * c) / det], axis=-1)
     radii = np.array([0.0, 0.93, SURROUNDINGS])
-    places = outlines.xy[:, None, None] + radii[:, None, None] * ray[:, None]
+    points = outlines.xy[:, None, None] + radii[:, None, None] * ray[:, None]
     height, width = grey.shape
-    low, high = places.min(axis=(1, 2)), places.max(axis=(1, 2))
+    low, high = points.min(axis=(1, 2)), points.max(axis=(1, 2))
     inside = (low >= 0).all(axis=1) & (high[:, 0] < width - 1) & (high[:, 1] < height - 1)
-    places = np.clip(places, 0, [width - 1, height - 1])
-    value = resample(grey, places.reshape(-1, 2), interpolation="bilinear").reshape(places.shape[:3])
+    points = np.clip(points, 0, [width - 1, height - 1])
+    value = resample(grey, points.reshape(-1, 2), interpolation="bilinear").reshape(points.shape[:3])
     middle, ring, paper = np.median(value, axis=2).T * outlines.sign
     step = ring - paper
     return np.asarray(inside & (step > least / 2) & (ring - middle > step / 4))
@@ -221,10 +221,10 @@ def _read(
     length = mean_radius(geometry)
     angle = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)
     rho = (np.arange(PROFILE) + 0.5) / PROFILE * SURROUNDINGS
-    places = positions_at(geometry, rho, angle)
-    if not _within(grey, places):
+    points = positions_at(geometry, rho, angle)
+    if not _within(grey, points):
         return None
-    profile = np.median(_sampled(grey, places), axis=0)
+    profile = np.median(_sampled(grey, points), axis=0)
     for number, size, blur in _most_similar(profile, rho, table, length):
         begin = geometry.copy()
         begin[2:5] /= size
@@ -251,11 +251,11 @@ def _confidence(fit: ConcentricFit, number: int, table: FloatArray, family: Conc
     # (M^-1 + R)^-1 of the information M and the covariance R in print, and its product with the corrections
     weight = np.linalg.inv(np.eye(n) + fit.radius_information @ printed)
     length = np.einsum("ki,ij,kj->k", others, weight @ fit.radius_information, others)
-    place = others @ (weight @ fit.radius_gradient) / np.maximum(length, 1e-12)
+    shift = others @ (weight @ fit.radius_gradient) / np.maximum(length, 1e-12)
     spread = abs(fit.theta[SPREAD]) / family.bit
-    if spread > QUARTER or np.abs(place).max() > QUARTER or length.min() < (2 * CODE_SIGMAS) ** 2:
+    if spread > QUARTER or np.abs(shift).max() > QUARTER or length.min() < (2 * CODE_SIGMAS) ** 2:
         return 0.0
-    return float(1 - 2 * np.abs(place).max())
+    return float(1 - 2 * np.abs(shift).max())
 
 
 def _edges_on_rays(
@@ -270,10 +270,10 @@ def _edges_on_rays(
     longest, shortest = axes_from_shape(start[None, 2:5])[0][0]
     count = int(np.clip(SAMPLES_PER_PX * SURROUNDINGS * longest, 40, 1000))
     rho = np.linspace(SURROUNDINGS, 0.0, count)
-    places = positions_at(start, rho, angle)
-    if not _within(grey, places):
+    points = positions_at(start, rho, angle)
+    if not _within(grey, points):
         return None
-    value = sign * _sampled(grey, places)
+    value = sign * _sampled(grey, points)
     paper = float(np.median(value[:, rho > 1.07]))
     ink = float(np.percentile(value[:, rho < 1.0], 95))
     if ink <= paper:
@@ -288,7 +288,7 @@ def _edges_on_rays(
     ring = (np.cumsum(crossing, axis=1) - 1)[ray, at]
     before, after = level[ray, at], level[ray, at + 1]
     share = before / (before - after)
-    xy = places[ray, at] + share[:, None] * (places[ray, at + 1] - places[ray, at])
+    xy = points[ray, at] + share[:, None] * (points[ray, at + 1] - points[ray, at])
     geometry = None
     if complete.mean() >= MIN_RAYS:
         of = complete[ray]
@@ -328,14 +328,14 @@ def _most_similar(
     ]
 
 
-def _within(grey: AnyArray, places: FloatArray) -> bool:
+def _within(grey: AnyArray, points: FloatArray) -> bool:
     """Return whether all positions (..., 2) are in the photograph."""
     height, width = grey.shape
-    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
-    return bool(np.isfinite(places).all() and low.min() >= 0 and high[0] < width - 1 and high[1] < height - 1)
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    return bool(np.isfinite(points).all() and low.min() >= 0 and high[0] < width - 1 and high[1] < height - 1)
 
 
-def _sampled(grey: AnyArray, places: FloatArray) -> FloatArray:
+def _sampled(grey: AnyArray, points: FloatArray) -> FloatArray:
     """Return the intensities at positions (k, m, 2), shape (k, m)."""
-    value = resample(grey, places.reshape(-1, 2), interpolation="bilinear")
-    return np.asarray(value, dtype=float).reshape(places.shape[:2])
+    value = resample(grey, points.reshape(-1, 2), interpolation="bilinear")
+    return np.asarray(value, dtype=float).reshape(points.shape[:2])

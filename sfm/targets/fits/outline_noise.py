@@ -8,7 +8,7 @@ correlated noise.
 Damage is detected relative to that shape. The edge of a target is divided into sectors. The deviation h of
 the outline in a sector, in radii, follows from the residuals of the blurred ellipse there. The median over
 the targets of a photograph is shape, such as polygonal printing or sharpening, which shifts all of them
-alike. A place is damaged if the rest is significant relative to the scatter along the edges of this target
+alike. A sector is damaged if the rest is significant relative to the scatter along the edges of this target
 and of the others.
 """
 

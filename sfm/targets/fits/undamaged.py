@@ -87,7 +87,7 @@ def fit_undamaged(
     alike = (np.flatnonzero(sign == one) for one in (1, -1))  # light and compression shift edges by polarity
     classes = [rows[one] for rows in alike for one in sizes_apart(_radii(start[rows]))]
     classes = classes or [np.zeros(0, dtype=np.int64)]
-    found = [_repaired(_some_of(every, one), sign[one], fit, noise**2, least_variance) for one in classes]
+    found = [_repaired(_rows(every, one), sign[one], fit, noise**2, least_variance) for one in classes]
     back = np.argsort(np.concatenate(classes))
 
     def together(parts: Iterable[tuple[FloatArray | IntArray, ...]]) -> Iterator[Any]:
@@ -133,7 +133,7 @@ def unlike_targets(
     ]
 
 
-def _some_of(fits: EllipseFits, some: IntArray) -> EllipseFits:
+def _rows(fits: EllipseFits, some: IntArray) -> EllipseFits:
     parts: Iterator[Any] = (part[some] for part in fits)
     return EllipseFits(*parts)
 
