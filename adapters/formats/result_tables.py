@@ -301,6 +301,8 @@ class _Summary(Json):
 
 def _summary(path: Path) -> _Summary:
     """Read the summary, which must not contain a camera twice."""
+    if not path.exists():
+        raise SurveyFileError(f"{path.parent}: not the folder of a result, {path.name} is missing")
     summary = read_json(path, _Summary, "the summary of a result")
     names = [camera.name for camera in summary.cameras]
     for name, count in Counter(names).items():

@@ -87,6 +87,12 @@ def test_bad_summaries_are_refused(folder: Path, text: str, message: str) -> Non
     assert "\n" not in str(refused.value) and str(folder) in str(refused.value)
 
 
+def test_a_folder_without_a_result_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SurveyFileError) as refused:
+        read_result(tmp_path)
+    assert str(refused.value) == f"{tmp_path}: not the folder of a result, summary.json is missing"
+
+
 @pytest.mark.parametrize(
     ("name", "column", "value", "message"),
     [
