@@ -4,20 +4,20 @@
     >>> "adjust" in dir(sfm)
     True
 
-A survey is `run_survey`; image points measured elsewhere go through `Network`, `orient` and `adjust`. The
-methods below them are in rooms, each with a list of its public names and an example:
+`run_survey` runs a whole survey. Image points measured elsewhere go through `Network`, `orient` and `adjust`.
+The methods underneath are in packages, each with a list of its public names and an example:
 
-- `targets`, `matching`: what is measured in photographs.
+- `targets`, `matching`: measurement in photographs.
 - `orientation`, `adjustment`: photographs and points from image points, with covariance and tests.
-- `geometry`, `comparison`, `epochs`: shapes and tolerances, two results of one object, what moved.
-- `planning`: what a network will give before anything is photographed.
+- `geometry`, `comparison`, `epochs`: shapes and tolerances, two results of one object, movements.
+- `planning`: the precision that a network will reach, before anything is photographed.
 - `textbook`: methods of the literature that a survey does not need.
 - `camera`, `conventions`: cameras and their distortion, frames and rotations.
 
     >>> sfm.textbook.resect_church.__name__
     'resect_church'
 
-Every name is listed in `__init__.pyi` and is imported when it is first asked for.
+Every name is listed in `__init__.pyi` and is imported when it is first used.
 """
 
 from __future__ import annotations

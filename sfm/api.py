@@ -1,6 +1,6 @@
-"""The functions that people call from Python and that need more than one room, or an adapter.
+"""The public functions that need more than one package, or an adapter.
 
-Everything public is named in `sfm/__init__.pyi`. Adapters are imported where they are asked for.
+All public names are listed in `sfm/__init__.pyi`. An adapter is imported by the function that needs it.
 """
 
 from __future__ import annotations
@@ -53,14 +53,15 @@ def run_survey(
 
     Args:
         survey: settings and given data, or the survey file.
-        images: folder of the photographs in place of those of the survey.
-        compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey asks for.
-        jobs: photographs measured at a time; as many as there are cores if not given.
-        store: folder that keeps what was measured, so that a photograph is not measured twice.
-        progress: whether to draw a bar on a terminal, or an object that receives stages and photographs.
+        images: folder of the photographs; the folder named in the survey if not given.
+        compare_with: "colmap" (its adjuster on the same network) or "none"; the choice of the survey if
+            not given.
+        jobs: number of photographs measured at the same time; the number of cores if not given.
+        store: folder that keeps the measurements, so that no photograph is measured twice.
+        progress: True draws a progress bar in the terminal; an object receives stages and photographs.
 
     Raises:
-        KolinearError: the survey cannot be run; the message says what to do.
+        KolinearError: the survey cannot be run; the message states the remedy.
 
     Example:
         >>> import sfm
@@ -96,13 +97,13 @@ def run_survey(
 
 @checked_arguments()
 def read_result(path: str | Path) -> Solution:
-    """Read a result: the folder of a survey, a COLMAP model, or another format that is known.
+    """Read a result: the folder of a survey, a COLMAP model, or another known format.
 
     Args:
         path: folder or file.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: the files cannot be read; the message gives the reason, the file and the line number.
 
     Example:
         >>> import sfm
@@ -122,19 +123,19 @@ def write_result(
     jobs: int | None = None,
     pictures_mb: float = 15.0,
 ) -> Path:
-    """Write a result into a folder, whole or not at all: of a survey tables, figures and the report.
+    """Write a result into a folder, whole or not at all.
 
     Args:
-        result: of a survey; of another solution, as of an adjustment, the tables are written.
-        folder: an earlier result in it is replaced, anything else in it is an error.
-        jobs: photographs drawn at the same time; as many as there are cores if not given.
-        pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies in pictures/.
+        result: a survey is written as tables, figures and the report; any other solution as tables only.
+        folder: an earlier result in it is replaced; any other content is an error.
+        jobs: number of photographs drawn at the same time; the number of cores if not given.
+        pictures_mb: limit for the pictures inside report.html, 10^6 bytes; the rest goes to pictures/.
 
     Returns:
-        The path of report.html, or of points.csv.
+        The path of report.html, or of points.csv if there is no report.
 
     Raises:
-        OutputError: the folder cannot be written, or contains something else than an earlier result.
+        OutputError: the folder cannot be written, or contains anything but an earlier result.
 
     Example:
         >>> import sfm
@@ -173,13 +174,13 @@ def compare(
     """Compare two results: differences b - a after an alignment, their standard deviations and tests.
 
     Args:
-        a: result that is kept as it is; points and photographs are recognised by their names.
-        b: result that is brought onto it.
-        align: points (all common ones), cameras (projection centres), control (the named points) or none.
+        a: result that stays as it is; points and photographs correspond by name.
+        b: result that is aligned with a.
+        align: points (all common points), cameras (projection centres), control (the named points) or none.
         control: names of the points for align = control.
 
     Raises:
-        GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
+        GeometryError: unknown alignment, too little in common for it, or nothing in common at all.
 
     Example:
         >>> import sfm
@@ -195,16 +196,16 @@ def compare(
 
 @checked_arguments()
 def distance(result: SurveyResult | Adjustment | Solution, start: str, end: str) -> tuple[float, float]:
-    """Return the distance of two points and its standard deviation, object unit.
+    """Return the distance between two points and its standard deviation, object unit.
 
     Args:
-        result: of a survey, of an adjustment, or read from files.
-        start: name of a point.
-        end: name of another.
+        result: result of a survey or an adjustment, or one read from files.
+        start: name of one point.
+        end: name of the other point.
 
     Raises:
-        UnknownNameError: there is no point of that name.
-        GeometryError: both are in one place, or their joint covariance is not known.
+        UnknownNameError: no point has that name.
+        GeometryError: the points coincide, or their joint covariance is unknown.
 
     Example:
         >>> import sfm
@@ -235,14 +236,14 @@ def fit_shape(
     """Fit a shape to points of a result by orthogonal distances, with the covariance of the network.
 
     Args:
-        result: of a survey, or read from files.
+        result: result of a survey or an adjustment, or one read from files.
         kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid (of revolution).
-        points: names or patterns such as `10*`; all if not given.
+        points: names or patterns such as `10*`; all points if not given.
         weights: network (the covariance of the points) or equal.
-        hold: values that are not fitted: `direction`, `centre` (also `point`, `apex`, `vertex`), `radius`,
-            `diameter` and the like; lengths in the object unit, angles in rad.
-        robust: whether points that most of the others contradict are left out.
-        offset: of the targets from the shape, on the side of its normal positive, object unit.
+        hold: values held fixed: `direction`, `centre` (also `point`, `apex`, `vertex`), `radius`, `diameter`
+            and the like; lengths in the object unit, angles in rad.
+        robust: whether to leave out points that contradict most of the others.
+        offset: distance of the targets from the shape, positive on the side of its normal, object unit.
 
     Raises:
         GeometryError: too few points, points that do not determine the shape, or unknown names.
@@ -267,12 +268,13 @@ def measure(
     """Measure a result: hidden points, alignment, shapes, distances, angles and tolerances.
 
     Args:
-        result: of a survey, or read from files.
-        features: the features file that says what is asked for, docs/measuring.md; points alone if not given.
-        allow_outside: whether it may name files outside its folder.
+        result: result of a survey or an adjustment, or one read from files.
+        features: features file that lists the features to measure, see docs/measuring.md; points only if not
+            given.
+        allow_outside: whether the features file may name files outside its folder.
 
     Raises:
-        KolinearError: what it asks for cannot be done; the message says why.
+        KolinearError: a feature cannot be measured; the message says why.
 
     Example:
         >>> import sfm
@@ -289,14 +291,14 @@ def measure(
 
 
 def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:
-    """Return a COLMAP model as a network and its solution; each image point has a sigma of 1 px.
+    """Convert a COLMAP model to a network and its solution; each image point gets a sigma of 1 px.
 
     Args:
         model: folder of the model, or a pycolmap.Reconstruction.
 
     Raises:
-        SurveyFileError: no model in the folder, or one that cannot be read.
-        BackendError: pycolmap is missing, or a camera model that Kolinear has no equal of.
+        SurveyFileError: the folder contains no model, or the model cannot be read.
+        BackendError: pycolmap is missing, or Kolinear has no equivalent of a camera model.
 
     Example:
         >>> import sfm
@@ -317,12 +319,12 @@ def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:
 
 
 def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherPrograms:
-    """Return the programs to compare a survey with; their library is imported only here.
+    """Return the programs that a survey is compared with; their library is imported only here.
 
     Args:
         backend: colmap or none.
         baseline: mapper or none.
-        threads: of the mapper; -1 for as many as there are cores.
+        threads: number of threads of the mapper; -1 for the number of cores.
     """
     others = OtherPrograms()
     if backend == "colmap":
@@ -337,10 +339,10 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
 
 
 def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float | None]:
-    """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
+    """Return a function that looks up the sensor width of a camera, mm, by make and model in COLMAP's list.
 
     Args:
-        note: receives the remark on a camera that could not be looked up, as without pycolmap.
+        note: receives a remark on each camera that could not be looked up, for example without pycolmap.
     """
     from adapters.colmap.mapper import sensor_width_mm
 
@@ -355,7 +357,7 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
 
 
 def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
-    """Return what writes the compared solution as COLMAP's model into a folder, None without one."""
+    """Return a function that writes the compared solution as a COLMAP model; None without a comparison."""
     both = result.comparison
     if both is None:
         return None
@@ -366,7 +368,7 @@ def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Hold BLAS to one thread: photographs are worked on side by side, and BLAS pools would compete."""
+    """Limit BLAS to one thread: photographs are processed in parallel, and BLAS pools would compete."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):

@@ -1,7 +1,7 @@
-"""Arguments of public functions, checked at the border against their annotations.
+"""Checks the arguments of public functions against their annotations.
 
-Where an array is annotated, a function decorated with `checked_arguments` takes whatever numpy makes an array
-of. Everything else it refuses in one line: what was found, and what was expected.
+A function decorated with `checked_arguments` accepts anything numpy can convert where an array is annotated.
+It refuses everything else in one line: what was found, and what was expected.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ ARRAYS: tuple[tuple[Any, str, Any, str], ...] = (
     (BoolArray, "b", np.bool_, "True and False"),
     (AnyArray, "biuf", None, "numbers"),
 )
-"""annotation, kinds of values that are taken (numpy's letters), what they become, how they are called"""
+"""annotation, accepted kinds of values (numpy's letters), resulting dtype, name in messages"""
 SEQUENCES = (list, tuple, Sequence)
 DIGITS = frozenset("0123456789")
 NUMBERS: Mapping[Any, tuple[type, str]] = {float: (Real, "a number"), int: (Integral, "a whole number")}
 
 
 def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that checks the arguments of a function before it begins.
+    """Return a decorator that checks the arguments of a function before it runs.
 
     Args:
-        shapes: shape of array arguments by name, as "n 3"; a letter is one length in all of them, "..." any
-            number of axes.
+        shapes: shapes of array arguments by name, such as "n 3"; a letter is the same length in all of them,
+            "..." is any number of axes.
 
     Raises:
-        GeometryError: by the function, for an argument of another type or shape.
+        GeometryError: the decorated function is called with an argument of another type or shape.
 
     Example:
         >>> @checked_arguments(points="n 3")
@@ -61,13 +61,13 @@ def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R
         annotated: dict[str, tuple[tuple[Any, ...], frozenset[Any]]] = {}
         called = function.__name__
 
-        def take(name: str, value: object, lengths: dict[str, int]) -> Any:
+        def check(name: str, value: object, lengths: dict[str, int]) -> Any:
             if name not in annotated:
-                return value  # of no parameter, which Python says itself
+                return value  # no such parameter: Python raises the error itself
             allowed, exact = annotated[name]
             kind = value.dtype if isinstance(value, np.ndarray) else type(value)
             if kind not in exact:
-                value = _taken(f"{called}: {name}", value, allowed)
+                value = _checked(f"{called}: {name}", value, allowed)
             if name in axes and isinstance(value, np.ndarray):
                 before = dict(lengths)
                 if not _has_shape(value.shape, axes[name], lengths):
@@ -76,12 +76,12 @@ def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R
 
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            if not annotated:  # which is read late, when all modules are there
+            if not annotated:  # read at the first call, when all modules are imported
                 hints = typing.get_type_hints(function)
                 annotated.update({name: _alternatives(hints[name]) for name in names})
             lengths: dict[str, int] = {}
-            positional: Any = [take(*pair, lengths) for pair in zip(names, args, strict=False)]
-            named: Any = {name: take(name, value, lengths) for name, value in kwargs.items()}
+            positional: Any = [check(*pair, lengths) for pair in zip(names, args, strict=False)]
+            named: Any = {name: check(name, value, lengths) for name, value in kwargs.items()}
             return function(*(*positional, *args[len(names) :]), **named)
 
         return checked
@@ -90,15 +90,15 @@ def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R
 
 
 def check_indices(where: str, indices: IntArray, count: int) -> None:
-    """Refuse indices that lead outside of what they count.
+    """Refuse indices that are out of range.
 
     Args:
-        where: the function and its argument.
-        indices: any number of them.
-        count: of what there is.
+        where: names of the function and its argument, for the message.
+        indices: indices, any shape.
+        count: number of elements that they refer to.
 
     Raises:
-        GeometryError: one is negative or too large.
+        GeometryError: an index is negative or too large.
     """
     outside = (indices < 0) | (indices >= count)
     if outside.any():
@@ -106,14 +106,14 @@ def check_indices(where: str, indices: IntArray, count: int) -> None:
 
 
 def _alternatives(hint: Any) -> tuple[tuple[Any, ...], frozenset[Any]]:
-    """Return the types that an annotation allows, and those of values that need no further look."""
+    """Return the types that an annotation allows, and those whose values need no further check."""
     allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     arrays = {np.dtype(dtype) for array, _, dtype, _ in ARRAYS if dtype is not None and array in allowed}
     return allowed, frozenset({one for one in allowed if type(one) is type} | arrays)
 
 
-def _taken(where: str, value: object, allowed: tuple[Any, ...]) -> object:
-    """Return an argument, an array made of it where one is expected; GeometryError if it is none of these."""
+def _checked(where: str, value: object, allowed: tuple[Any, ...]) -> object:
+    """Return an argument, converted to an array where one is expected; GeometryError if no type fits."""
     for hint in allowed:
         array = next((row for row in ARRAYS if row[0] == hint), None)
         if array is not None:
@@ -122,15 +122,15 @@ def _taken(where: str, value: object, allowed: tuple[Any, ...]) -> object:
                 return made
         elif _fits(value, hint):
             return _as_annotated(value, hint)
-    expected = " or ".join(dict.fromkeys(_called(hint) for hint in allowed))
-    raise GeometryError(f"{where} is {_described(value)}, expected {expected}")
+    expected = " or ".join(dict.fromkeys(_type_name(hint) for hint in allowed))
+    raise GeometryError(f"{where} is {_describe_value(value)}, expected {expected}")
 
 
 def _array_of(value: object, kinds: str, dtype: Any) -> AnyArray | None:
-    """Return an array of a value, None if it is none of these kinds."""
+    """Return a value as an array, None if its elements are of another kind."""
     try:
         made = np.asarray(value)
-    except (TypeError, ValueError):  # rows of unequal length, or what is no sequence
+    except (TypeError, ValueError):  # rows of unequal length, or no sequence
         return None
     if made.dtype.kind not in kinds and (made.size or made.dtype.kind != "f"):
         return None
@@ -138,15 +138,15 @@ def _array_of(value: object, kinds: str, dtype: Any) -> AnyArray | None:
 
 
 def _as_annotated(value: Any, hint: Any) -> object:
-    """Return a value that fits, as the list or tuple of arrays that is annotated."""
+    """Return a value that fits, converted to the annotated list or tuple of arrays."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if isinstance(value, list | tuple) and origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS):
-        value = [_taken("", one, inner[:1]) for one in value]
+        value = [_checked("", one, inner[:1]) for one in value]
     return origin(value) if origin in (list, tuple) else value
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Return whether a value is of a type that is no array; elements of sequences are looked at too."""
+    """Return whether a value is of a type other than an array; elements of sequences are checked too."""
     if hint is type(None) or hint is None:
         return value is None
     if hint in NUMBERS:
@@ -160,23 +160,23 @@ def _fits(value: object, hint: Any) -> bool:
         origin = Sequence
     if not isinstance(value, origin) or (isinstance(value, str) and origin is not str):
         return False
-    if not isinstance(value, list | tuple) or not inner:  # others may read their elements from files
+    if not isinstance(value, list | tuple) or not inner:  # other sequences may read elements from files
         return True
     if typing.get_origin(hint) is tuple and Ellipsis not in inner:
-        return len(value) == len(inner) and all(map(_is, value, inner))
-    return all(_is(one, inner[0]) for one in value)
+        return len(value) == len(inner) and all(map(_matches, value, inner))
+    return all(_matches(one, inner[0]) for one in value)
 
 
-def _is(value: object, hint: Any) -> bool:
+def _matches(value: object, hint: Any) -> bool:
     try:
-        _taken("", value, _alternatives(hint)[0])
+        _checked("", value, _alternatives(hint)[0])
     except GeometryError:
         return False
     return True
 
 
 def _has_shape(shape: tuple[int, ...], axes: list[str], lengths: dict[str, int]) -> bool:
-    """Return whether an array has a shape, by the lengths of the letters up to now; new ones are added."""
+    """Return whether an array has a shape; lengths of letters that are new are added to `lengths`."""
     if axes[0] == "...":
         axes = axes[1:]
         shape = shape[-len(axes) :]
@@ -198,8 +198,8 @@ def _wrong_shape(
     )
 
 
-def _described(value: object) -> str:
-    """Return how a message calls a value: by its kind and shape, or as it is where it is short."""
+def _describe_value(value: object) -> str:
+    """Return the description of a value for a message: a short value itself, else its type and shape."""
     if isinstance(value, np.ndarray):
         return f"an array of {value.dtype} of shape {value.shape}"
     if value is None or isinstance(value, str | int | float | bool):
@@ -208,8 +208,8 @@ def _described(value: object) -> str:
     return f"a {type(value).__name__}{within}"
 
 
-def _called(hint: Any) -> str:
-    """Return an annotation as it is called in a message."""
+def _type_name(hint: Any) -> str:
+    """Return the name of an annotated type for a message."""
     for array, _, _, values in ARRAYS:
         if array == hint:
             return f"an array of {values}"
@@ -221,5 +221,5 @@ def _called(hint: Any) -> str:
     name = getattr(origin, "__name__", str(hint))
     if name == "Callable" or getattr(origin, "_is_protocol", False):
         return "a function"
-    elements = f" of {_called(inner[0])}" if name in ("list", "tuple", "Sequence") and inner else ""
+    elements = f" of {_type_name(inner[0])}" if name in ("list", "tuple", "Sequence") and inner else ""
     return {"str": "text", "bool": "True or False"}.get(name, name) + elements

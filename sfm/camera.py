@@ -1,6 +1,6 @@
-"""Camera: interior orientation, and the way between pixels and rays.
+"""Camera: interior orientation, and the transformation between pixels and rays.
 
-The distortion models are in `sfm.distortion`; a camera has the values of one of them.
+The distortion models are in `sfm.distortion`; a camera has the parameter values of one model.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from sfm.kernels.compiling import compiled
 
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-10
-CURVATURE_STEP = 1e-3  # of tangents; a pixel or a few
-# Of tangents; what Newton's method leaves after such a step is its square, or rounding.
+CURVATURE_STEP = 1e-3  # tangents, one or a few pixels
+# In tangents; the error of Newton's method after such a step is its square, or rounding.
 STEP_TOLERANCE = 1e-11
-# Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
-# apart from true ones. A parameter that the network knows worse is better held.
+# Fraction of the half diagonal, at the corner of the photograph, by which nominal focal lengths, sensors and
+# lenses differ from true ones. A parameter that the network determines worse is better held fixed.
 KNOWN_WITHOUT = 0.01
-DIAGONAL_PLACES = 26  # from the corner to the middle of a wide-angle photograph, of which one has a ray
+DIAGONAL_PLACES = 26  # from the corner to the middle of a wide-angle photograph; one of them has a ray
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Camera:
     """Interior orientation of one camera, shared by the photographs taken with it."""
 
     name: str
-    """what people call the camera"""
+    """name of the camera"""
     model: str
-    """distortion model, a name in `sfm.distortion.models.MODELS`"""
+    """name of the distortion model in `sfm.distortion.models.MODELS`"""
     size_px: tuple[int, int]
     """width and height of its photographs, px"""
     pixel_mm: FloatArray
@@ -46,8 +46,8 @@ class Camera:
     free: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """which parameters are to be adjusted; none by default, shape (n,)"""
     shared: tuple[str, ...] = ()
-    """of each parameter, the group of cameras that have one value of it, such as the camera whose photographs
-    differ in c only; "" = this camera's alone, () = all this camera's alone, length n"""
+    """of each parameter, the group of cameras that share its value, such as photographs of one camera that
+    differ in c only; "" = not shared, () = none shared, length n"""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -74,7 +74,7 @@ class Camera:
         return MODELS[self.model].units
 
     def plays(self, *roles: Role) -> BoolArray:
-        """Return which parameters play one of some parts, such as radial distortion, (n,)."""
+        """Return which parameters have one of the roles, such as radial distortion, (n,)."""
         return np.array([parameter.role in roles for parameter in MODELS[self.model].parameters])
 
     @property
@@ -85,28 +85,28 @@ class Camera:
 
     @property
     def in_mm(self) -> bool:
-        """Whether c and the principal point are in mm on the sensor; else there are focal lengths in px."""
+        """Whether c and the principal point are in mm on the sensor; otherwise focal lengths are in px."""
         return MODELS[self.model].in_mm
 
     @property
     def wide_angle(self) -> bool:
-        """Whether equal angles are about equally long on its photographs, instead of equal tangents."""
+        """Whether equal angles, rather than equal tangents, have about equal lengths in its photographs."""
         return MODELS[self.model] in WIDE_ANGLE
 
     @property
     def index(self) -> int:
-        """Number by which compiled code knows the model."""
+        """Number of the model in compiled code."""
         return number_of(self.model)
 
     @property
     def frame(self) -> FloatArray:
-        """Centre (px), pixel size (mm) and variant of the model for compiled code, (6,)."""
+        """Centre (px), pixel size (mm) and variant of the model, for compiled code, (6,)."""
         width, height = self.size_px
         return np.array([(width - 1) / 2, (height - 1) / 2, *self.pixel_mm, *MODELS[self.model].variant])
 
     @property
     def linear_frame(self) -> FloatArray:
-        """`frame` with residuals in the corrected plane, where those of corrections are linear in the ray."""
+        """`frame` with residuals in the corrected plane; there correction models are linear in the ray."""
         frame = self.frame
         if MODELS[self.model].corrects:
             frame[4] = 0.0
@@ -128,7 +128,7 @@ class Camera:
         return np.array([width / 2 + x / self.pixel_mm[0], height / 2 - y / self.pixel_mm[1]])
 
     def value(self, name: str) -> float:
-        """Value of one parameter in its unit; KeyError if the model has none of that name."""
+        """Return the value of a parameter in its unit; KeyError if the model has no such parameter."""
         if name not in self.names:
             raise KeyError(name)
         return float(self.parameters[self.names.index(name)])
@@ -138,26 +138,26 @@ class Camera:
         return self.shared[parameter] if self.shared else ""
 
     def owner_of(self, parameter: int) -> str:
-        """Return whose a parameter is, given by its index: of the cameras that share it, or of this one."""
+        """Return the owner of a parameter, given by its index: the group that shares it, or this camera."""
         return self.group_of(parameter) or self.name
 
     @property
     def shared_name(self) -> str:
-        """Name of the cameras that share parameters with this one; its name where none does."""
+        """Name of the group that shares parameters with this camera; its own name if nothing is shared."""
         return next(filter(None, self.shared), self.name)
 
     def reduced(self, shrink: int) -> Camera:
-        """Return the camera of the same photographs with the mean of `shrink` pixels a side in one.
+        """Return the camera of the photographs reduced by averaging squares of `shrink` x `shrink` pixels.
 
-        The rest beyond whole squares at the right and the lower border is cut off.
+        Incomplete squares at the right and lower borders are cut off.
         """
         width, height = (side // shrink for side in self.size_px)
         cut = (np.array(self.size_px) - shrink * np.array([width, height])) / 2 * self.pixel_mm
         parameters = self.parameters.copy()
-        if self.in_mm:  # from the middle of the photograph, which the cut moves
+        if self.in_mm:  # counted from the centre of the photograph, which the cut moves
             parameters[self.plays(Role.X0)] += cut[0]
             parameters[self.plays(Role.Y0)] -= cut[1]
-        else:  # models in px count the principal point from the middle of the first pixel
+        else:  # models in px count the principal point from the centre of the first pixel
             parameters[self.plays(Role.FOCAL)] /= shrink
             centre = self.plays(Role.X0, Role.Y0)
             parameters[centre] = (parameters[centre] + 0.5) / shrink - 0.5
@@ -179,17 +179,17 @@ def camera_from_values(
     free: tuple[str, ...] = (),
     values: tuple[tuple[str, float], ...] = (),
 ) -> Camera:
-    """Return a camera from its principal distance and whatever other parameters are known.
+    """Return a camera from its principal distance and other known parameters.
 
     Args:
-        name: what people call the camera.
-        model: one of MODELS.
+        name: name of the camera.
+        model: name of the distortion model, one of MODELS.
         size_px: width and height of its photographs, px.
         pixel_mm: width and height of a pixel, mm.
         c_mm: principal distance, mm; for models in px it gives f, or fx and fy.
-        free: names of the parameters that are to be adjusted.
-        values: (name, value) of parameters in the model's units; all others are 0, and the principal
-            point of models in px is the centre of the photograph.
+        free: names of the parameters to adjust.
+        values: (name, value) of known parameters in the units of the model. All others are 0; for models in
+            px the principal point is the centre of the photograph.
 
     Raises:
         SurveyFileError: unknown model or parameter name, or sizes that are not positive.
@@ -236,8 +236,8 @@ def camera_from_values(
 def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tuple[str, ...], IntArray]:
     """Return the families of cameras that share parameters, such as the photographs of one zoom lens.
 
-    A camera that shares nothing is a family by itself. The name of another is that of the group that
-    most photographs have in common.
+    A camera that shares nothing is a family by itself. Any other family takes the name of the group with the
+    most photographs.
 
     Args:
         cameras: interior orientations.
@@ -252,7 +252,7 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
     for of_family, count in zip(owners, used, strict=True):
         photographs.update(dict.fromkeys(of_family, count))
     names = [max(of_family, key=lambda owner: photographs[owner]) for of_family in owners]
-    # two cameras without anything in common may have one name in another program's files
+    # in files of other programs two cameras with nothing in common may have the same name
     keys = [(name, -1 if one.shared else a) for a, (name, one) in enumerate(zip(names, cameras, strict=True))]
     families = list(dict.fromkeys(keys))
     return tuple(name for name, _ in families), np.array(
@@ -261,9 +261,9 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
 
 
 def base_name(name: str, names: Iterable[str]) -> str:
-    """Return which of some cameras one is, by its name, which may have a photograph behind; "" if none.
+    """Return which of the names a camera name begins with; a photograph may follow. Return "" if none.
 
-    Of names that begin alike it is the longest.
+    If several fit, the longest is returned.
     """
     return max((one for one in names if f"{name} ".startswith(f"{one} ")), key=len, default="")
 
@@ -276,7 +276,7 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
         xy_px: pixel coordinates, shape (k, 2), px.
 
     Returns:
-        u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where the model cannot be inverted.
+        u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where the model has no inverse.
 
     Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera (`sfm.distortion`).
     """
@@ -285,7 +285,7 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
 
 def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return the pixel coordinates at which rays with tangents (u, v) are seen.
+    """Return the pixel coordinates of rays with tangents (u, v).
 
     Args:
         camera: interior orientation.
@@ -299,7 +299,7 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
 
 
 def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return directions of rays, object axes, one unit along the axis of the camera, shape (k, 3).
+    """Return directions of rays in object axes, shape (k, 3), one unit long along the camera axis.
 
     Args:
         uv: tangents u = -U/W and v = -V/W, shape (k, 2).
@@ -337,14 +337,14 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
 
 
 def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
-    """Return d (x, y) / d (u, v), how pixels move with the tangents of their rays.
+    """Return d (x, y) / d (u, v), the change of pixel coordinates with the tangents of the rays.
 
     Args:
         camera: interior orientation.
         xy_px: pixel coordinates, shape (k, 2), px.
 
     Returns:
-        Derivatives, shape (k, 2, 2), px; the inverse of central differences over two pixels.
+        Derivatives, shape (k, 2, 2), px, from the inverse of central differences over two pixels.
     """
     columns = []
     for step in np.eye(2):
@@ -354,15 +354,15 @@ def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
 
 def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return d^2 (x, y) / d (u, v)^2, by which the distortion bends what is straight in the tangents.
+    """Return d^2 (x, y) / d (u, v)^2: how much distortion bends lines that are straight in the tangents.
 
     Args:
         camera: interior orientation.
         uv: tangents of rays, shape (k, 2).
 
     Returns:
-        Second derivatives [:, i, a, b] of pixel coordinate i, shape (k, 2, 2, 2), px; by differences over
-        CURVATURE_STEP, NaN where the distortion folds over.
+        Second derivatives [:, i, a, b] of pixel coordinate i, shape (k, 2, 2, 2), px, from differences over
+        CURVATURE_STEP. They are NaN where the distortion folds over.
     """
     u, v = CURVATURE_STEP * np.eye(2)
 
@@ -378,7 +378,7 @@ def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
 
 @compiled
 def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> FloatArray:
-    """Return the tangents by Newton's method; one step is exact for corrections, which are linear in u, v."""
+    """Return the tangents by Newton's method; one step is exact for correction models, linear in u and v."""
     residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     uv = np.empty_like(xy)
     for i in range(len(xy)):
@@ -404,7 +404,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> F
 
 @compiled
 def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return the pixels by the fixed point x <- x + residual(x), which distortion contracts."""
+    """Return the pixels by fixed-point iteration x <- x + residual(x), a contraction for usual distortion."""
     residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     xy = np.empty_like(uv)
     for i in range(len(uv)):
@@ -423,10 +423,10 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> Flo
 
 
 def corner_shift(camera: Camera, s: int, sigma: float) -> float:
-    """Return by how much a change of a parameter moves the corner, over the half diagonal.
+    """Return how far a change of parameter s by sigma moves the corner, as a fraction of the half diagonal.
 
-    The corner of a wide-angle photograph may be farther off the axis than any ray: the farthest place on the
-    diagonal that has one stands for it.
+    The corner of a wide-angle photograph may lie farther from the axis than any ray reaches. Then the
+    farthest position on the diagonal that has a ray takes its place.
     """
     if not np.isfinite(sigma):
         return np.inf

@@ -2,13 +2,13 @@
 
 Pixel frame
     (0, 0) is the centre of the top-left pixel, x = column to the right, y = row down, unit px.
-    (COLMAP counts from the corner of that pixel; adapters/colmap alone adds the half pixel.)
+    (COLMAP counts from the corner of that pixel; only adapters/colmap adds the half pixel.)
 Image frame
     mm, origin at the centre of the sensor, x right, y up; the camera looks along -z.
 Object frame
     right-handed, in the object unit that the survey declares.
 Rotation
-    R = Rx(omega) Ry(phi) Rz(kappa) turns image axes into object axes, M = R^T the other way.
+    R = Rx(omega) Ry(phi) Rz(kappa) turns image axes into object axes; M = R^T is the inverse.
     (U, V, W) = M (X - X0); tangents u = -U/W, v = -V/W; ideal image point x = c u, y = c v.
 Angles are radians inside and degrees in files and reports. A `sigma` is one standard deviation.
 """
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
-"""metric units and their length in metres, largest first"""
+"""metric units and their lengths in metres, largest first"""
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -40,9 +40,10 @@ METRES = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-"""units of length and their length in metres"""
+"""units and their lengths in metres"""
 MAD_TO_SIGMA = 1.4826
-"""standard deviation of a normal variable over its median absolute deviation; Hampel (1974), JASA 69"""
+"""ratio of the standard deviation of a normal variable to its median absolute deviation; Hampel (1974), JASA
+69"""
 
 
 def rotation_from_angles(omega: float, phi: float, kappa: float) -> FloatArray:
@@ -78,10 +79,9 @@ def angles_from_rotation(rotation: FloatArray) -> FloatArray:
         rotation: R, image to object axes, shape (..., 3, 3).
 
     Returns:
-        Angles, shape (..., 3); at phi = +-90 deg, where omega and kappa are not separable, omega
-        is 0.
+        Angles, shape (..., 3). At phi = +-90 deg omega and kappa are not separable, and omega is 0.
 
-    Source: as `rotation_from_angles`.
+    Source: as for `rotation_from_angles`.
     """
     R = np.asarray(rotation, dtype=float)
     sin_phi = np.clip(R[..., 0, 2], -1.0, 1.0)
@@ -97,7 +97,7 @@ def angles_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def image_from_pixel(xy_px: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray) -> FloatArray:
-    """Return image-frame coordinates (mm, y up, origin at the sensor centre) of pixel coordinates.
+    """Convert pixel coordinates to image-frame coordinates (mm, y up, origin at the sensor centre).
 
     Args:
         xy_px: pixel coordinates, shape (..., 2), px.
@@ -112,7 +112,7 @@ def image_from_pixel(xy_px: FloatArray, size_px: tuple[int, int], pixel_mm: Floa
 
 
 def pixel_from_image(xy_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray) -> FloatArray:
-    """Return pixel coordinates of image-frame coordinates; inverse of `image_from_pixel`.
+    """Convert image-frame coordinates to pixel coordinates; the inverse of `image_from_pixel`.
 
     Args:
         xy_mm: image coordinates, shape (..., 2), mm.
@@ -149,7 +149,7 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 
 
 def skew(vector: FloatArray) -> FloatArray:
-    """Return [vector]x, the matrix of the cross product from the left, shape (..., 3, 3)."""
+    """Return [vector]x, the matrix of the cross product with the vector on the left, shape (..., 3, 3)."""
     w = np.asarray(vector, dtype=float)
     zero = np.zeros(w.shape[:-1])
     x, y, z = w[..., 0], w[..., 1], w[..., 2]
@@ -164,27 +164,27 @@ UNITS = {
     **{25.4: ("mm", "inch"), 2.54: ("cm", "inch"), 1 / 0.0254: ("inch", "m"), 12.0: ("inch", "foot")},
     **{304.8: ("mm", "foot"), 30.48: ("cm", "foot"), 1 / 0.3048: ("foot", "m")},
 }
-"""factors of lengths by what the finer and the coarser unit are"""
+"""factors of lengths, with the finer and the coarser unit of each"""
 POWERS_OF_TEN = (10.0, 100.0, 1e3, 1e6)
-SAME_POWER = 0.02  # relative: a wrong scale beside a power of ten; no length is near one by chance
-SWELLING = 0.002  # relative, of prints: paper swells by 1 to 2 permille
+SAME_POWER = 0.02  # relative: a wrong scale this close to a power of ten is not there by chance
+SWELLING = 0.002  # relative: printed paper swells by 1 to 2 permille
 
 
 @dataclass(frozen=True)
 class UnitFactor:
-    """A factor of lengths as that of two units."""
+    """The factor between two units of length."""
 
-    factor: float  # of UNITS, or 1 over it
-    units: tuple[str, str]  # the finer and the coarser one
+    factor: float  # a key of UNITS, or its reciprocal
+    units: tuple[str, str]  # the finer and the coarser unit
 
 
 def finer_unit(unit: str, value: float) -> tuple[float, str]:
-    """Return by what to multiply lengths of about this size, and the unit in which they read well.
+    """Return a factor for lengths of about this size, and the unit in which the multiplied lengths read well.
 
     Args:
-        unit: object unit of the survey. Lengths in feet and inches stay as they are; of a unit without a
-            known length, as that of a network without scale, thousandths, millionths and so on are taken.
-        value: the largest of the lengths, in that unit.
+        unit: object unit of the survey. Lengths in feet and inches stay as they are. A unit of unknown
+            length, as in a network without scale, is divided into thousandths, millionths and so on.
+        value: largest of the lengths, in that unit.
     """
     metres = METRES.get(unit)
     if not unit or unit in IMPERIAL or not math.isfinite(value) or value <= 0:
@@ -197,12 +197,12 @@ def finer_unit(unit: str, value: float) -> tuple[float, str]:
 
 
 def find_unit(lengths: float, rest: float) -> UnitFactor | None:
-    """Return the factor between two units that a factor of lengths is; None if it is none.
+    """Return the factor between two units that a factor of lengths equals; None if there is none.
 
     Args:
-        lengths: factor.
-        rest: relative difference from the factor of two units that is no contradiction; from a power of
-            ten it may be SAME_POWER.
+        lengths: factor of lengths.
+        rest: largest relative difference from the factor between two units; for a power of ten at least
+            SAME_POWER is allowed.
     """
     found: list[tuple[float, UnitFactor]] = []
     for size, units in UNITS.items():

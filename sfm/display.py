@@ -1,4 +1,4 @@
-"""Short views of long data: small tables for the prompt and for notebooks, lists cut short for messages."""
+"""Formats data for people: small tables for the prompt and notebooks, and shortened lists for messages."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
-MAX_LISTED = 5  # of many in one message
+MAX_LISTED = 5  # items in one message
 NO_BREAK = "\N{NO-BREAK SPACE}"
-# a number and its unit, and between a number and what it is one of, are not parted at the end of a line
+# spaces at which a line may not end, such as those between numbers and their units
 WITH_UNIT = re.compile(
     r"(?<=95 %) (?=\d)|(?<=\d) (?=×)|(?<=×) (?=\d)|"
     r"(?<=\d) (?=(?:%|px|[kmcdµun]?m|deg|s|sigma|mrad|iterations?)(?![\w^]))"
 )
-PROGRAMS = {"kolinear": "Kolinear", "colmap": "COLMAP"}  # as people write what survey files and tables name
+PROGRAMS = {"kolinear": "Kolinear", "colmap": "COLMAP"}  # key in survey files and tables -> name
 TEMPLATE = """\
 <table><caption>{{ title }}</caption>
 <thead><tr>{% for name in header %}<th>{{ name }}</th>{% endfor %}</tr></thead>
@@ -22,12 +22,12 @@ TEMPLATE = """\
 
 
 def program_name(key: str) -> str:
-    """Return the name of a program as people write it."""
+    """Return the name of a program in its usual spelling."""
     return PROGRAMS.get(key, key)
 
 
 def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table as HTML; whatever comes from files is escaped."""
+    """Return a table as HTML; all text is escaped."""
     from jinja2 import Environment
 
     template = Environment(autoescape=True).from_string(TEMPLATE)
@@ -35,17 +35,17 @@ def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
 
 
 def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in columns of text, the first to the left and the others to the right."""
+    """Return a table as text, with the first column aligned left and the others aligned right."""
     lines = [header, *rows] if any(header) else list(rows)
     return "\n".join([title, *aligned(lines, [k == 0 for k in range(len(header))])])
 
 
 def aligned(rows: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
-    """Return rows of cells as lines with columns below one another.
+    """Return rows of cells as lines with aligned columns.
 
     Args:
-        rows: of as many cells each.
-        left: which columns stand at the left; the others, of numbers, stand at the right.
+        rows: rows with the same number of cells.
+        left: which columns are aligned left; the others (numbers) are aligned right.
 
     Examples:
         >>> aligned([("point", "rays"), ("A", "12")], [True, False])
@@ -72,27 +72,27 @@ def bound(text: str) -> str:
 
 
 def wrapped(text: str, width: int) -> str:
-    """Return a text in lines of a width that part no number from its unit.
+    """Wrap a text into lines that do not separate a number from its unit.
 
     Args:
-        text: of one paragraph.
-        width: characters of a line.
+        text: one paragraph.
+        width: number of characters in a line.
     """
     lines = textwrap.wrap(bound(text), max(width, 1), break_on_hyphens=False)
     return "\n".join(lines).replace(NO_BREAK, " ")
 
 
 def plural(noun: str, count: float) -> str:
-    """Return a noun as it stands after a number, with an s unless that is 1."""
+    """Return a noun as it follows a number, with an s unless the number is 1."""
     return noun if count == 1 else f"{noun}s"
 
 
 def counted(count: int, noun: str) -> str:
-    """Return how many of something there are.
+    """Return a number with its noun in the singular or plural.
 
     Args:
-        count: of them.
-        noun: what one of them is.
+        count: the number.
+        noun: noun in the singular.
 
     Examples:
         >>> counted(1, "photograph"), counted(12, "image point")
@@ -102,11 +102,11 @@ def counted(count: int, noun: str) -> str:
 
 
 def agreeing(count: float, forms: str) -> str:
-    """Return the form of a verb or pronoun that agrees with how many there are.
+    """Return the form of a verb or pronoun that agrees with a number.
 
     Args:
-        count: of them.
-        forms: that of one and that of several, as "is|are".
+        count: the number.
+        forms: singular and plural form, such as "is|are".
 
     Examples:
         >>> agreeing(1, "has|have"), agreeing(2, "its|their")
@@ -116,12 +116,12 @@ def agreeing(count: float, forms: str) -> str:
 
 
 def listed(texts: Iterable[str], *, most: int = MAX_LISTED, separator: str = ", ") -> str:
-    """Return texts one after the other, the first few of many, and how many more there are.
+    """Join the first few of several texts, and state how many more there are.
 
     Args:
-        texts: names, or what is said of each.
-        most: so many are shown.
-        separator: between them.
+        texts: names or phrases.
+        most: largest number of texts shown.
+        separator: text between two of them.
 
     Examples:
         >>> listed(["501", "502", "503"], most=2)

@@ -1,7 +1,7 @@
-"""The distributions of test statistics, from special functions: `scipy.stats` takes a second to import.
+"""Distributions of test statistics, from special functions because `scipy.stats` takes a second to import.
 
-Names as in `scipy.stats`: sf is the probability of more than x, isf its inverse, ppf the quantile. They take
-numbers or arrays, and say NaN where their arguments mean nothing.
+The names follow `scipy.stats`: sf is the probability of exceeding x, isf its inverse, ppf the quantile. All
+functions accept numbers or arrays, and return NaN for invalid arguments.
 
 Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.4, 26.6, 26.7.
 """
@@ -16,7 +16,7 @@ from scipy import special
 
 def chi2_sf(x: Any, r: Any) -> Any:
     """Probability that chi-square of redundancy r is larger than x."""
-    return special.chdtrc(r, np.maximum(x, 0.0))  # rounding makes a difference of squares negative
+    return special.chdtrc(r, np.maximum(x, 0.0))  # rounding can make a difference of squares negative
 
 
 def chi2_isf(probability: Any, r: Any) -> Any:
@@ -35,7 +35,10 @@ def f_sf(x: Any, r1: Any, r2: Any) -> Any:
 
 
 def f_isf(probability: Any, r1: Any, r2: Any) -> Any:
-    """Value that F of redundancies r1 and r2 exceeds with a probability: 1 / F of r2 and r1 stays below."""
+    """Value that F of redundancies r1 and r2 exceeds with a probability.
+
+    It is the reciprocal of the value that F of r2 and r1 stays below.
+    """
     return 1 / special.fdtri(r2, r1, probability)
 
 
@@ -50,7 +53,7 @@ def t_ppf(probability: Any, r: Any) -> Any:
 
 
 def nct_parameter(x: float, r: int, power: float) -> float:
-    """Non-centrality with which Student's t of redundancy r exceeds x with a probability."""
+    """Non-centrality at which Student's t of redundancy r exceeds x with the probability `power`."""
     return float(special.nctdtrinc(r, 1 - power, x))
 
 
@@ -65,10 +68,10 @@ def normal_ppf(probability: Any) -> Any:
 
 
 def poisson_sf(k: Any, expected: Any) -> Any:
-    """Probability of more than k events where a number of them is expected."""
+    """Probability of more than k events, given their expected number."""
     return np.where(np.asarray(k) < 0, 1.0, special.pdtrc(np.maximum(k, 0), expected))[()]
 
 
 def binomial_sf(k: Any, n: Any, p: Any) -> Any:
-    """Probability of more than k events in n trials, of a probability each."""
+    """Probability of more than k events in n trials with probability p each."""
     return np.where(np.asarray(k) < 0, 1.0, special.bdtrc(np.maximum(k, 0), n, p))[()]

@@ -1,26 +1,26 @@
 """The exceptions of Kolinear.
 
-    KolinearError               anything that a person can put right; the command line prints one line
+    KolinearError               any error that the user can correct; the command line prints one line
     |-- SurveyFileError         the survey file or a table it names cannot be used
     |-- PhotographError         a photograph cannot be read or does not fit its camera
-    |-- GeometryError           the points or photographs do not determine what is asked for
-    |-- UnknownNameError        a point, photograph or camera of that name is not there
+    |-- GeometryError           the points or photographs do not determine the requested result
+    |-- UnknownNameError        no point, photograph or camera has that name
     |-- InstallationError       files of another project lie among Kolinear's
     |-- OutputError             a result cannot be written
     |   `-- FolderInUseError    another run is writing there
-    `-- BackendError            an external program or library is of another version, fails or refuses
-        `-- MissingLibraryError it is not installed
+    `-- BackendError            an external program or library has the wrong version, fails or refuses
+        `-- MissingLibraryError a library is not installed
 
 Rank, convergence and rejected observations are results, not exceptions.
 """
 
 
 class KolinearError(Exception):
-    """Base of all errors whose message is one line that says what was found and what was needed."""
+    """Base class of all errors; the message is one line that states what was found and what was needed."""
 
 
 class SurveyFileError(KolinearError):
-    """The survey file, or a table that it names, cannot be used as it stands."""
+    """The survey file, or a table that it names, cannot be used."""
 
 
 class PhotographError(KolinearError):
@@ -28,11 +28,11 @@ class PhotographError(KolinearError):
 
 
 class GeometryError(KolinearError):
-    """The given points or photographs do not determine what is asked for."""
+    """The given points or photographs do not determine the requested result."""
 
 
 class UnknownNameError(KolinearError):
-    """There is no point, photograph or camera of that name."""
+    """No point, photograph or camera has that name."""
 
 
 class InstallationError(KolinearError, ImportError):
@@ -40,7 +40,7 @@ class InstallationError(KolinearError, ImportError):
 
 
 class OutputError(KolinearError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to the requested folder or file."""
 
 
 class FolderInUseError(OutputError):
@@ -48,13 +48,13 @@ class FolderInUseError(OutputError):
 
 
 class BackendError(KolinearError):
-    """An external library is missing, of the wrong version, or refuses the problem."""
+    """An external program or library is missing, has the wrong version, fails or refuses the problem."""
 
 
 class MissingLibraryError(BackendError):
-    """A library is not installed that only some commands need; the message says how to install it."""
+    """An optional library is not installed; the message says how to install it."""
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error on one line, the name of its kind where it has none."""
+    """Return the message of an error on one line, or the name of its class if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__

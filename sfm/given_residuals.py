@@ -1,8 +1,8 @@
-"""Values given with a standard deviation beside the image points, and their residuals: the rows of given.csv.
+"""Residuals of values given with a standard deviation in addition to the image points: the rows of given.csv.
 
-Each value is judged by Baarda's w, its residual over the standard deviation of that residual, sigma sqrt(r)
-with the standard deviation stated for it and its redundancy number r. A value with r = 0 is met exactly
-whatever it is, so that it is not checked.
+Each value is tested by Baarda's w, its residual divided by the standard deviation of the residual. This is
+sigma sqrt(r), with the stated standard deviation sigma and the redundancy number r. A value with r = 0 has
+no residual whatever it is, so it is not checked.
 
 Source: Baarda (1968), A testing procedure for use in geodetic networks.
 """
@@ -21,7 +21,7 @@ from sfm.observations.pose import ExteriorObservations
 from sfm.solution import CONTROL_COVARIANCE
 
 CENTRE, ROTATION = "projection centre", "rotation"
-Tests = tuple[IntArray, FloatArray, FloatArray]  # rows of a kind, their redundancy numbers and w
+Tests = tuple[IntArray, FloatArray, FloatArray]  # rows of a kind, redundancy numbers, w
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class GivenValue:
     unit: str
     given: float
     difference: float  # adjusted minus given
-    sigma: float  # given standard deviation; 0 where fixed
+    sigma: float  # stated standard deviation; 0 where fixed
     r: float  # redundancy number; NaN where fixed
     w: float  # NaN where not checked
 
@@ -42,29 +42,29 @@ class GivenValue:
 class GivenResiduals:
     """Residuals of given values of one kind; d = 3 coordinates or angles of a point or photograph, else 1."""
 
-    kind: str  # name of one of them
+    kind: str  # name of the kind, in the singular
     coordinates: tuple[str, ...]  # names of the coordinates or angles, (d,)
     names: tuple[str, ...]  # control point, both ends of a bar, parameter and camera, or photograph, (n,)
-    units: tuple[tuple[str, ...], ...]  # of each coordinate, (n, d)
+    units: tuple[tuple[str, ...], ...]  # unit of each coordinate, (n, d)
     given: FloatArray  # (n, d)
     difference: FloatArray  # adjusted minus given, (n, d)
-    sigma: FloatArray  # given standard deviation; NaN where not observed, 0 where fixed, (n, d)
+    sigma: FloatArray  # stated standard deviation; NaN where not observed, 0 where fixed, (n, d)
     r: FloatArray  # redundancy number; NaN where fixed or not observed, (n, d)
     w: FloatArray  # difference over sigma sqrt(r); NaN where not checked, (n, d)
 
     def observed(self) -> GivenResiduals | None:
-        """Return those of which something was observed; None without any."""
+        """Return the rows with at least one observed value; None if there are none."""
         rows = np.flatnonzero(np.isfinite(self.sigma).any(axis=1))
         return self.rows(rows) if len(rows) else None
 
     def rows(self, rows: IntArray) -> GivenResiduals:
-        """Return some of them."""
+        """Return the rows of the given indices."""
         names, units = tuple(self.names[k] for k in rows), tuple(self.units[k] for k in rows)
         values = (x[rows] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(self.kind, self.coordinates, names, units, *values)
 
     def components(self, kind: str, some: slice) -> GivenResiduals:
-        """Return some of the coordinates as a kind."""
+        """Return some of the coordinates as a kind of their own."""
         values = (x[:, some] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(
             kind, self.coordinates[some], self.names, tuple(u[some] for u in self.units), *values
@@ -72,7 +72,7 @@ class GivenResiduals:
 
     @property
     def checked(self) -> bool:
-        """Whether any has a standard deviation, so that its residual can be judged."""
+        """Whether any value has a standard deviation, so its residual can be tested."""
         return bool(np.isfinite(self.r).any())
 
     @property
@@ -83,7 +83,7 @@ class GivenResiduals:
 
     @property
     def values(self) -> tuple[GivenValue, ...]:
-        """Every coordinate by itself, those not observed left out."""
+        """All observed coordinates, one by one."""
         return tuple(
             GivenValue(
                 self.names[k],
@@ -96,7 +96,7 @@ class GivenResiduals:
 
     @property
     def by_w(self) -> tuple[GivenValue, ...]:
-        """The coordinates that have a redundancy number, largest |w| first."""
+        """The coordinates with a redundancy number, largest |w| first."""
         known = [one for one in self.values if np.isfinite(one.r)]
         return tuple(sorted(known, key=lambda one: -abs(np.nan_to_num(one.w))))
 
@@ -127,15 +127,15 @@ class GivenResiduals:
 def given_residuals(
     network: Network, estimate: Estimate, length_unit: str, tests: Mapping[int, Tests] | None = None
 ) -> Iterator[tuple[int, GivenResiduals]]:
-    """Yield the residuals of every kind of given values, with its index among `network.kinds`.
+    """Yield the residuals of every kind of given values, with the index of the kind in `network.kinds`.
 
-    Exterior orientation is two kinds, projection centres and angles. Without tests r and w are NaN.
+    Exterior orientation gives two kinds, projection centres and angles. Without tests r and w are NaN.
 
     Args:
-        network: with the given values.
-        estimate: where they are compared.
-        length_unit: of its coordinates.
-        tests: of the kinds that took part in an adjustment, by their index.
+        network: network with the given values.
+        estimate: solution that the values are compared with.
+        length_unit: unit of its coordinates.
+        tests: tests of the kinds that took part in an adjustment, by the index of the kind.
     """
     for index, kind in enumerate(network.kinds):
         if not len(kind):
@@ -166,12 +166,12 @@ def given_residuals(
 
 
 def given_rows(kinds: Iterable[GivenResiduals], network: Network, unit: str) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of given.csv: every value, and of control with correlated coordinates their covariances.
+    """Yield the rows of given.csv: all values, and the covariances of correlated control coordinates.
 
     Args:
-        kinds: of given values.
-        network: of which the control is.
-        unit: of the control.
+        kinds: residuals of each kind of given values.
+        network: network with the control points.
+        unit: length unit of the control.
     """
     control = False
     for kind in kinds:

@@ -1,7 +1,7 @@
-"""Network (what was measured) and Estimate (what is solved for), with the arrays they are made of.
+"""Network (the measurements) and Estimate (the values solved for), as frozen objects of arrays.
 
-Everything is counted by index: image i is `network.images[i]`, point j is `network.points[j]`. A
-function that changes something returns a new object.
+Photographs and points are identified by index: image i is `network.images[i]`, point j is
+`network.points[j]`. A function that changes something returns a new object.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ __all__ = [
     "without_given",
 ]
 
-MAX_NAMES = 10  # in a message
-MAX_PAIRS_AT_ONCE = 4_000_000  # of photographs that are compared
+MAX_NAMES = 10  # most names listed in a message
+MAX_PAIRS_AT_ONCE = 4_000_000  # pairs of photographs compared in one sparse product
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,16 @@ class ImagePoints:
     image: IntArray  # index of the photograph, (k,)
     point: IntArray  # index of the object point, (k,)
     xy: FloatArray  # measured position in the pixel frame, px, (k, 2)
-    covariance: FloatArray  # of xy, px^2, (k, 2, 2)
-    stated: BoolArray | None = None  # which covariances were stated with the image points and are no default
-    # of the program that reads them; all if None, (k,)
+    covariance: FloatArray  # covariance of xy, px^2, (k, 2, 2)
+    # which covariances were stated with the image points, rather than set by default when they were read; all
+    # if None, (k,)
+    stated: BoolArray | None = None
 
     def __len__(self) -> int:
         return len(self.image)
 
     def select(self, mask: BoolArray | IntArray) -> ImagePoints:
-        """Return the image points that a mask or an index names."""
+        """Return the image points that a mask or an array of indices selects."""
         stated = None if self.stated is None else self.stated[mask]
         return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask], stated)
 
@@ -79,7 +80,7 @@ class ImagePoints:
 
     @property
     def stated_covariance(self) -> FloatArray:
-        """Covariances of x and y, px^2; 0 where none was stated, (k,)."""
+        """Covariances between x and y, px^2; 0 where none was stated, (k,)."""
         return (
             self.covariance[:, 0, 1]
             if self.stated is None
@@ -89,7 +90,7 @@ class ImagePoints:
 
 @dataclass(frozen=True, repr=False)
 class Network:
-    """All that was measured in a survey.
+    """All measurements of a survey.
 
     Example:
         >>> import sfm
@@ -111,13 +112,14 @@ class Network:
     scale_bars: ScaleBars = field(default_factory=ScaleBars)
     exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
     interior: InteriorObservations = field(default_factory=InteriorObservations)
-    observations: tuple[Kind, ...] = ()  # of further kinds
-    moment: IntArray | None = None  # when each photograph was taken, 0, 1, ...: those of one moment, by
-    # cameras of one rig, have one pose; each by itself if None, (m,)
+    observations: tuple[Kind, ...] = ()  # further kinds
+    # number of the moment of each photograph, 0, 1, ...; cameras of one rig share a pose at one moment; if
+    # None, each photograph has its own, (m,)
+    moment: IntArray | None = None
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
-        """All kinds of observations beside image points, empty ones included."""
+        """All kinds of observations other than image points, including empty ones."""
         return (self.control, self.exterior, self.interior, self.scale_bars, *self.observations)
 
     @classmethod
@@ -130,17 +132,18 @@ class Network:
         sigma_px: npt.ArrayLike = 0.1,
         camera: Mapping[str, int] | None = None,
     ) -> Network:
-        """Return the network of measured image points; photographs and points count as they come first.
+        """Return the network of measured image points, with photographs and points in order of appearance.
 
         Args:
             image: name of the photograph of each image point, k of them.
             point: name of the object point of each image point.
             xy: positions in the pixel frame, px, (k, 2).
-            sigma_px: standard deviations of x and y, px, (k, 2) or what can be broadcast to it.
-            camera: index of the camera of each photograph in Estimate.cameras, by name; 0 where not named.
+            sigma_px: standard deviations of x and y, px, (k, 2) or broadcastable to it.
+            camera: index in Estimate.cameras of the camera of each photograph, by its name; 0 if not named.
 
         Raises:
-            GeometryError: arrays of different length, no finite positions, or no positive sigmas.
+            GeometryError: arrays of different lengths, positions that are not finite, or sigmas that are not
+                positive.
         """
         measured = np.asarray(xy, dtype=float)
         k = len(image)
@@ -169,17 +172,17 @@ class Network:
         return cls(images, owner, points, seen)
 
     def with_control(self, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> Network:
-        """Return the network with known points in place of its control.
+        """Return the network with the given control points in place of its own.
 
         Args:
-            names: of points of the network, c of them.
-            xyz: their coordinates, object unit, (c, 3).
-            sigma: standard deviations, 0 = fixed, infinite = not known, object unit, (c, 3) or what can be
-                broadcast to it.
+            names: names of points of the network, c of them.
+            xyz: coordinates, object unit, (c, 3).
+            sigma: standard deviations, 0 = fixed, infinite = unknown, object unit, (c, 3) or broadcastable
+                to it.
 
         Raises:
             UnknownNameError: a point is not in the network.
-            GeometryError: arrays of another shape, a negative sigma, or what is no number.
+            GeometryError: arrays of another shape, a negative sigma, or values that are not numbers.
         """
         index = np.array([self.point_index(name) for name in names], dtype=np.int64)
         known, s = np.asarray(xyz, dtype=float), np.asarray(sigma, dtype=float)
@@ -201,7 +204,13 @@ class Network:
         return replace(self, control=ObjectPoints(index, np.where(np.isfinite(s), known, 0.0), covariance))
 
     def with_scale_bar(self, start: str, end: str, length: float, sigma: float) -> Network:
-        """Return the network with one more measured distance between two of its points, object unit.
+        """Return the network with one more scale bar, a measured distance between two of its points.
+
+        Args:
+            start: name of the point at one end.
+            end: name of the point at the other end.
+            length: measured distance, object unit.
+            sigma: standard deviation of the distance, object unit.
 
         Raises:
             UnknownNameError: a point is not in the network.
@@ -216,19 +225,19 @@ class Network:
         return replace(self, scale_bars=added)
 
     def image_index(self, name: str) -> int:
-        """Return the number of a photograph; UnknownNameError if there is none of that name."""
+        """Return the index of a photograph; UnknownNameError if no photograph has that name."""
         return index_of(self.images, name, "photograph")
 
     def point_index(self, name: str) -> int:
-        """Return the number of a point; UnknownNameError if there is none of that name."""
+        """Return the index of a point; UnknownNameError if no point has that name."""
         return index_of(self.points, name, "point")
 
     def rays(self) -> IntArray:
-        """Return in how many photographs each point was measured, (n,)."""
+        """Return the number of photographs in which each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
     def incidence(self, usable: BoolArray) -> csr_matrix:
-        """Return 1 where a photograph shows a point, among usable image points (k,), sparse, (m, n)."""
+        """Return a sparse matrix, 1 where usable image points (k,) show a point in a photograph, (m, n)."""
         seen = self.image_points.select(usable)
         shape = (len(self.images), len(self.points))
         sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
@@ -237,24 +246,24 @@ class Network:
         return sees
 
     def correlated_control(self) -> Iterator[tuple[str, str, float]]:
-        """Yield name, pair of coordinates (XY, XZ, YZ) and covariance of control that is correlated."""
+        """Yield name, coordinate pair (XY, XZ, YZ) and covariance of correlated control coordinates."""
         for j, C in zip(self.control.point, self.control.covariance, strict=True):
             for row, column in combinations(range(3), 2):
                 if np.isfinite(C[row, column]) and C[row, column] != 0:
                     yield self.points[j], "XYZ"[row] + "XYZ"[column], float(C[row, column])
 
     def common_points(self, usable: BoolArray) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
-        """Return the pairs of photographs that share points, and how many, among usable image points.
+        """Yield the pairs of photographs that share points, and the number of points that they share.
 
-        In parts of some millions of pairs: where many photographs see the same points, all pairs would take
-        gigabytes.
+        The pairs come in parts of a few million. All pairs at once would take gigabytes where many
+        photographs see the same points.
 
         Args:
-            usable: of the image points, (k,).
+            usable: which image points count, (k,).
 
         Yields:
-            Index of the first and of the second photograph, which is larger, and the number of points, (p,);
-            in the order of the first and then of the second one.
+            Index of the first photograph, larger index of the second, and number of shared points, (p,) each.
+            They are sorted by the first and then by the second photograph.
         """
         sees = self.incidence(usable)
         seen_by = sees.T.tocsr()
@@ -281,29 +290,29 @@ class Network:
 
 @dataclass(frozen=True)
 class Mounts:
-    """Where the cameras of rigs are mounted: R_photograph = R_pose R, X0 = X_pose + R_pose X.
+    """Mounts of cameras in their rigs: R_photograph = R_pose R, X0 = X_pose + R_pose X.
 
-    The pose of a rig is that of its reference camera, whose position is 0 and whose rotation is the unit
-    matrix. So are those of a camera without a rig.
+    The pose of a rig is the pose of its reference camera. The mount of the reference camera has position 0
+    and the unit matrix as rotation; so has the mount of a camera without a rig.
     """
 
     position: FloatArray  # projection centre of each camera in the axes of its rig, object unit, (a, 3)
     rotation: FloatArray  # R of each camera, its image axes to those of its rig, (a, 3, 3)
     free: BoolArray  # which of X, Y, Z and small rotations about the image axes are adjusted, (a, 6)
-    rig: tuple[str, ...]  # name of the rig of each camera; "" of those without, (a,)
+    rig: tuple[str, ...]  # name of the rig of each camera; "" without a rig, (a,)
 
     @property
     def at_reference(self) -> BoolArray:
-        """Which cameras are held fixed at 0, as the reference of a rig is and those without are, (a,)."""
+        """Which cameras are held fixed at 0: references of rigs and cameras without a rig, (a,)."""
         return np.asarray(~self.free.any(axis=1) & ~self.position.any(axis=1))
 
     def select(self, on: BoolArray) -> Mounts:
-        """Return the mounts of some cameras, (a,)."""
+        """Return the mounts of the cameras selected by a mask, (a,)."""
         rig = tuple(name for name, keep in zip(self.rig, on, strict=True) if keep)
         return Mounts(self.position[on], self.rotation[on], self.free[on], rig)
 
     def by_rig(self) -> dict[str, list[int]]:
-        """Return the cameras of each rig, its reference first."""
+        """Return the indices of the cameras of each rig, its reference first."""
         found: dict[str, list[int]] = {}
         for a in np.argsort(~self.at_reference, kind="stable").tolist():
             if self.rig[a]:
@@ -325,7 +334,7 @@ class Estimate:
     position: FloatArray  # projection centres X0, object unit, (m, 3)
     rotation: FloatArray  # R of each photograph, image to object axes, (m, 3, 3)
     points: FloatArray  # object points, object unit, (n, 3)
-    mounts: Mounts | None = None  # of the cameras; None without rigs
+    mounts: Mounts | None = None  # mounts of the cameras; None without rigs
 
     @property
     def oriented(self) -> BoolArray:
@@ -346,7 +355,7 @@ class Estimate:
 
 
 class AdjustedValues(NamedTuple):
-    """Adjusted values, as `sfm.observations.kind.Values`."""
+    """Adjusted values in the form of `sfm.observations.kind.Values`."""
 
     points: FloatArray
     position: FloatArray
@@ -357,7 +366,7 @@ class AdjustedValues(NamedTuple):
 
 
 def values_of(estimate: Estimate) -> AdjustedValues:
-    """Return the values of an estimate as kinds of observations ask for them."""
+    """Return the values of an estimate in the form that the kinds of observations use."""
     cameras, mounts = estimate.cameras, estimate.mounts
     parameters = np.full((len(cameras), max(len(camera.parameters) for camera in cameras)), np.nan)
     for a, camera in enumerate(cameras):
@@ -375,7 +384,7 @@ def values_of(estimate: Estimate) -> AdjustedValues:
 
 
 def without_given(network: Network) -> Network:
-    """Return the network of the image points alone, with what is known of its cameras."""
+    """Return the network with its image points and interior observations only."""
     return replace(
         network,
         control=ObjectPoints(),
@@ -386,14 +395,18 @@ def without_given(network: Network) -> Network:
 
 
 def rows_of(index: IntArray, count: int) -> list[IntArray]:
-    """Return the rows of each index value from 0 to count - 1, in order."""
+    """Return, for each value from 0 to count - 1, the rows of `index` with that value, in order."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
 @checked_arguments()
 def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
-    """Return an estimate of which only the start values of the cameras are known.
+    """Return an estimate with the start values of the cameras; everything else is NaN.
+
+    Args:
+        network: network of m photographs and n points.
+        cameras: start values of the interior orientations.
 
     Example:
         >>> import sfm
@@ -405,15 +418,15 @@ def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
 
 
 def index_of(names: Sequence[str], name: object, what: str) -> int:
-    """Return the number of a name.
+    """Return the index of a name.
 
     Args:
-        names: all of them.
-        name: the one to find.
-        what: it is the name of, for messages.
+        names: all names.
+        name: name to find.
+        what: kind of thing that has the name, for the message.
 
     Raises:
-        UnknownNameError: it is not among them.
+        UnknownNameError: the name is not among them.
     """
     try:
         return names.index(str(name))

@@ -1,9 +1,9 @@
-"""A survey from photographs to result, start to end.
+"""Pipeline: runs a survey from photographs to the result.
 
     given data, photographs -> targets -> orientation -> correspondences -> adjustment -> comparison -> result
 
-Every stage is one call, for coded targets, for natural texture and for given image points alike; what it
-does, and from which book, stands where it is written.
+Every stage is one call, the same for coded targets, natural texture and given image points. The module of a
+stage describes its method and cites the source.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ def run_survey(
 
     Args:
         survey: settings and given data.
-        images_dir: folder of the photographs in place of those of the survey.
-        jobs: threads; photographs measured at a time.
-        others: the programs to compare with.
-        store: of what was measured, so that a photograph is not measured twice.
+        images_dir: folder of the photographs; the folder named in the survey if not given.
+        jobs: number of threads, which is the number of photographs measured at the same time.
+        others: programs that the result is compared with.
+        store: keeps the measurements, so that no photograph is measured twice.
         progress: receives stages and photographs.
 
     Raises:
-        KolinearError: the survey cannot be run; the message says what to do.
+        KolinearError: the survey cannot be run; the message states the remedy.
     """
     clock = StageClock(progress)
     with _naming(survey), own_threads(jobs):
@@ -71,7 +71,7 @@ def run_survey(
 def _solve(
     survey: Survey, measured: Measurements, jobs: int, clock: StageClock
 ) -> tuple[Survey, Measurements, Orientation, Correspondences, SolvedSurvey]:
-    """Return what orientation, matching and adjustment make of the image points, and of which cameras."""
+    """Orient, match and adjust the image points; orientation may change the survey and the image points."""
     with clock.stage("orientation"):
         survey, measured, start = orient_with_models(survey, measured)
         measured, start = agree_on_turns(survey, measured, start)
@@ -85,7 +85,7 @@ def _solve(
 def _measure(
     survey: Survey, images_dir: Path | None, jobs: int, store: MeasuredStore | None, clock: StageClock
 ) -> tuple[Survey, Measurements]:
-    """Return the survey, with a camera for each size of photographs, and its image points."""
+    """Return the survey, with one camera for each size of photographs, and its image points."""
     if survey.observations is not None:
         return survey, measurements_from_observations(survey)
     files = find_photographs(survey, images_dir=images_dir)
@@ -112,7 +112,7 @@ def _measure(
 
 @contextmanager
 def _naming(survey: Survey) -> Iterator[None]:
-    """Say which survey it is whose geometry does not determine what is asked for."""
+    """Add the name of the survey to the message of a GeometryError."""
     try:
         yield
     except GeometryError as error:

@@ -1,7 +1,7 @@
-"""A part of a network, counted anew, and checks of networks before they are adjusted.
+"""Reduces networks to parts with new indices, and checks networks before they are adjusted.
 
-Input of an adjustment from Python is checked as files are: shapes, indices, numbers, covariances. The first
-thing that is wrong is named, with what was expected.
+Networks passed from Python are checked as strictly as files: shapes, indices, numbers and covariances. The
+message names the first error and states what was expected.
 """
 
 from __future__ import annotations
@@ -16,25 +16,26 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
 from sfm.observations.kind import Kind
 
-CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
+CORRELATION_LIMIT = 0.999999  # above it a covariance matrix is singular in floating point
 K = TypeVar("K", bound=Kind)
-MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+MIN_IMAGE_POINTS = 4  # fewest per photograph in the final adjustment: three determine it, the fourth checks
 
 
 def reduce_network(
     network: Network, estimate: Estimate, images: BoolArray, points: BoolArray, image_points: BoolArray
 ) -> tuple[Network, Estimate]:
-    """Return the network and estimate of some photographs, points and image points only.
+    """Return the network and estimate of the photographs, points and image points to keep.
 
     Args:
-        network: of m photographs, n points and k image points.
-        estimate: of the same.
+        network: network of m photographs, n points and k image points.
+        estimate: estimate of this network.
         images: photographs to keep, (m,).
         points: points to keep, (n,).
-        image_points: image points to keep (those of dropped photographs and points go anyway), (k,).
+        image_points: image points to keep, (k,); those of dropped photographs and points are dropped too.
 
     Returns:
-        Reduced network and estimate, counted anew; observations of dropped points and photographs are gone.
+        Reduced network and estimate, with new indices and without observations of dropped points and
+        photographs.
     """
     image_index = np.cumsum(images) - 1
     point_index = np.cumsum(points) - 1
@@ -73,17 +74,20 @@ def supported(
     min_points: int | IntArray,
     min_rays: int | IntArray,
 ) -> tuple[BoolArray, BoolArray]:
-    """Return the photographs and points that are left when those with too few image points go, in turn.
+    """Return the photographs and points that remain after dropping those with too few image points.
+
+    Each dropped photograph or point takes its image points with it, so the test is repeated until nothing
+    changes.
 
     Args:
-        network: of m photographs, n points and k image points.
-        estimate: of the same.
+        network: network of m photographs, n points and k image points.
+        estimate: estimate of this network.
         accepted: image points that count, (k,).
-        min_points: image points that a photograph needs, of all or of each, (m,).
-        min_rays: image points that a point needs, of all or of each, (n,).
+        min_points: image points that a photograph needs, one number or (m,).
+        min_rays: image points that a point needs, one number or (n,).
 
     Returns:
-        Photographs (m,) and points (n,); of those, oriented and determined ones only.
+        Masks of photographs (m,) and points (n,), restricted to oriented photographs and determined points.
     """
     seen = network.image_points
     images, points = estimate.oriented, estimate.determined
@@ -106,8 +110,15 @@ def determined(
 ) -> tuple[BoolArray, BoolArray]:
     """Return the photographs (m,) and points (n,) that accepted image points determine.
 
+    Args:
+        network: network of m photographs, n points and k image points.
+        estimate: estimate of this network.
+        accepted: image points that count, (k,).
+        min_rays: image points that a point needs, (n,).
+        min_points: image points that a photograph needs, one number or (m,).
+
     Raises:
-        GeometryError: fewer than two photographs are left.
+        GeometryError: fewer than two photographs remain.
     """
     images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
@@ -119,7 +130,7 @@ def determined(
 
 
 def merge_estimate(part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
-    """Return the estimate of all photographs (m,) and points (n,); NaN but for those of a part."""
+    """Return the estimate of all photographs (m,) and points (n,), with NaN outside the given part."""
     position, rotation = np.full((len(images), 3), np.nan), np.full((len(images), 3, 3), np.nan)
     xyz = np.full((len(points), 3), np.nan)
     position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
@@ -127,14 +138,14 @@ def merge_estimate(part: Estimate, images: BoolArray, points: BoolArray) -> Esti
 
 
 def check_network(network: Network, estimate: Estimate) -> None:
-    """Refuse a network and an estimate that do not belong together or hold what no adjustment can use.
+    """Refuse a network and an estimate that do not fit together or contain values that cannot be adjusted.
 
     Args:
-        network: what was measured.
-        estimate: start values; NaN where there is none.
+        network: the measurements.
+        estimate: start values; NaN where unknown.
 
     Raises:
-        GeometryError: what was found, where, and what was expected.
+        GeometryError: the message states what was found, where, and what was expected.
     """
     if not isinstance(network, Network) or not isinstance(estimate, Estimate):
         found = f"{type(network).__name__} and {type(estimate).__name__}"
@@ -179,12 +190,12 @@ def check_network(network: Network, estimate: Estimate) -> None:
     wrong = _first(np.asarray(~np.isfinite(seen.xy).all(axis=1)))
     if wrong is not None:
         raise GeometryError(
-            f"{of_row(wrong)}: image coordinates {_said(seen.xy[wrong])} px, expected numbers"
+            f"{of_row(wrong)}: image coordinates {_in_text(seen.xy[wrong])} px, expected numbers"
         )
     wrong = _first(~_positive_definite(seen.covariance))
     if wrong is not None:
         raise GeometryError(
-            f"{of_row(wrong)}: covariance {_said(seen.covariance[wrong])} px^2, expected a symmetric "
+            f"{of_row(wrong)}: covariance {_in_text(seen.covariance[wrong])} px^2, expected a symmetric "
             "positive definite matrix"
         )
     control, bars = network.control, network.scale_bars
@@ -200,7 +211,7 @@ def check_network(network: Network, estimate: Estimate) -> None:
 
 
 def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
-    """Refuse control that no adjustment can use; points are the names of the object points."""
+    """Refuse control points that cannot be adjusted; `points` are the names of all object points."""
     wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~possible_covariances(control.covariance))
     if wrong is not None:
         raise GeometryError(
@@ -213,10 +224,16 @@ def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
 
 
 def check_number(what: str, value: float, low: float, high: float = np.inf) -> None:
-    """Refuse a number that is not between two others, the bounds left out.
+    """Refuse a number that does not lie strictly between two bounds.
+
+    Args:
+        what: name of the number, for the message.
+        value: the number.
+        low: lower bound.
+        high: upper bound.
 
     Raises:
-        GeometryError: with what was found and expected.
+        GeometryError: the number lies outside; the message states what was found and expected.
     """
     if not isinstance(value, int | float | np.number) or not low < value < high:
         expected = f"more than {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
@@ -228,7 +245,7 @@ def _first(wrong: BoolArray) -> int | None:
     return int(rows[0]) if len(rows) else None
 
 
-def _said(values: FloatArray) -> str:
+def _in_text(values: FloatArray) -> str:
     return " ".join(f"{value:g}" for value in np.ravel(values))
 
 
@@ -240,10 +257,12 @@ def _positive_definite(covariance: FloatArray) -> BoolArray:
 
 
 def possible_covariances(covariance: FloatArray) -> BoolArray:
-    """Return which covariances (c, n, n) coordinates can have, those fixed or not known left out, (c,).
+    """Return which matrices (c, n, n) are valid covariances of control coordinates, (c,).
+
+    The coordinates that are neither fixed nor unknown must have a positive definite covariance.
 
     Args:
-        covariance: variance 0 = fixed, infinite = not known; these are correlated with nothing.
+        covariance: variance 0 = fixed, infinite = unknown; such coordinates may not be correlated.
     """
     n = covariance.shape[1]
     unknown = np.eye(n, dtype=bool) & np.isposinf(covariance)  # a variance may be infinite

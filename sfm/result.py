@@ -1,9 +1,9 @@
-"""SurveyResult: everything that a survey ends with, as the report needs it."""
+"""SurveyResult: the complete result of a survey, with everything that the report needs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import date
 from functools import cache, cached_property
 from pathlib import Path
@@ -36,7 +36,7 @@ class FailedImage:
 
     @property
     def is_copy(self) -> bool:
-        """Whether it is a copy of another photograph, which counts for both."""
+        """Whether it is a copy of another photograph, which is used instead."""
         return self.reason.kind in COPIES
 
 
@@ -45,13 +45,13 @@ class LeftOutPoint:
     """A measured point that is not part of the result."""
 
     point: str  # name of the point
-    image_points: int  # measured of it
+    image_points: int  # number of its image points
     reason: Remark  # what was found and what was needed
 
 
 @dataclass(frozen=True)
 class StageTime:
-    """How long a stage took."""
+    """Duration of a stage."""
 
     stage: str
     seconds: float
@@ -64,14 +64,14 @@ class PhotographTargets:
     image: str  # name of the photograph
     path: Path  # its file
     xy: FloatArray  # centres of the measured targets, pixel frame, px, (k, 2)
-    semi_axes: FloatArray  # of their outlines, larger first, px, (k, 2)
-    angle: FloatArray  # of the larger semi-axis from x towards y, rad, (k,)
+    semi_axes: FloatArray  # semi-axes of their outlines, larger first, px, (k, 2)
+    angle: FloatArray  # angle of the larger semi-axis from x towards y, rad, (k,)
     rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
     rejected_flag: IntArray  # reason for each rejection, see sfm.targets.outlines.Flag, (r,)
     flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.outlines.Flag, (k,)
     stored: bool = False  # whether the targets were measured in an earlier run
-    blur: FloatArray | None = None  # standard deviation of their edges, px; NaN where there is none, (k,)
-    camera: str = ""  # its name, with photographs of one size
+    blur: FloatArray | None = None  # standard deviation of their edges, px; NaN where unknown, (k,)
+    camera: str = ""  # name of the camera; each camera has photographs of one size
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
@@ -80,11 +80,11 @@ class PhotographTargets:
 
 @dataclass(frozen=True)
 class ControlCheck:
-    """Differences at control that took no part in the adjustment, after placing the result on it."""
+    """Differences at control points that took no part in the adjustment, after a similarity onto them."""
 
     points: tuple[str, ...]  # names of the control points that were measured, (n,)
-    differences: FloatArray  # placed minus nominal X, Y, Z, object unit, (n, 3)
-    scale: float  # of the control over the adjusted network; 1 where the scale came from the control
+    differences: FloatArray  # transformed minus nominal X, Y, Z, object unit, (n, 3)
+    scale: float  # scale of the control over that of the adjusted network; 1 where it came from the control
 
     @property
     def rms(self) -> FloatArray:
@@ -94,7 +94,7 @@ class ControlCheck:
 
 @dataclass(frozen=True)
 class Eccentricity:
-    """By how much image points were corrected because a circle's centre is not its ellipse's centre."""
+    """Corrections of image points because the image of a circle's centre is not the centre of its ellipse."""
 
     largest_px: float  # longest correction, px
     rms_px: float  # root mean square per coordinate, px
@@ -106,36 +106,36 @@ class CheckPoint:
     """A point with known coordinates that took no part in the adjustment."""
 
     point: str
-    xyz: FloatArray  # object unit, NaN where the coordinate took part or is not known, (3,)
+    xyz: FloatArray  # object unit, NaN where the coordinate took part or is unknown, (3,)
     sigma: FloatArray  # stated standard deviations, object unit, (3,)
 
 
 @dataclass(frozen=True)
 class SeenPlate:
-    """A calibration plate of which the result has points."""
+    """A calibration plate with points in the result."""
 
-    points: IntArray  # of the network of the result, (n,)
+    points: IntArray  # indices in the network of the result, (n,)
     sigma: float  # standard deviation of its coordinates, object unit
 
 
 @dataclass(frozen=True)
 class PlacedEquipment:
-    """A bar or frame of the equipment file at a place where it was photographed."""
+    """A bar or frame of the equipment file in one of the positions where it was photographed."""
 
-    name: str  # in the equipment file
-    given_as: str  # scale bar | rigid frame, with its name among the given values
+    name: str  # name in the equipment file
+    given_as: str  # scale bar | rigid frame, followed by its name among the given values
     calibrated: date
     calibration_temperature: float  # deg C
-    expansion: float  # coefficient, 1e-6 per K
-    expansion_sigma: float  # standard deviation of it, 1e-6 per K
-    temperature: float  # in the survey, deg C
-    temperature_sigma: float  # standard deviation of it, K
-    correction: float  # of its lengths from calibration to survey, 1e-6
+    expansion: float  # expansion coefficient, 1e-6 per K
+    expansion_sigma: float  # standard deviation of the expansion coefficient, 1e-6 per K
+    temperature: float  # temperature in the survey, deg C
+    temperature_sigma: float  # standard deviation of the temperature, K
+    correction: float  # correction of its lengths from calibration to survey, 1e-6
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class SurveyResult:
-    """Result of a survey: the adjustment and what a person must know to judge it.
+    """Result of a survey: the adjustment and the information needed to judge it.
 
     Example:
         >>> import sfm
@@ -147,30 +147,30 @@ class SurveyResult:
     survey: str  # name of the survey
     unit: str  # object unit
     images_total: int  # photographs that the survey names
-    failed: tuple[FailedImage, ...]  # those that could not be read or oriented, with the reason
-    adjustment: Adjustment  # in the datum and on the control that the survey asks for
+    failed: tuple[FailedImage, ...]  # photographs that could not be read or oriented, with the reason
+    adjustment: Adjustment  # adjustment in the datum and with the control that the survey specifies
     code: IntArray  # code number of each point of adjustment.network, -1 = uncoded, (n,)
-    comparison: AdjusterComparison | None  # with the other adjuster; None if the survey asks for none
-    baseline: BaselineComparison | None = None  # another pipeline on the photographs; None likewise
-    photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
+    comparison: AdjusterComparison | None  # comparison with the other adjuster; None if not requested
+    baseline: BaselineComparison | None = None  # comparison with another pipeline; None if not requested
+    photographs: tuple[PhotographTargets, ...] = ()  # all readable photographs; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
-    remarks: tuple[Remark, ...] = ()  # what its stages found
+    remarks: tuple[Remark, ...] = ()  # remarks of its stages
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
-    given_tests: tuple[GivenTest, ...] = ()  # of control and scale bars against the image points alone
-    other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
-    unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
-    plates: tuple[SeenPlate, ...] = ()  # whose points are known to one another
-    check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
-    equipment: tuple[PlacedEquipment, ...] = ()  # calibrated, each as often as it was placed
+    given_tests: tuple[GivenTest, ...] = ()  # tests of control and scale bars against the image points alone
+    other_solutions: tuple[OtherSolution, ...] = ()  # further solutions that fit the image points
+    unused_image_points: int = 0  # their point or photograph is not in the result; in no other count
+    plates: tuple[SeenPlate, ...] = ()  # plates whose points are known relative to one another
+    check_points: tuple[CheckPoint, ...] = ()  # points with coordinates that took no part
+    equipment: tuple[PlacedEquipment, ...] = ()  # calibrated equipment, once for each position
     balance_radius_mm: tuple[tuple[str, float], ...] = ()  # R0 of the cameras given in AICON's form
-    exterior_correlations: ExteriorCorrelations | None = None  # of camera parameters, all of them
-    orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
-    # orientation, the strong ones
-    seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
-    settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, what it says) of the survey
-    weights: str = "components"  # of image points beside other observations: components | stated
+    exterior_correlations: ExteriorCorrelations | None = None  # correlations of all camera parameters
+    # strong correlations between camera parameters and exterior orientation
+    orientation_correlations: tuple[OrientationCorrelation, ...] = ()
+    seconds: tuple[StageTime, ...] = ()  # computing time of each stage, in order
+    settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, its content)
+    weights: str = "components"  # weighting of image points and other observations: components | stated
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
     @property
@@ -180,7 +180,7 @@ class SurveyResult:
 
     @property
     def network(self) -> Network:
-        """The adjusted network, rejected image points included."""
+        """The adjusted network, including rejected image points."""
         return self.adjustment.network
 
     @property
@@ -190,7 +190,7 @@ class SurveyResult:
 
     @cached_property
     def seen_targets(self) -> SeenTargets:
-        """Targets measured and candidates rejected in the photographs of the result."""
+        """Measured targets and rejected candidates in the photographs of the result."""
         index = {name: i for i, name in enumerate(self.network.images)}
         of_index = [one for one in self.photographs if one.image in index]
         of_index.sort(key=lambda one: index[one.image])
@@ -232,28 +232,28 @@ class SurveyResult:
         return self.solution.points
 
     def point(self, name: str | int) -> Point:
-        """Return an object point; UnknownNameError if there is none of that name."""
+        """Return an object point; UnknownNameError if no point has that name."""
         return self.solution.point(name)
 
     def image(self, name: str) -> OrientedImage:
-        """Return the exterior orientation of a photograph; UnknownNameError if there is none of that name."""
+        """Return the exterior orientation of a photograph; UnknownNameError if no such photograph exists."""
         return self.solution.image(name)
 
     def camera(self, name: str) -> Camera:
-        """Return an adjusted camera; UnknownNameError if there is none of that name."""
+        """Return an adjusted camera; UnknownNameError if no camera has that name."""
         return self.solution.camera(name)
 
     def write(self, folder: str | Path, *, pictures_mb: float = 15.0) -> Path:
         """Write tables, figures and the report into a folder, whole or not at all; return report.html.
 
         Args:
-            folder: an earlier result in it is replaced, anything else in it is an error.
-            pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies beside it.
+            folder: an earlier result in it is replaced; any other content is an error.
+            pictures_mb: limit for the pictures inside report.html, 10^6 bytes; the rest goes to pictures/.
 
         Raises:
-            OutputError: the folder cannot be written, or contains something else than an earlier result.
+            OutputError: the folder cannot be written, or contains anything but an earlier result.
         """
-        import sfm  # the report stands above the result, and is reached by its public name
+        import sfm  # the report is in a layer above this one, so it is called by its public name
 
         page: Path = sfm.write_result(self, folder, pictures_mb=pictures_mb)
         return page
@@ -283,7 +283,7 @@ class SurveyResult:
 
     @property
     def image_point_counts(self) -> str:
-        """How many image points were accepted, rejected and of no use, in words."""
+        """Numbers of accepted, rejected and unused image points, in words."""
         rejected = int(self.adjustment.rejected.sum())
         words = f"{len(self.adjustment.rejected) - rejected} accepted, {rejected} rejected"
         unused = self.unused_image_points
@@ -294,7 +294,7 @@ class SurveyResult:
 
     @property
     def has_scale(self) -> bool:
-        """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
+        """Whether lengths are in the object unit: from control or scale bars, or by placement on control."""
         return self.adjustment.has_scale
 
     @property
@@ -305,15 +305,15 @@ class SurveyResult:
 
 @cache
 def _reason(flag: int) -> str:
-    """Return in words why a candidate was not measured."""
+    """Return the reasons why a candidate was not measured, in words."""
     names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
     return ", ".join(names) or "no reason kept"
 
 
 def likest_first(reasons: Iterable[str]) -> list[str]:
-    """Return reasons against candidates in words, those of candidates that are most like targets first.
+    """Sort reasons for rejection so that reasons for the most target-like candidates come first.
 
-    Reasons that are not against a candidate, such as a target measured and not used, come before them.
+    Reasons that do not concern a candidate, such as a target measured but not used, precede them all.
     """
     rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKEST_FIRST)}
     return sorted(reasons, key=lambda reason: (rank.get(reason, -1), reason))

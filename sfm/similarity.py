@@ -1,9 +1,11 @@
 """3-D similarity (absolute orientation): closed form, weighted, with residuals and covariance.
 
+A closed-form similarity brings corresponding points together. Similarities restricted to some motions serve
+networks with a partial datum. The seven infinitesimal motions describe what a datum leaves open.
 Two-dimensional similarity and affine transformations (fiducial marks) are in
 `sfm.textbook.photo_coordinates`.
 
-Source: Szeliski and Kang (1997), IEEE PAMI 19(5), for the reversal of depth.
+Source: Szeliski and Kang (1997), IEEE PAMI 19(5), for the reversal of depth; others with each function.
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate
 
 PARAMETERS = 7
-MIN_DEPTH_RATIO = 0.05  # extent over the longest one below which points have no depth
-OPEN = 1e-6  # share of a rotation or scale in motions that are open; it is of their order or rounding
-MAX_STEPS = 50  # of a fit of some motions, which ends after about 5
-MAX_COLLINEAR_RATIO = 1e-9  # second singular value over the first below which points lie on a line
+MIN_DEPTH_RATIO = 0.05  # ratio of an extent to the longest one below which points have no depth
+OPEN = 1e-6  # share of a rotation or scale in the open motions; smaller shares are rounding
+MAX_STEPS = 50  # iterations of a fit of some motions, which usually ends after about 5
+MAX_COLLINEAR_RATIO = 1e-9  # ratio of the second singular value to the first below which points are collinear
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Similarity:
     def apply_estimate(self, estimate: Estimate) -> Estimate:
         """Return the estimate with points, positions, rotations and mounts in the target frame."""
         mounts = estimate.mounts
-        if mounts is not None:  # those held fixed keep the lengths they were given
+        if mounts is not None:  # mounts held fixed keep their given lengths
             scale = np.where(mounts.free[:, :3].any(axis=1, keepdims=True), self.scale, 1.0)
             mounts = replace(mounts, position=scale * mounts.position)
         return replace(
@@ -73,16 +75,16 @@ def fit_similarity(
     weights: FloatArray | None = None,
     scale: float | None = None,
 ) -> Similarity:
-    """Return the similarity that brings source points onto target points with least squares.
+    """Return the similarity that brings source points onto target points by least squares.
 
     Args:
         source: points in the source frame, shape (n, 3), source unit.
         target: the same points in the target frame, shape (n, 3), target unit.
         weights: weight of each point, shape (n,); equal if not given.
-        scale: scale to keep, target unit per source unit; fitted too if not given.
+        scale: scale to hold fixed, target unit per source unit; estimated if not given.
 
     Raises:
-        GeometryError: fewer than three points, all points on a line, or arrays of another shape.
+        GeometryError: fewer than three points, all points on a line, or arrays of the wrong shape.
 
     Example:
         >>> import sfm
@@ -113,14 +115,14 @@ def fit_similarity(
 
 
 def fit_similarities(source: FloatArray, target: FloatArray) -> list[Similarity | None]:
-    """Return the similarities of many sets of points at once, as `fit_similarity` does of one.
+    """Return the similarities of many sets of points at once; `fit_similarity` handles one set.
 
     Args:
-        source: sets of n points each, 3 at least, shape (s, n, 3).
-        target: the same points in the target frame of each.
+        source: sets of n points in the source frame, n >= 3, shape (s, n, 3).
+        target: the same points in the target frame, shape (s, n, 3).
 
     Returns:
-        None for a set whose points lie on a line, or are not finite.
+        A similarity for each set; None for a set whose points lie on a line or are not finite.
     """
     known = np.isfinite(source + target).all(axis=(1, 2)).reshape(-1, 1, 1)
     n = source.shape[1]
@@ -130,7 +132,7 @@ def fit_similarities(source: FloatArray, target: FloatArray) -> list[Similarity 
 def _fitted(
     source: FloatArray, target: FloatArray, w: FloatArray, scale: float | None
 ) -> list[Similarity | None]:
-    """Return the similarities of sets of finite points, (s, n, 3), with weights whose sum is 1, (n,)."""
+    """Return the similarities of sets of finite points, (s, n, 3), with weights that sum to 1, (n,)."""
     centre_s, centre_t = w @ source, w @ target
     s, t = source - centre_s[:, None], target - centre_t[:, None]
     spread = np.linalg.svd(s * np.sqrt(w)[:, None], compute_uv=False)
@@ -149,17 +151,18 @@ def _fitted(
 
 
 def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> Similarity:
-    """Return the similarity of some motions alone that brings source points onto target points.
+    """Return the similarity, restricted to some motions, that brings source points onto target points.
 
-    With least squares; of a levelled network it is composed of shifts and a rotation about the vertical.
+    The fit is by least squares. For a levelled network, for example, the motions are the shifts and the
+    rotation about the vertical.
 
     Args:
         source: points in the source frame, (n, 3).
         target: the same points in the target frame, (n, 3).
-        motions: how the source points move with each motion that is open, (n, 3, d).
+        motions: displacements of the source points under each open motion, (n, 3, d).
 
     Raises:
-        GeometryError: as `fit_similarity`.
+        GeometryError: as for `fit_similarity`.
     """
     if not motions.shape[2]:
         return Similarity(1.0, np.eye(3), np.zeros(3))
@@ -187,7 +190,7 @@ def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> 
 
 
 def _finite_motion(motion: FloatArray, centre: FloatArray, size: float) -> FloatArray:
-    """Return a motion of `similarity_motions` that is not small, homogeneous, (4, 4)."""
+    """Return the finite motion of a combination (7,) of `similarity_motions`, homogeneous, (4, 4)."""
     generator = np.zeros((4, 4))
     generator[:3, :3] = (skew(motion[3:6]) + motion[6] * np.eye(3)) / size
     generator[:3, 3] = motion[:3] - generator[:3, :3] @ centre
@@ -195,13 +198,13 @@ def _finite_motion(motion: FloatArray, centre: FloatArray, size: float) -> Float
 
 
 def _space(directions: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the space of some directions, (k, rank)."""
+    """Return an orthonormal basis of the space that directions span, (k, rank)."""
     U, d, _ = np.linalg.svd(directions)
     return U[:, : int((d > OPEN).sum())]
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Return the rotation R with the largest trace of R' M, (3, 3): of M = sum b a', the best for b = R a.
+    """Return the rotation R with the largest trace of R' M, (3, 3); for M = sum b a' it fits b = R a best.
 
     Source: Umeyama (1991), IEEE Trans. PAMI 13(4), lemma.
     """
@@ -210,12 +213,12 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0) -> FloatArray:
-    """Return how points move with shifts, small rotations about a centre and the scale, (n, 3, 7).
+    """Return the displacements of points under shifts, small rotations and a change of scale, (n, 3, 7).
 
     Args:
         xyz: points, (n, 3).
-        centre: of rotations and scale, (3,).
-        size: over which rotations and scale are taken, so that all seven motions can be of one order.
+        centre: centre of rotations and scale, (3,).
+        size: length that divides rotations and scale, so that all seven motions are of the same order.
 
     Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3.
     """
@@ -225,24 +228,24 @@ def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0
 
 
 def motions_along(xyz: FloatArray, motions: FloatArray, *, centre: FloatArray, size: float) -> FloatArray:
-    """Return motions of points as combinations of those of `similarity_motions`, orthonormal, (7, d).
+    """Express motions of points as orthonormal combinations of the seven `similarity_motions`, (7, d).
 
     Args:
         xyz: points, (n, 3).
-        motions: how they move, (n, 3, d).
-        centre: as of `similarity_motions`.
-        size: as of `similarity_motions`.
+        motions: displacements of the points under each motion, (n, 3, d).
+        centre: as for `similarity_motions`.
+        size: as for `similarity_motions`.
     """
     G = similarity_motions(xyz, centre=centre, size=size).reshape(-1, 7)
     return np.linalg.qr(np.linalg.lstsq(G, motions.reshape(len(G), -1), rcond=None)[0])[0]
 
 
 def without_motions(xyz: FloatArray, away: FloatArray) -> FloatArray:
-    """Return displacements of points without what a small similarity takes of them, (n, 3, q).
+    """Return displacements of points after removing the best-fitting small similarity, (n, 3, q).
 
     Args:
-        xyz: points, (n, 3); NaN where one is not known.
-        away: their displacements, (n, 3, q).
+        xyz: points, (n, 3); NaN where unknown.
+        away: displacements of the points, (n, 3, q).
     """
     known = np.isfinite(xyz).all(axis=1)
     X = xyz[known]
@@ -260,7 +263,7 @@ def mean_distance(xyz: FloatArray) -> float:
 
 
 def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the axes along which an object extends (k, 3), and its coordinates along them (n, k)."""
+    """Return the axes along which an object has extent (k, 3), and its coordinates along them (n, k)."""
     centred = xyz - xyz.mean(axis=0)
     _, extent, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes[MIN_DEPTH_RATIO * extent[0] < extent]
@@ -268,10 +271,10 @@ def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def reverse_depth(estimate: Estimate) -> Estimate:
-    """Return the estimate reflected in depth: exact where all rays of a photograph are parallel.
+    """Return the estimate reflected in depth, which is exact if the rays of each photograph are parallel.
 
     Args:
-        estimate: NaN for photographs and points that are not determined, which stay so.
+        estimate: NaN for photographs and points that are not determined; they stay NaN.
     """
     known, oriented = estimate.determined, estimate.oriented
     d = estimate.rotation[oriented, :, 2].mean(axis=0)
@@ -295,7 +298,7 @@ class AbsoluteOrientation:
     residuals: FloatArray  # v = transformed - control, control unit, (n, 3)
     sigma0: float  # a posteriori standard deviation of unit weight, control unit; NaN without redundancy
     redundancy: int  # 3 n - 7
-    covariance: FloatArray  # of scale, three small turns about control axes (rad) and the shift, (7, 7)
+    covariance: FloatArray  # scale, three small rotations about control axes (rad) and shift, (7, 7)
 
 
 @checked_arguments(model="n 3", control="n 3", weights="n")
@@ -310,11 +313,11 @@ def orient_absolute(
         weights: weight of each point, shape (n,); 1 if not given.
 
     Returns:
-        The closed-form solution, which is the least-squares one, with its covariance: of the scale, of w in
-        exp([w]x) R, and of the translation of the model's centre of gravity.
+        The closed-form solution, which is the least-squares solution, and its covariance. The covariance is
+        that of the scale, of w in exp([w]x) R, and of the translation of the model's centre of gravity.
 
     Raises:
-        GeometryError: fewer than three points, or all on a line.
+        GeometryError: fewer than three points, or all points on a line.
 
     Source: document 004, "absolute orientation"; Horn (1987) for the closed form (sfm/similarity.py), Kraus
     (2007), sec. 4.4.3, for the differential equations.
@@ -325,7 +328,7 @@ def orient_absolute(
     P = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
     moved = similarity.apply(model)
     v = moved - control
-    # at the weighted centre: d = (moved - centre) dm / m + w x (moved - centre) + dt
+    # about the weighted centre: d = (moved - centre) dm / m + w x (moved - centre) + dt
     arm = moved - (P @ moved) / P.sum()
     A = np.zeros((n, 3, PARAMETERS))
     A[:, :, 0] = arm / similarity.scale

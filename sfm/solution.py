@@ -1,7 +1,7 @@
-"""Solution: a network that is solved, and its points by name, with covariance, whoever solved it.
+"""Solution: a solved network with its points by name and their covariance, from Kolinear or other programs.
 
-`adjust` and `run_survey` have it as `.solution`, `read_result` returns it; comparison, shapes, measurement,
-epochs and files take it.
+The results of `adjust` and `run_survey` have it as `.solution`, and `read_result` returns it. Comparison,
+shapes, measurement, epochs and file formats accept it.
 """
 
 from __future__ import annotations
@@ -25,28 +25,26 @@ from sfm.network import Estimate, Network, index_of
 if TYPE_CHECKING:
     import pandas
 
-SHOWN = 10  # points in a representation
+SHOWN = 10  # points in a printed table
 HEADER = ("point", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
 NO_SCALE = "network units"
 """unit of lengths in a network whose scale is undefined"""
 OBJECT_UNITS = "object units"
-"""unit of lengths in a network where none is stated"""
+"""unit of lengths in a network whose unit is not stated"""
 CONTROL_COVARIANCE = "control covariance"  # kind of a row of given.csv
-MOUNT = ("X", "Y", "Z", "omega", "phi", "kappa")  # of a camera in the axes of its rig
+MOUNT = ("X", "Y", "Z", "omega", "phi", "kappa")  # pose of a camera in the axes of its rig
 MEASURED = "measured"
-"""what targets.csv says of a target in the place of a reason for its rejection"""
+"""entry in targets.csv for a measured target, in place of a reason for rejection"""
 
 
 @dataclass(frozen=True)
 class SeenTargets:
-    """Targets measured and candidates rejected in the photographs of a result."""
+    """Measured targets and rejected candidates in the photographs of a result."""
 
     image: IntArray  # index of the photograph in the network of the result, (k,)
     xy: FloatArray  # centres, px, (k, 2)
-    ellipse: (
-        FloatArray  # semi-axes, larger first, px, and angle from x towards y, rad; NaN if rejected, (k, 3)
-    )
-    reason: tuple[str, ...]  # why it was not measured, in words; empty where it was, (k,)
+    ellipse: FloatArray  # semi-axes, larger first, px; angle from x towards y, rad; NaN if rejected, (k, 3)
+    reason: tuple[str, ...]  # reason for rejection, in words; empty if measured, (k,)
 
     @property
     def measured(self) -> BoolArray:
@@ -61,9 +59,7 @@ class OrientedImage:
     name: str
     position: FloatArray  # projection centre X0, object unit, (3,)
     rotation: FloatArray  # R, image to object axes, (3, 3)
-    covariance: (
-        FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad); NaN where not known, (6, 6)
-    )
+    covariance: FloatArray  # X0, Y0, Z0 (object unit), omega, phi, kappa (rad); NaN where unknown, (6, 6)
 
     @property
     def angles(self) -> FloatArray:
@@ -92,28 +88,25 @@ class Solution:
         ((3,), (12, 12))
     """
 
-    name: str  # what people call it
+    name: str  # name of the result
     network: Network
     estimate: Estimate
     point_covariance: FloatArray | None = None  # marginal, object unit^2, (n, 3, 3)
-    position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
-    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
-    redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
-    unit: str = ""  # of lengths, as people call it; empty where it is not known
-    covariance: FloatArray | None = None  # of all coordinates of points together, object unit^2, (3k, 3k)
-    datum: str = ""  # free | minimal | control; empty where it is not known
-    points_named: bool = True  # whether names of points identify them, or are mere numbers
-    images_named: bool = True  # likewise of photographs
-    covariance_points: IntArray | None = (
-        None  # of which k points `covariance` is, all n where not given, (k,)
-    )
-    exterior_covariance: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, unit and rad, (m, 6, 6)
-    interior_covariance: tuple[FloatArray, ...] = ()  # of the free parameters of each camera, (f, f)
-    rig_covariance: FloatArray | None = (
-        None  # of `interior_covariance` of all cameras and then X, Y, Z, omega,
-    )
-    # phi, kappa of the mount of each, together, unit and rad, (s, s)
-    joint: JointCovariance | None = None  # of an adjustment in memory; None where only what is above is known
+    position_covariance: FloatArray | None = None  # projection centres, object unit^2, (m, 3, 3)
+    interior_sigma: tuple[FloatArray, ...] | None = None  # one per parameter, NaN where fixed
+    redundancy: int | None = None  # redundancy of the adjustment, for the degrees of freedom of tests
+    unit: str = ""  # name of the unit of lengths; empty where unknown
+    covariance: FloatArray | None = None  # joint, of all coordinates of points, object unit^2, (3k, 3k)
+    datum: str = ""  # free | minimal | control; empty where unknown
+    points_named: bool = True  # whether the names of points identify them, or are mere numbers
+    images_named: bool = True  # likewise for photographs
+    covariance_points: IntArray | None = None  # indices of the points of `covariance`; all if None, (k,)
+    exterior_covariance: FloatArray | None = None  # X0, Y0, Z0, omega, phi, kappa, unit and rad, (m, 6, 6)
+    interior_covariance: tuple[FloatArray, ...] = ()  # free parameters of each camera, (f, f)
+    # joint, of the free parameters of all cameras, then X, Y, Z, omega, phi, kappa of each mount, unit and
+    # rad, (s, s)
+    rig_covariance: FloatArray | None = None
+    joint: JointCovariance | None = None  # joint covariance of an adjustment in memory; otherwise None
 
     @property
     def has_scale(self) -> bool:
@@ -128,7 +121,7 @@ class Solution:
 
     @property
     def rig_parameters(self) -> tuple[str, ...]:
-        """Camera and parameter of each row of `rig_covariance`, in words, (s,)."""
+        """Names of the camera and parameter of each row of `rig_covariance`, (s,)."""
         cameras = self.estimate.cameras
         interior = [
             f"{camera.name} {name}"
@@ -139,22 +132,22 @@ class Solution:
 
     @property
     def solution(self) -> Solution:
-        """Itself, as an adjustment and a survey have theirs."""
+        """The solution itself: results of adjustments and surveys have the same attribute."""
         return self
 
     @cached_property
     def with_joint_covariance(self) -> Solution:
-        """The same with the covariance of all points together, or of a sample of many of them.
+        """The solution with the joint covariance of all points, or of a sample if there are many.
 
-        It is the solution as it is where that is not known.
+        Where this covariance is unknown, it is the unchanged solution.
         """
         if self.covariance is not None or self.joint is None:
             return self
         some = points_kept_together(self.network.points)
         try:
-            # by a copy, which takes the normal equations with it: they are larger than all else
+            # a copy, so that the normal equations, the largest part of it, are freed with the copy
             found = copy(self.joint)(some, np.zeros(0, dtype=np.int64))
-        except GeometryError:  # normal equations that cannot be solved have no covariance at all
+        except GeometryError:  # normal equations that cannot be solved give no covariance at all
             return self
         if not np.isfinite(found).all():
             return self
@@ -162,19 +155,19 @@ class Solution:
         return replace(self, covariance=found, covariance_points=None if every else some)
 
     def covariance_of(self, points: Sequence[str] = (), images: Sequence[str] = ()) -> FloatArray:
-        """Return the joint covariance of some points and photographs, by their names.
+        """Return the joint covariance of some points and photographs, given by name.
 
         Args:
-            points: p names.
-            images: m names of photographs.
+            points: names of p points.
+            images: names of m photographs.
 
         Returns:
             Covariance of X Y Z of each point, then of X0, Y0, Z0, omega, phi, kappa of each photograph, in
             object units and rad, (3 p + 6 m, 3 p + 6 m).
 
         Raises:
-            UnknownNameError: there is none of that name.
-            GeometryError: it is not known, as that between points of a result of another program.
+            UnknownNameError: no point or photograph has that name.
+            GeometryError: the covariance is unknown, for example between points of another program's result.
         """
         rows = np.array([self.network.point_index(name) for name in points], dtype=np.int64)
         photographs = np.array([self.network.image_index(name) for name in images], dtype=np.int64)
@@ -195,10 +188,10 @@ class Solution:
         )
 
     def covariance_rows(self, points: IntArray) -> IntArray:
-        """Return the row of points among those that `covariance` is of, -1 where it is not of them.
+        """Return the position of points among the points of `covariance`, -1 for points that it lacks.
 
         Args:
-            points: indices, (k,).
+            points: indices of points, (k,).
         """
         if self.covariance_points is None:
             return points
@@ -208,7 +201,7 @@ class Solution:
 
     @property
     def points(self) -> PointTable:
-        """The object points by name."""
+        """The object points, by name."""
         n = len(self.network.points)
         covariance = self.point_covariance
         if covariance is None:
@@ -218,10 +211,10 @@ class Solution:
         )
 
     def point(self, name: str | int) -> Point:
-        """Return an object point by its name, which of a coded target is its number.
+        """Return an object point by its name; the name of a coded target is its number.
 
         Raises:
-            UnknownNameError: there is none of that name.
+            UnknownNameError: no point has that name.
         """
         found: Point = self.points[str(name)]
         return found
@@ -232,13 +225,13 @@ class Solution:
         Raises:
             OutputError: the folder cannot be written.
         """
-        import sfm  # files stand above the solution, and are reached by their public name
+        import sfm  # file formats are in a layer above this one, so they are called by their public name
 
         path: Path = sfm.write_result(self, folder)
         return path
 
     def image(self, name: str) -> OrientedImage:
-        """Return the exterior orientation of a photograph; UnknownNameError if there is none of that name."""
+        """Return the exterior orientation of a photograph; UnknownNameError if no such photograph exists."""
         i = self.network.image_index(name)
         covariance = np.full((6, 6), np.nan)
         if self.exterior_covariance is not None:
@@ -248,7 +241,7 @@ class Solution:
         return OrientedImage(name, self.estimate.position[i], self.estimate.rotation[i], covariance)
 
     def camera(self, name: str) -> Camera:
-        """Return a camera; UnknownNameError if there is none of that name."""
+        """Return a camera; UnknownNameError if no camera has that name."""
         cameras = self.estimate.cameras
         return cameras[index_of([camera.name for camera in cameras], name, "camera")]
 
@@ -269,20 +262,20 @@ class Solution:
 
 
 def mount_blocks(covariance: FloatArray, first: int) -> FloatArray:
-    """Return the covariance of each mount of those of all together, which begin at a row, (a, 6, 6)."""
+    """Return the block of each mount in a joint covariance; mounts begin at row `first`, (a, 6, 6)."""
     rows = first + np.arange(len(covariance) - first if len(covariance) else 0).reshape(-1, 6)
     return np.asarray(covariance[rows[:, :, None], rows[:, None]])
 
 
 def solution_of(result: Any, what: str) -> Solution:
-    """Return the solution of what an adjustment, a survey or a file gave.
+    """Return the solution of the result of an adjustment, a survey or a file.
 
     Args:
-        result: a Solution, or what has one as `.solution`.
-        what: asks for it, for messages.
+        result: a Solution, or an object with a Solution as `.solution`.
+        what: name of the calling function, for the message.
 
     Raises:
-        GeometryError: it has none.
+        GeometryError: the object has no solution.
     """
     found = getattr(result, "solution", None)
     if not isinstance(found, Solution):
@@ -298,7 +291,7 @@ class Point:
 
     name: str
     xyz: FloatArray  # object unit, (3,)
-    covariance: FloatArray  # object unit^2; NaN where not known, (3, 3)
+    covariance: FloatArray  # object unit^2; NaN where unknown, (3, 3)
 
     @property
     def sigma(self) -> FloatArray:
@@ -312,13 +305,13 @@ class Point:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class PointTable(Sequence[Point]):
-    """Object points in order, each reached by its name or its number."""
+    """Object points in order; each can be accessed by its name or its index."""
 
     names: tuple[str, ...]  # (n,)
     xyz: FloatArray  # object unit, (n, 3)
-    covariance: FloatArray  # object unit^2; NaN where not known, (n, 3, 3)
-    rays: IntArray  # photographs that each point was measured in, (n,)
-    unit: str = ""  # of lengths, as people call it
+    covariance: FloatArray  # object unit^2; NaN where unknown, (n, 3, 3)
+    rays: IntArray  # number of photographs in which each point was measured, (n,)
+    unit: str = ""  # name of the unit of lengths
 
     @property
     def sigma(self) -> FloatArray:
@@ -326,10 +319,10 @@ class PointTable(Sequence[Point]):
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
     def index(self, name: object, start: int = 0, stop: int | None = None) -> int:
-        """Return the number of a point.
+        """Return the index of a point.
 
         Raises:
-            UnknownNameError: there is no point of that name.
+            UnknownNameError: no point has that name.
         """
         return index_of(self.names, name, "point")
 
@@ -343,7 +336,7 @@ class PointTable(Sequence[Point]):
         return (self[k] for k in range(len(self)))
 
     def __getitem__(self, key: Any) -> Any:
-        """Return a point by its name or number, or the points of a slice, a mask, or a list of either."""
+        """Return the point of a name or index, or the points of a slice, mask or list of names or indices."""
         if isinstance(key, str):
             key = self.index(key)
         if isinstance(key, int | np.integer):
@@ -355,7 +348,7 @@ class PointTable(Sequence[Point]):
         return PointTable(names, self.xyz[rows], self.covariance[rows], self.rays[rows], self.unit)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return the points as a data frame with the names as its index.
+        """Return the points as a data frame indexed by their names.
 
         Raises:
             BackendError: pandas is not installed.

@@ -1,7 +1,8 @@
-"""Compile the kernels of a survey ahead of the first one: `python -m sfm.warm_up`.
+"""Compiles the numba kernels before the first survey: `python -m sfm.warm_up`.
 
-Numba keeps compiled kernels on disk; the first run of each would take most of a minute otherwise. Every part
-works on a small made-up problem in a separate process, since numba compiles one function at a time.
+Numba keeps compiled kernels on disk. Without them, the first run of each kind would take most of a minute
+longer. Each part solves a small synthetic problem in its own process, since numba compiles one function at a
+time.
 """
 
 from __future__ import annotations
@@ -49,17 +50,17 @@ from sfm.textbook.resection.zeng_wang import resect_zeng_wang
 
 IMAGES, POINTS = 8, 40
 SINGLE_IMAGES = 18  # enough unknowns for steps in single precision
-MANY_IMAGES, MANY_POINTS = 80, 160  # more photographs than those whose normal matrix is always a full one
-SEEN, RAYS = 12, 6  # points that one of them sees, and photographs that see a point of a strip
+MANY_IMAGES, MANY_POINTS = 80, 160  # too many photographs for a dense normal matrix to be the only choice
+SEEN, RAYS = 12, 6  # points in each of these photographs; photographs of each point in a strip
 SIZE_PX, PIXEL_MM, C_MM = (1000, 800), (0.01, 0.01), 10.0
-DISTANCE = 4.0  # of the cameras, the points lie within 1 of the origin
+DISTANCE = 4.0  # distance of the cameras from the origin; the points lie within 1 of it
 NOISE_PX = 0.05
 DOTS = ((60.3, 60.7), (180.1, 60.2), (60.4, 180.5), (180.6, 180.3))  # centres in the drawn photograph, px
 FREE = ("c", "x0", "y0", "K1", "P1", "P2")
 
 
 def compile_targets() -> None:
-    """Find targets in drawn photographs: dark and bright, rings of cells, arcs, tags, and crossings."""
+    """Find targets in drawn photographs: dark and bright, with cell rings, arcs, tags and checkerboards."""
     for bright in (False, True):
         for codes in ("ring14", "arcs", "apriltag36h11"):
             find_targets(drawn_photograph(bright), polarity="auto", codes=codes)
@@ -71,7 +72,7 @@ def compile_targets() -> None:
 
 
 def compile_orientation() -> None:
-    """Orient a network from nothing but its image points, and match them without their names."""
+    """Orient a network from its image points alone, match the points without names, and resect."""
     network, truth = made_up_network()
     orient(network, empty_estimate(network, truth.cameras), refine=lambda _, estimate: estimate)
     seen = network.image_points
@@ -88,7 +89,7 @@ def compile_orientation() -> None:
 
 
 def compile_adjustment() -> None:
-    """Adjust a network in every way that a survey does, and prepare its comparison."""
+    """Adjust networks in all the ways that a survey uses, and prepare a comparison."""
     network, truth = made_up_network()
     adjust(network, truth, datum=Datum("free"), reject="huber", covariance=False)
     adjustment = adjust(network, truth, datum=Datum("free"), reject="tau")
@@ -96,13 +97,13 @@ def compile_adjustment() -> None:
     compared = adjust(part, start, datum=Datum("free"), reject="none")
     reprojection(part, compared.estimate)
     every = np.ones((SINGLE_IMAGES, POINTS), dtype=bool)
-    # whose normal matrix is one of fronts, summed ray by ray, and a product in single precision on the way
+    # normal matrices of three forms: factored by fronts, summed ray by ray, and a product in single precision
     for sees in (_strip(), _scattered(), every):
         adjust(*made_up_network(sees), datum=Datum("free"), reject="none")
 
 
 def compile_matching() -> None:
-    """Find interest points, match some by correlation and by least squares in every model, link features."""
+    """Find interest points, match some by correlation and by least squares in all models, link features."""
     photograph = drawn_photograph(False)
     at = foerstner_points(photograph, border_px=30).xy[:4]
     for method in METHODS:
@@ -117,7 +118,7 @@ def compile_matching() -> None:
 
 
 def compile_planning() -> None:
-    """Render a photograph of a coded target, and see which points a triangle hides, as plans do."""
+    """Render a photograph of a coded target, and find points hidden by a triangle, as planning does."""
     face = Faces(np.zeros((1, 3)), np.eye(3)[None, :2], np.ones((1, 2)), *np.array([[0.8], [0.0], [1.0]]))
     ring = coded_ring(0, np.zeros(2), 0.1, 20, ring_family("ring14"), 0.1)
     target = CircularTargets(np.zeros(1, dtype=np.int64), np.zeros((1, 2)), np.full(1, 0.1), np.full(1, 20))
@@ -129,7 +130,7 @@ def compile_planning() -> None:
     gains(np.eye(3)[None], np.ones((1, 1, 2, 3)), np.ones(1), np.ones(1, dtype=bool))
 
 
-PARTS = (  # the longest first
+PARTS = (  # longest first
     compile_orientation,
     compile_targets,
     compile_adjustment,
@@ -142,10 +143,10 @@ def main(progress: Progress = SILENT) -> None:
     """Compile all parts, as many at a time as there are cores.
 
     Args:
-        progress: receives every part that is done.
+        progress: is advanced when a part is finished.
 
     Raises:
-        KolinearError: a process was ended from outside.
+        KolinearError: a process was ended by the system.
     """
     progress.stage("compiling", len(PARTS))
     with (
@@ -165,19 +166,21 @@ def main(progress: Progress = SILENT) -> None:
 
 
 def _compile(part: Callable[[], None]) -> None:
-    """Compile a part in a separate process, whose memory need not be tidied on the way.
+    """Compile a part in its own process, without garbage collection.
 
-    Looking for cycles among the many objects of a compiler takes a tenth of the time; they are 0.2 GB.
+    Searching the many objects of the compiler for cycles would take a tenth of the time. The cycles use
+    0.2 GB, which the end of the process frees.
     """
     gc.disable()
     part()
 
 
 def made_up_network(sees: AnyArray | None = None) -> tuple[Network, Estimate]:
-    """Return a convergent network with a little noise, and its truth.
+    """Return a synthetic convergent network with little noise, and its true values.
 
     Args:
-        sees: which photographs see which points, (photographs, points); a few that all see all if not given.
+        sees: which photographs see which points, (photographs, points); if not given, each of a few
+            photographs sees every point.
     """
     sees = np.ones((IMAGES, POINTS), dtype=bool) if sees is None else sees
     images, count = sees.shape
@@ -192,7 +195,7 @@ def made_up_network(sees: AnyArray | None = None) -> tuple[Network, Estimate]:
     right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(images)], axis=1)
     down = np.cross(back, right)
     rotation = np.stack([right, down, back], axis=2)
-    rotation[1::2] = np.stack([down, -right, back], axis=2)[1::2]  # rolled, so that the camera is determined
+    rotation[1::2] = np.stack([down, -right, back], axis=2)[1::2]  # rolled, which determines the camera
     xy = np.stack(
         [project(camera, X0, R, points) for X0, R in zip(position, rotation, strict=True)]
     ) + rng.normal(0, NOISE_PX, (images, count, 2))
@@ -207,14 +210,14 @@ def made_up_network(sees: AnyArray | None = None) -> tuple[Network, Estimate]:
 
 
 def _strip() -> AnyArray:
-    """Return which points photographs see that share them with their neighbours only."""
+    """Return which points each photograph sees if it shares points with its neighbours only."""
     first = np.arange(MANY_POINTS) * (MANY_IMAGES - RAYS) // (MANY_POINTS - 1)
     i = np.arange(MANY_IMAGES)[:, None]
     return np.asarray((first <= i) & (i < first + RAYS))
 
 
 def _scattered() -> AnyArray:
-    """Return which points photographs see that share few of them, with any others."""
+    """Return which points each photograph sees if it shares a few points with any other."""
     rng = np.random.default_rng(3)
     return np.asarray(rng.random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
 
