@@ -1,14 +1,14 @@
 """Bundle adjustment with self-calibration.
 
-- `adjust`: begin here; a network and start values in, an `Adjustment` with covariance and tests out.
+- `adjust`: start here; it turns a network and start values into an `Adjustment` with covariance and tests.
 - `predict`: the covariance of a planned network.
-- `Datum`, `change_datum`: what decides position, attitude and scale.
+- `Datum`, `change_datum`: the definition of position, attitude and scale.
 - `marginal_of`: joint covariances of points.
-- `w_test`, `tau_test`: gross errors in image coordinates.
+- `w_test`, `tau_test`: tests for gross errors in image coordinates.
 - `estimate_error_correlation`, `with_error_correlation`, `with_neighbours`: errors that neighbouring image
   points have in common.
 
-How it is computed is in `engine`, how good it is in `quality`.
+The computation is in `engine`, the assessment of quality in `quality`.
 
     >>> import numpy as np
     >>> import sfm

@@ -1,13 +1,13 @@
 """Covariance of any subset of the unknowns of a finished adjustment, in any datum.
 
-The normal equations are formed once more at the solution. The coordinates stay; a change of datum is an
-S-transformation of their covariance.
+`marginal_of` forms the normal equations once more at the solution and gives joint covariances. A change of
+datum keeps the coordinates and transforms their covariance by an S-transformation.
 
-A network as it is best computed with: coordinates near the origin, near points near in memory; and back. Near
-5e6 m a coordinate in double precision has steps of 1e-9 m, which in a close-range network is more than the
-change at which an iteration has converged: it is reduced to its centroid. The points of a large network are
-put in order along a curve that fills space, so that a photograph meets those that it sees in few stretches of
-memory; sums over 646,000 image points take a third of the time then.
+`local_of` prepares a network for computing, and `LocalNetwork` converts the result back. Coordinates far from
+the origin are reduced to the centroid: near 5e6 m a double has steps of 1e-9 m, more than the change at which
+the iteration of a close-range network has converged. The points of a large network are sorted along a
+space-filling curve, so the points of a photograph lie close together in memory. Sums over 646,000 image
+points then take a third of the time.
 
 Source: Baarda (1973), S-transformations and criterion matrices; Luhmann et al., Close-Range Photogrammetry
 (2020), sec. 2.2.2; Morton (1966), A computer oriented geodetic data base and a new technique in file
@@ -45,15 +45,15 @@ from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
 from sfm.observations.pose import exterior_jacobian
 
-# Extents of the network from the origin at which an axis is reduced: three digits are lost.
+# Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.
 MAX_EXTENTS = 1000.0
-MIN_SORTED_POINTS = 5000  # points from which their order matters; fewer stay in the cache
-LEVELS = 10  # of the curve: each axis is cut into 2^10 parts
+MIN_SORTED_POINTS = 5000  # number of points from which order matters; fewer stay in the cache
+LEVELS = 10  # levels of the curve: each axis is cut into 2^10 parts
 
 
 @dataclass(frozen=True)
 class Marginal:
-    """A finished adjustment with its normal equations at hand."""
+    """A finished adjustment with its normal equations at the solution."""
 
     adjustment: Adjustment
     layout: Unknowns
@@ -62,18 +62,18 @@ class Marginal:
     cofactors: Cofactors
 
     def names(self) -> list[tuple[str, str]]:
-        """Return (parameter, of what) of each reduced unknown: X0 ... of photographs, then interior ones."""
+        """Return (parameter, owner) of each reduced unknown: exterior orientation, then interior ones."""
         return reduced_names(self.layout, self.adjustment.network, self.adjustment.estimate)
 
     @cached_property
     def influence(self) -> Influence:
-        """How the errors of image points move the unknowns."""
+        """Effect of errors of image points on the unknowns."""
         weight = np.ascontiguousarray(self.adjustment.weights[self.layout.order])
         return influence_of(self.optimum, self.layout, weight)
 
     @cached_property
     def correlated(self) -> CorrelatedPart | None:
-        """Part of the covariance due to correlated errors; None where they are independent."""
+        """Part of the covariance due to correlated errors; None if errors are independent."""
         a = self.adjustment
         if a.error_correlation is None:
             return None
@@ -85,7 +85,7 @@ class Marginal:
         return without_held(found, self.layout, self.optimum)
 
     def covariance(self) -> Covariance:
-        """Return the covariance of points, exterior and interior orientation, each by itself."""
+        """Return the marginal covariances of points, exterior and interior orientation."""
         found, variance = self.of_independent_errors(), self.adjustment.sigma0**2
         return found if self.correlated is None else self.correlated.added_to(found, variance, self.optimum)
 
@@ -93,16 +93,16 @@ class Marginal:
         """Return the joint covariance of some reduced unknowns and some object points.
 
         Args:
-            unknowns: indices into `names`; of a photograph X0 and the small rotation in its axes.
+            unknowns: indices into `names`; for a photograph these are X0 and a small rotation in its axes.
             points: indices of object points.
 
         Returns:
-            Covariance in this order, X Y Z of each point, shape (u + 3 p, u + 3 p).
+            Covariance of the unknowns and then X, Y, Z of each point, shape (u + 3 p, u + 3 p).
         """
         Q, b, motions = self.cofactors, self.optimum.equations.blocks, self.optimum.motions
         observations, first, u = self.layout.observations, self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
-        # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
+        # each dx as a linear function of the reduced unknowns: an unknown itself, or -L^-T Y' for a point
         through = np.zeros((self.layout.reduced, len(rows)))
         m = observations.poses
         of_poses = through[: 6 * m].reshape(m, 6, len(rows))
@@ -140,12 +140,12 @@ class Marginal:
         half = H @ F
         cofactor -= half
         cofactor -= half.T
-        del half  # of all coordinates by all, as is each term
+        del half  # each term is as large as the whole covariance
         cofactor += H @ Q.G @ H.T
         if self.correlated is not None:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
-        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)  # by the datum
+        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)  # fixed
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
         cofactor *= self.adjustment.sigma0**2
@@ -153,10 +153,10 @@ class Marginal:
 
 
 class JointOnDemand:
-    """Joint covariances of an adjustment; its normal equations are formed when they are first asked for."""
+    """Joint covariances of an adjustment; the normal equations are formed at the first call."""
 
     def __init__(self, adjustment: Adjustment) -> None:
-        """Of what `adjust` returned."""
+        """Keep the adjustment that `adjust` returned."""
         self._adjustment = adjustment
 
     @cached_property
@@ -164,7 +164,15 @@ class JointOnDemand:
         return marginal_of(self._adjustment, cross=False)
 
     def __call__(self, points: IntArray, images: IntArray) -> FloatArray:
-        """Return that of X Y Z of points (p,) and X0 Y0 Z0 omega phi kappa of photographs (m,), by indices.
+        """Return the joint covariance of points and photographs.
+
+        Args:
+            points: indices of points, (p,).
+            images: indices of photographs, (m,).
+
+        Returns:
+            Covariance of X, Y, Z of each point, then X0, Y0, Z0, omega, phi, kappa of each photograph, object
+            unit and rad, (3 p + 6 m, 3 p + 6 m).
 
         Raises:
             GeometryError: the normal equations cannot be solved.
@@ -186,15 +194,15 @@ class JointOnDemand:
 
 @checked_arguments()
 def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:
-    """Return a finished adjustment with its normal equations at hand.
+    """Return a finished adjustment with its normal equations at the solution.
 
     Args:
-        adjustment: what `adjust` returned.
-        datum: another datum of the same kinds (control stays control); that of the adjustment if None.
-        cross: whether cofactors between points and photographs are wanted.
+        adjustment: result of `adjust`.
+        datum: another datum, with control only if the adjustment has it; that of the adjustment if None.
+        cross: whether to compute cofactors between points and photographs.
 
     Raises:
-        GeometryError: a change between control and a datum without.
+        GeometryError: a change between a datum with control and one without.
     """
     use_control = adjustment.datum == "control"
     resolved = ResolvedDatum(adjustment.datum, adjustment.datum_points)
@@ -211,25 +219,26 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
     optimum = optimum_at(problem_of(layout, observed, resolved), state, weight)
     if optimum is None:
-        motions_of(layout, observed, state, resolved)  # raises if the datum is the reason
+        motions_of(layout, observed, state, resolved)  # raises its own error if the datum is the reason
         raise GeometryError("adjustment: its normal equations cannot be solved")
     return Marginal(adjustment, layout, observed, optimum, cofactors(optimum, layout, cross=cross))
 
 
 @checked_arguments()
 def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
-    """Return the adjustment carried into another datum by an S-transformation, without adjusting again.
+    """Transform an adjustment into another datum by an S-transformation, without adjusting again.
 
-    The result is that of `adjust` in this datum with the adjusted coordinates as approximate values: they
-    stay, residuals, tests and all that does not depend on the datum stay, and the covariance changes.
+    `adjust` in this datum, with the adjusted coordinates as approximate values, gives the same result. The
+    coordinates, residuals, tests and all else that is independent of the datum stay. Only the covariance
+    changes.
 
     Args:
-        adjustment: what `adjust` returned.
-        datum: free or minimal, on all points or on some, by name, index or mask; or only its kind.
+        adjustment: result of `adjust`.
+        datum: free or minimal, on all points or on some given by name, index or mask; or only its kind.
 
     Raises:
-        GeometryError: a change between control and a datum without, unknown points, or points that cannot
-            carry the datum.
+        GeometryError: a change between a datum with control and one without, unknown points, or points that
+            cannot carry the datum.
 
     Example:
         >>> import sfm
@@ -250,13 +259,13 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
 
 @checked_arguments()
 def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation) -> Adjustment:
-    """Return the adjustment with a covariance that knows that errors of neighbouring image points agree.
+    """Return the adjustment with a covariance for correlated errors of neighbouring image points.
 
-    The estimate stays, which is that of independent errors; residuals and tests stay, too.
+    The estimate is still that for independent errors. Residuals and tests do not change either.
 
     Args:
-        adjustment: what `adjust` returned.
-        correlation: of the errors, as `estimate_error_correlation` finds it in the residuals.
+        adjustment: result of `adjust`.
+        correlation: correlation of the errors, such as `estimate_error_correlation` finds in the residuals.
 
     Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.2.
     """
@@ -266,15 +275,19 @@ def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation
 
 
 def _with_covariance(m: Marginal) -> Adjustment:
-    """Return the adjustment with the covariance in the datum of its marginal."""
+    """Return the adjustment with the covariance in the datum of the marginal."""
     independent = None if m.correlated is None else m.of_independent_errors()
     return replace(m.adjustment, covariance=m.covariance(), independent=independent)
 
 
 def determines_cameras(marginal: Marginal) -> bool:
-    """Return whether a network knows its cameras as well as linear propagation needs.
+    """Return whether a network determines its cameras well enough for linear error propagation.
 
-    That is by how much the free parameters, one standard deviation off together, move its image points.
+    The criterion is how far a joint error of one standard deviation in the free parameters moves image
+    points.
+
+    Args:
+        marginal: adjustment with its normal equations.
     """
     a, none = marginal.adjustment, np.zeros(0, dtype=np.int64)
     seen = a.network.image_points.select(~a.rejected)
@@ -299,18 +312,22 @@ def determines_cameras(marginal: Marginal) -> bool:
 
 
 @dataclass(frozen=True)
-class Local:
-    """A network to compute with, and the way back to the coordinates and order of another."""
+class LocalNetwork:
+    """A network prepared for computing, with its relation to the given network."""
 
     network: Network
     estimate: Estimate
     datum: ResolvedDatum
-    given: Network  # the other one
-    centroid: FloatArray  # by which its coordinates are reduced, (3,)
-    order: IntArray | None  # its points in the order here, None if that is the same, (n,)
+    given: Network
+    centroid: FloatArray  # subtracted from the coordinates of the given network, object unit, (3,)
+    order: IntArray | None  # given points in the order of this network, None if unchanged, (n,)
 
     def back(self, result: Adjustment) -> Adjustment:
-        """Return an adjustment of this network as one of the other."""
+        """Convert an adjustment of this network to one of the given network.
+
+        Args:
+            result: adjustment of this network.
+        """
         if self.order is not None:
             place = np.argsort(self.order)
             covariance = result.covariance
@@ -330,8 +347,14 @@ class Local:
         return replace(result, network=self.given, estimate=estimate)
 
 
-def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Local:
-    """Return a network, its start values and its datum as they are best computed with."""
+def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> LocalNetwork:
+    """Prepare a network for computing: reduce its coordinates and sort its points where that pays.
+
+    Args:
+        network: the given network.
+        estimate: its start values.
+        datum: its datum.
+    """
     centroid = centroid_of(network, estimate)
     local, start = network, estimate
     if centroid.any():
@@ -340,14 +363,14 @@ def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Loca
     if len(network.points) >= MIN_SORTED_POINTS:
         order = along_curve(start.points)
         local, start, datum = _renumbered(local, start, datum, order)
-    return Local(local, start, datum, network, centroid, order)
+    return LocalNetwork(local, start, datum, network, centroid, order)
 
 
 def along_curve(points: FloatArray) -> IntArray:
-    """Return the order of points along Morton's curve, those without coordinates last.
+    """Return the order of points along Morton's curve, points without coordinates last.
 
     Args:
-        points: object points, NaN where there is none, shape (n, 3).
+        points: object points, NaN where unknown, shape (n, 3).
     """
     known = np.isfinite(points).all(axis=1)
     key = np.full(len(points), np.iinfo(np.int64).max)
@@ -365,7 +388,7 @@ def along_curve(points: FloatArray) -> IntArray:
 def _renumbered(
     network: Network, estimate: Estimate, datum: ResolvedDatum, order: IntArray
 ) -> tuple[Network, Estimate, ResolvedDatum]:
-    """Return them with the points in another order."""
+    """Return network, estimate and datum with the points in another order."""
     place = np.argsort(order)
     renumbered = replace(
         network,
@@ -381,11 +404,11 @@ def _renumbered(
 
 
 def centroid_of(network: Network, estimate: Estimate) -> FloatArray:
-    """Return by how much to shift a network, 0 in each axis in which its origin is near, (3,).
+    """Return the centroid to subtract from a network, 0 in each axis in which the origin is near, (3,).
 
     Args:
-        network: gives the control.
-        estimate: gives all other points and the projection centres; NaN where there are none.
+        network: network with the control.
+        estimate: all other points and the projection centres; NaN where unknown.
     """
     control = network.control.xyz
     xyz = np.concatenate([estimate.points, estimate.position, control])
@@ -393,16 +416,22 @@ def centroid_of(network: Network, estimate: Estimate) -> FloatArray:
     if len(known) == 0:
         return np.zeros(3)
     low, high = known.min(axis=0), known.max(axis=0)
-    if max(high.max(), -low.min()) <= MAX_EXTENTS * (high - low).max() / 2:  # the extent is at least that
+    if max(high.max(), -low.min()) <= MAX_EXTENTS * (high - low).max() / 2:  # a lower bound of the extent
         return np.zeros(3)
     centre = np.median(known, axis=0)
     extent = np.abs(known - centre).max()
-    # Far from the origin x - c is exact for all x between c / 2 and 2 c (Sterbenz), so is giving it back.
+    # Far from the origin x - c is exact for all x between c / 2 and 2 c (Sterbenz), and so is its reversal.
     return np.where(np.abs(centre) > MAX_EXTENTS * extent, centre, 0.0)
 
 
 def shifted(network: Network, estimate: Estimate, by: FloatArray) -> tuple[Network, Estimate]:
-    """Return a network and an estimate with all object coordinates changed by a shift, object unit, (3,)."""
+    """Shift all object coordinates of a network and an estimate.
+
+    Args:
+        network: the network.
+        estimate: its estimate.
+        by: shift, object unit, (3,).
+    """
     moved = replace(
         network,
         control=network.control.shifted(by),

@@ -1,19 +1,19 @@
-"""Datum: which points define position, attitude and scale; free motions and their constraints.
+"""Datum: the points that define position, attitude and scale, with free motions and datum constraints.
 
-The normal equations of image points alone do not change when the whole network is shifted, turned or scaled.
-`free_motions` gives these null vectors H; what is fixed or observed takes some away. A datum is a matrix B
-with B' dx = 0 and B'H regular, and any solution is carried into it by S = I - H (B'H)^-1 B' without a new
-adjustment.
+The normal equations of image points alone do not change when the whole network is shifted, rotated or scaled.
+`free_motions` gives the null vectors H of these motions; fixed and observed values remove some of them. A
+datum is a matrix B with B' dx = 0 and B'H regular. The matrix S = I - H (B'H)^-1 B' transforms any solution
+into it without a new adjustment.
 
-Other null vectors are brought into the datum too. Two networks without a
-common point, a photograph with a single point, a principal distance that looks like another height: the
-normal equations leave more open than the datum knows of. Where such a null vector moves object points that
-carry the datum, the datum fixes it as it fixes the motions, by an inner constraint on these points, so that
-two networks have a free datum each. Where it moves none, it is fixed by an inner constraint on the scaled
-reduced unknowns. So the result does not depend on how a solver has held them.
+Normal equations can have further null vectors that no motion explains. Examples are two networks without a
+common point, a photograph with a single point, or a principal distance that acts like another height. If such
+a null vector moves object points that carry the datum, the datum fixes it like the motions, by an inner
+constraint on these points. Two separate networks thus get a free datum each. If it moves none of these
+points, it is fixed by an inner constraint on the scaled reduced unknowns. The result therefore does not
+depend on how the solver held the null vectors.
 
-A point without an accepted ray, or with parallel ones, carries no datum; the directions that are open stay
-where they are, whatever the rest does.
+A point without accepted rays, or with parallel rays, carries no datum. Its open directions keep their values,
+whatever the rest of the network does.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3; Baarda (1973), S-transformations and
 criterion matrices; Papo and Perelmuter (1980); Foerstner and Wrobel (2016), sec. 4.5.
@@ -38,13 +38,13 @@ from sfm.errors import GeometryError
 from sfm.kernels.compiling import kernel
 from sfm.network import Network
 
-MIN_CARRIERS = 3  # points that fix position, attitude and scale
-# Share of the largest component of a null vector from which it leaves a parameter open.
+MIN_CARRIERS = 3  # points needed to fix position, attitude and scale
+# Share of the largest component of a null vector from which a parameter counts as open.
 MIN_LEADING_SHARE = 0.1
-# |A dx| of the points that carry the datum from which a null vector of length 1 moves them.
+# |A dx| of the points that carry the datum from which a null vector of length 1 is said to move them.
 MIN_DATUM_EFFECT = 1e-6
 TINY = float(np.finfo(float).tiny)
-SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 but for rounding
+SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 except for rounding
 MIN_EFFECT = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 KINDS = ("free", "minimal", "control")
 
@@ -53,16 +53,16 @@ class ResolvedDatum(NamedTuple):
     """A datum on the points of one network."""
 
     kind: str  # free | minimal | control
-    points: BoolArray | None  # which object points carry it, all if None, (n,)
+    points: BoolArray | None  # which object points carry the datum, all if None, (n,)
 
 
 @dataclass(frozen=True)
 class Datum:
-    """How position, attitude and scale of the network are decided.
+    """The definition of position, attitude and scale of a network.
 
-    free: inner constraints on object points, control is ignored; minimal: as many fixed coordinates as
-    needed; control: the network's control points, fixed or weighted. Scale bars, observed exterior and
-    interior orientation take part in every kind, and the datum adds only what they leave open.
+    free: inner constraints on object points, ignoring control; minimal: the smallest number of fixed
+    coordinates; control: the network's control points, fixed or weighted. Scale bars, observed exterior and
+    interior orientation take part in every kind. The datum fixes only what they leave open.
 
     Example:
         >>> import sfm
@@ -82,10 +82,10 @@ class Datum:
         """Return the datum with its points as a mask.
 
         Args:
-            network: whose points are named.
+            network: network that contains the points.
 
         Raises:
-            GeometryError: a point that is not in the network, or no point.
+            GeometryError: a point is not in the network, or no points are given.
         """
         if self.points is None:
             return ResolvedDatum(self.kind, None)
@@ -117,17 +117,17 @@ class Datum:
 
 @dataclass(frozen=True)
 class Motions:
-    """Null vectors H of the normal equations and datum constraints B, split as the unknowns are.
+    """Null vectors H of the normal equations and datum constraints B, split like the unknowns.
 
-    Columns are the motions and, behind them, further null vectors that no motion explains.
+    The columns are the motions, followed by further null vectors that no motion explains.
     """
 
     reduced: FloatArray  # H of the reduced unknowns, (reduced, d)
     points: FloatArray  # H of the object points, (n, 3, d)
     constraints: FloatArray  # B of the object points, (n, 3, d)
-    on_reduced: FloatArray  # B of the reduced unknowns where no free point can carry it, (reduced, d)
+    on_reduced: FloatArray  # B of the reduced unknowns, used where no free point can carry it, (reduced, d)
     inverse: FloatArray  # (B'H)^-1, (d, d)
-    further: int = 0  # how many of the columns are further null vectors
+    further: int = 0  # number of columns that are further null vectors
 
     @property
     def defect(self) -> int:
@@ -135,19 +135,24 @@ class Motions:
         return len(self.inverse) - self.further
 
     def orthonormal(self, scale: FloatArray) -> FloatArray:
-        """Return a basis of the motions of the reduced unknowns over their scales, (reduced, d).
+        """Return an orthonormal basis of the motions of the scaled reduced unknowns, (reduced, d).
 
         Args:
-            scale: of each unknown, (reduced,).
+            scale: divisor of each unknown, (reduced,).
         """
         H = self.reduced[:, : self.defect] / scale[:, None]
         if not 0 < H.shape[1] <= len(H):
             return np.asarray(np.linalg.qr(H)[0])
-        reflections, tau, _, _ = dgeqrf(H)  # as numpy's qr does, which takes four times as long to call
+        reflections, tau, _, _ = dgeqrf(H)  # numpy's qr does the same, but a call takes four times as long
         return np.ascontiguousarray(dorgqr(reflections, tau)[0])
 
     def transform(self, reduced: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return steps (reduced, e), (n, 3, e), or one (reduced,), (n, 3), carried into the datum: S dx."""
+        """Transform steps into the datum: S dx.
+
+        Args:
+            reduced: steps of the reduced unknowns, (reduced, e) or (reduced,).
+            points: steps of the object points, (n, 3, e) or (n, 3).
+        """
         d = len(self.inverse)
         if d == 0:
             return reduced, points
@@ -160,12 +165,12 @@ class Motions:
 def motions_of(
     layout: Unknowns, observed: tuple[ObservedKind, ...], state: State, datum: ResolvedDatum
 ) -> Motions:
-    """Return the motions that the observations leave open and the constraints that the datum puts on them.
+    """Return the motions that the observations leave open, and the datum constraints that fix them.
 
     Args:
         layout: order of the unknowns.
-        observed: observations beside image points.
-        state: where the motions are taken; lengths are scaled by the size of the network.
+        observed: observations other than image points.
+        state: values at which the motions are evaluated; lengths are scaled by the size of the network.
         datum: kind and points.
 
     Raises:
@@ -179,7 +184,7 @@ def motions_of(
     H[layout.kept_start :] = points[layout.kept].reshape(-1, 7)
     seen = _seen_by_datum(layout, observed, state, H, mounts[~mounted & layout.rigged], points)
     if len(seen):
-        # U would have a column for every row, of which control alone brings three a point
+        # without the full U, which would have a column for every row, three per control point
         _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
         rank = int((singular > MIN_EFFECT * max(1.0, singular[0])).sum())
         open_motions = Vt[rank:].T
@@ -216,7 +221,12 @@ def motions_of(
 
 
 def carriers(layout: Unknowns, datum: ResolvedDatum) -> BoolArray:
-    """Return which object points carry the datum, (n,)."""
+    """Return which object points carry the datum, (n,).
+
+    Args:
+        layout: order of the unknowns.
+        datum: kind and points.
+    """
     free: BoolArray = np.asarray(layout.point_free.any(axis=1))
     return free if datum.points is None else free & datum.points
 
@@ -224,9 +234,15 @@ def carriers(layout: Unknowns, datum: ResolvedDatum) -> BoolArray:
 def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the seven similarity motions as changes of poses, mounts and points.
 
-    Of X, w of poses and of mounts, (poses, 6, 7) and (a, 6, 7), and of X of points, (n, 3, 7). Shifts, turns
-    and scale are about the centre of the network, the latter two over its size, so that all seven are of the
-    same order.
+    Rotations and scale refer to the centre of the network and are divided by its size, so that all seven
+    motions are of the same order.
+
+    Args:
+        layout: order of the unknowns.
+        state: values at which the motions are evaluated.
+
+    Returns:
+        Changes of X, w of poses (poses, 6, 7), of X, w of mounts (a, 6, 7), and of X of points (n, 3, 7).
     """
     centre, size = _extent(layout, state)
     poses, points = np.zeros((len(state.rig_from_object), 6, 7)), np.zeros((len(state.points), 3, 7))
@@ -239,16 +255,16 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
 
 
 def _extent(layout: Unknowns, state: State) -> tuple[FloatArray, float]:
-    """Return centre and size of the points that take part."""
+    """Return centre and size of the points that take part in the adjustment."""
     cloud = state.points[layout.point_on]
     centre = cloud.sum(axis=0) / len(cloud)
-    # root mean square distance from the centre, as `mean_distance`
+    # root mean square distance from the centre, as in `mean_distance`
     return centre, max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
 
 
 @kernel
 def _fill_motions(xyz: FloatArray, centre: FloatArray, size: float, motions: FloatArray) -> None:
-    """Fill the motions of points (n, 3 or more, 7) by `similarity_motions`; the unknown ones only shift."""
+    """Fill the `similarity_motions` of points, (n, 3 or more, 7); points without coordinates only shift."""
     for i in range(len(xyz)):
         known = np.isfinite(xyz[i, 0]) and np.isfinite(xyz[i, 1]) and np.isfinite(xyz[i, 2])
         x = (xyz[i, 0] - centre[0]) / size if known else 0.0
@@ -261,9 +277,14 @@ def _fill_motions(xyz: FloatArray, centre: FloatArray, size: float, motions: Flo
 
 
 def minimal_coordinates(motions: FloatArray, points: FloatArray, on: BoolArray) -> FloatArray:
-    """Return which coordinates (indices into the flat n x 3) carry a minimal datum.
+    """Return the coordinates that carry a minimal datum, as indices into the flattened n x 3 coordinates.
 
-    They are taken from three points far apart, by pivoting, so that B'H is as regular as it can be.
+    They belong to three points far apart. Pivoting selects them so that B'H is well conditioned.
+
+    Args:
+        motions: motions of the flattened coordinates, (3 n, d).
+        points: object points, (n, 3).
+        on: which points may carry the datum, (n,).
     """
     index = np.flatnonzero(on)
     X = points[index]
@@ -295,7 +316,7 @@ def _seen_by_datum(
     fixed_mounts: FloatArray,
     points: FloatArray,
 ) -> FloatArray:
-    """Return what each motion does to fixed and observed unknowns and to observations, one row for each."""
+    """Return the effect of the motions on fixed unknowns and observations, one row for each, (rows, 7)."""
     if layout.all_free and not observed:
         return np.zeros((0, 7))
     pose_on = np.zeros(len(layout.pose_free), dtype=bool)
@@ -325,11 +346,11 @@ def _seen_by_datum(
 
 
 def on_sound_points(datum: ResolvedDatum, held: IntArray) -> ResolvedDatum:
-    """Return a datum without the object points of which directions are held, if enough others carry it.
+    """Return the datum without object points that have held directions, if enough other points carry it.
 
     Args:
         datum: kind and points.
-        held: how many directions of each object point are held, (n,).
+        held: number of held directions of each object point, (n,).
     """
     if not held.any():
         return datum
@@ -338,7 +359,11 @@ def on_sound_points(datum: ResolvedDatum, held: IntArray) -> ResolvedDatum:
 
 
 def leading(vectors: FloatArray) -> BoolArray:
-    """Return the unknowns that each null vector leaves open, (reduced, e), of scaled ones (reduced, e)."""
+    """Return which unknowns each null vector leaves open, (reduced, e).
+
+    Args:
+        vectors: null vectors of the scaled unknowns, (reduced, e).
+    """
     size = np.abs(vectors)
     return np.asarray(size >= MIN_LEADING_SHARE * size.max(axis=0, keepdims=True, initial=0.0))
 
@@ -349,11 +374,11 @@ def with_further(
     """Return the motions with further null vectors and the constraints on them.
 
     Args:
-        motions: null vectors that the datum explains.
-        further: those it does not explain, scaled, orthonormal, (reduced, e).
-        equations: normal equations that have them.
+        motions: null vectors that are motions, with the datum constraints on them.
+        further: further null vectors, scaled and orthonormal, (reduced, e).
+        equations: normal equations with these null vectors.
         layout: order of the unknowns.
-        datum: kind and sound points; but for a minimal one all constraints on points are inner ones.
+        datum: kind and sound points; constraints on points are inner ones, except in a minimal datum.
     """
     if further.shape[1] == 0 and not equations.blocks.held.any():
         return motions
@@ -376,7 +401,7 @@ def with_further(
     on_points[on, :, :carried] = moved[on, :, :carried]
     on_reduced[:, carried:] = N[:, carried:] / scale**2
     on_points[..., :carried] /= np.sqrt((on_points[..., :carried] ** 2).sum(axis=(0, 1)))
-    # N meets the constraints on the motions: B'H of all together is block triangular
+    # N meets the constraints on the motions, so B'H of all columns is block triangular
     inverse = np.linalg.inv(_product(on_points, on_reduced, moved, N))
     across = _product(on_points, on_reduced, motions.points, motions.reduced)
     d, e = len(motions.inverse), len(inverse)
@@ -395,7 +420,7 @@ def with_further(
 
 
 def _moved_points(N: FloatArray, equations: Equations, layout: Unknowns) -> FloatArray:
-    """Return what null vectors of the reduced unknowns do to the object points, (n, 3, e)."""
+    """Return the displacements of object points by null vectors N of the reduced unknowns, (n, 3, e)."""
     moved = np.empty((*layout.point_free.shape, N.shape[1]))
     times_reduced(layout.observations, equations.blocks, np.ascontiguousarray(N), moved)
     moved = -solve_transposed(equations.blocks.L, moved)

@@ -15,75 +15,78 @@ from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
 from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
-# Of an image coordinate. Computed ones are exact to some 1e-15 of themselves, and to 1e-10 where errors of
-# control strain their network; measured ones to 1e-7 at best.
+# Relative rounding of an image coordinate. Computed coordinates are exact to about 1e-15, or to 1e-10 if
+# errors of control strain their network; measured coordinates are exact to 1e-7 at best.
 ROUNDING = 1e-9
-MOTIONS = 7  # position, attitude and scale: what image points leave open
-# Standard deviation of an image coordinate that no measurement beats: targets reach 1/100 px, computed images
-# 1/1000. Beside larger weights, control and bars of a usual survey would be lost in rounding. Source: Luhmann
-# et al. (2020), Close-Range Photogrammetry, sec. 5.4.2.
+MOTIONS = 7  # position, attitude and scale, which image points leave open
+# Standard deviation of an image coordinate that no measurement surpasses: targets reach 1/100 px, computed
+# images 1/1000 px. With larger weights, control and bars of a usual survey would vanish in rounding. Source:
+# Luhmann et al. (2020), Close-Range Photogrammetry, sec. 5.4.2.
 MIN_SIGMA_PX = 1e-3
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """Marginal covariance of the unknowns, scaled by sigma0^2 a posteriori, in the datum adjusted in."""
+    """Marginal covariance of the unknowns in the datum of the adjustment, scaled by a posteriori sigma0^2."""
 
-    points: FloatArray  # of X, Y, Z of each object point, object unit^2, (n, 3, 3)
-    exterior: FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (m, 6, 6)
-    interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order; the variance of one
-    # that is not determined is infinite, (f, f)
-    points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
-    rigs: FloatArray = field(
-        default_factory=lambda: np.zeros((0, 0))
-    )  # of `interior` of all cameras and then
-    # X, Y, Z (object unit), omega, phi, kappa (rad) of each in its rig, together; none without rigs, (s, s)
+    points: FloatArray  # X, Y, Z of each object point, object unit^2, (n, 3, 3)
+    exterior: FloatArray  # X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (m, 6, 6)
+    # of the free parameters of each camera, in order; infinite variance if not determined, (f, f)
+    interior: tuple[FloatArray, ...]
+    points_limiting: FloatArray  # object points with cameras held fixed, object unit^2, (n, 3, 3)
+    # joint, of `interior` of all cameras, then X, Y, Z (object unit), omega, phi, kappa (rad) of each camera
+    # in its rig; empty without rigs, (s, s)
+    rigs: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def mounts(self) -> FloatArray:
-        """Covariance of X, Y, Z, omega, phi, kappa of each camera in its rig; 0 of references, (a, 6, 6)."""
+        """Covariance of X, Y, Z, omega, phi, kappa of each camera in its rig; 0 for references, (a, 6, 6)."""
         return mount_blocks(self.rigs, sum(map(len, self.interior)))
 
 
 @dataclass(frozen=True)
 class ErrorCorrelation:
-    """Errors of image points that neighbours in a photograph have in common, and those that each has alone.
+    """Errors of image points, split into an independent part and a part common to neighbours in a photograph.
 
-    Each alone has `alone` times its variance a posteriori. Common errors move neighbours by as many
-    px, precise ones and others, x and y alike: their covariance in one photograph is
-    `common` exp(-d / length_px) at distance d.
+    The independent part has `alone` times the a posteriori variance of each image point. The common part
+    moves neighbours by the same number of px, whatever their precision, in x and in y. At distance d, its
+    covariance in one photograph is `common` exp(-d / length_px).
     """
 
-    alone: float  # variance over that a posteriori
-    common: float  # over sigma0_px^2, that of a usual image point
-    length_px: float  # distance at which the common part has fallen to 1/e
+    alone: float  # variance of the independent part over the a posteriori variance
+    common: float  # variance of the common part over sigma0_px^2, that of a usual image point
+    length_px: float  # distance at which the covariance of the common part has fallen to 1/e
 
     def sigmas_px(self, sigma0_px: float) -> tuple[float, float]:
-        """Return the standard deviations of what an image coordinate has alone and of the common part, px."""
+        """Return the standard deviations of the independent and the common part of an image coordinate, px.
+
+        Args:
+            sigma0_px: a posteriori standard deviation of a usual image coordinate, px.
+        """
         return self.alone**0.5 * sigma0_px, self.common**0.5 * sigma0_px
 
 
 @dataclass(frozen=True)
 class ObservedResiduals:
-    """Residuals of the observations of one kind beside image points that took part in an adjustment."""
+    """Residuals of the observations of one kind, other than image points, that took part in an adjustment."""
 
-    index: int  # of their kind among `Network.kinds`
-    rows: IntArray  # which of its observations took part, (n,)
+    index: int  # index of the kind in `Network.kinds`
+    rows: IntArray  # rows of the observations that took part, (n,)
     difference: FloatArray  # computed minus observed, (n, d)
     redundancy_numbers: FloatArray  # 0 to 1; NaN where a component was not observed, (n, d)
-    standardised: FloatArray  # Baarda's w for sigma0 = 1; NaN where a component has no check, (n, d)
-    count: int  # scalar observations
+    standardised: FloatArray  # Baarda's w for sigma0 = 1; NaN where a component is not checked, (n, d)
+    count: int  # number of scalar observations
     vPv: float
-    redundancy: float  # of all of them; NaN without covariance
+    redundancy: float  # total redundancy; NaN without covariance
 
 
 class GroupParameters(NamedTuple):
-    """Parameters that a group of observations finds, such as an additive constant or the tip of a probe."""
+    """Parameters that a group of observations determines, such as an additive constant or a probe tip."""
 
     group: str
     names: tuple[str, ...]  # (h,)
     value: FloatArray  # object unit, (h,)
-    covariance: FloatArray  # infinite variances where they are not determined, (h, h)
+    covariance: FloatArray  # infinite variances where not determined, (h, h)
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,43 +100,45 @@ class Adjustment:
         ('free', np.False_, (20, 3, 3))
     """
 
-    network: Network  # as stated, rejected image points included
+    network: Network  # network as given, including rejected image points
     estimate: Estimate  # adjusted interior and exterior orientation and points
     converged: bool  # whether the criterion of convergence was met
-    iterations: int  # steps taken
+    iterations: int  # number of steps
     datum: str  # free | minimal | control
-    defect: int  # rank defect of the normal equations without datum, found numerically
-    expected_defect: int  # the defect that the kind of datum leaves to it
+    defect: int  # rank defect of the normal equations without datum, determined numerically
+    expected_defect: int  # defect that the datum is expected to fix
     undetermined: tuple[str, ...]  # parameters that cannot be determined, in words; empty if none
-    residuals: FloatArray  # v = computed - measured, px, pixel frame, rejected ones included, (k, 2)
+    residuals: FloatArray  # v = computed - measured, px, pixel frame, including rejected ones, (k, 2)
     rejected: BoolArray  # image points that took no part, (k,)
-    redundancy_numbers: FloatArray  # of each image coordinate, 0 to 1; NaN where rejected, (k, 2)
+    redundancy_numbers: FloatArray  # one per image coordinate, 0 to 1; NaN where rejected, (k, 2)
     sigma_px: float  # a priori standard deviation of unit weight, px
-    sigma0: float  # a posteriori over a priori standard deviation of unit weight, `inflation` included
+    sigma0: float  # a posteriori over a priori standard deviation of unit weight, including `inflation`
     redundancy: int  # observations and constraints minus unknowns
-    unknowns: int  # all adjusted parameters
-    observations: int  # scalar observations used: image coordinates and those of other kinds
+    unknowns: int  # number of adjusted parameters
+    observations: int  # number of scalar observations used: image coordinates and other kinds
     covariance: Covariance
-    standardised: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # Baarda's w of each image
-    # coordinate, v over its a priori standard deviation; of rejected ones as predicted, (k, 2)
-    residual_weights: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # diagonal of P Qvv P of
-    # each image point, Qvv the cofactors of its residual; NaN where rejected, px^-2, (k, 2)
-    weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
-    # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
-
-    inflation: float = 1.0  # of standard deviations by an M-estimator, over those that v'Pv with its weights
-    # gives; see `robust.inflation`; 1 with least squares
-    observed: tuple[ObservedResiduals, ...] = ()  # residuals of the observations beside image points
-    image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))  # by which the stated standard
-    # deviations of each image point were multiplied for its weight, (k,)
+    # Baarda's w of each image coordinate, v over its a priori standard deviation; predicted for rejected
+    # image points, (k, 2)
+    standardised: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    # diagonal of P Qvv P of each image point, with the cofactors Qvv of its residual; NaN where rejected,
+    # px^-2, (k, 2)
+    residual_weights: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    # factor on the weight of each image point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
+    weights: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # factor of an M-estimator on the standard deviations that follow from v'Pv with its weights, see
+    # `robust.inflation`; 1 with least squares
+    inflation: float = 1.0
+    observed: tuple[ObservedResiduals, ...] = ()  # residuals of observations other than image points
+    # factor on the stated standard deviations of each image point for its weight, (k,)
+    image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
-    unknown_counts: tuple[int, int, int] = (0, 0, 0)  # of exterior orientation, interior orientation, points
-    test_alpha: float = 0.001  # probability with which the test that was applied rejects a good image
-    # coordinate; Baarda's usual one where none was
-    start_sigma0: float = float("nan")  # as sigma0, at the start values
-    remarks: tuple[Remark, ...] = ()  # what of the robust test could not be carried through
-    error_correlation: ErrorCorrelation | None = None  # of neighbours, that the covariance has in it
-    independent: Covariance | None = None  # covariance without that correlation, None where there is none
+    unknown_counts: tuple[int, int, int] = (0, 0, 0)  # exterior orientation, interior orientation, points
+    # probability that the applied test rejects a good image coordinate; Baarda's usual value without a test
+    test_alpha: float = 0.001
+    start_sigma0: float = float("nan")  # sigma0 at the start values
+    remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
+    error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
+    independent: Covariance | None = None  # covariance without that correlation, None without correlation
 
     @cached_property
     def solution(self) -> Solution:
@@ -159,7 +164,7 @@ class Adjustment:
 
     @property
     def group_parameters(self) -> tuple[GroupParameters, ...]:
-        """Parameters of groups of observations that a survey is made to find, with their covariance."""
+        """Parameters of groups of observations that are results of a survey, with their covariance."""
         found: list[GroupParameters] = []
         for group in self.network.observations:
             if isinstance(group, Group) and group.reported and len(group):
@@ -172,18 +177,18 @@ class Adjustment:
 
     @property
     def has_scale(self) -> bool:
-        """Whether lengths are in the object unit: from what was given, or placed on control."""
+        """Whether lengths are in the object unit: from given values, or by placement on control."""
         given = self.datum == "control" or self.expected_defect < MOTIONS or len(self.network.scale_bars) > 0
         return given or len(self.network.control) >= 2
 
     @property
     def vPv(self) -> float:
-        """Weighted sum of squared residuals of all observations, a priori unit weight."""
+        """Weighted sum of squared residuals of all observations, with a priori unit weight."""
         return (self.sigma0 / self.inflation) ** 2 * self.redundancy
 
     @property
     def cofactors(self) -> Covariance:
-        """Covariance of independent errors for sigma0 = 1, which the weights of the adjustment mean."""
+        """Covariance of independent errors for sigma0 = 1, as implied by the weights of the adjustment."""
         c, unit = self.covariance if self.independent is None else self.independent, self.sigma0**2
         return Covariance(
             c.points / unit,
@@ -200,7 +205,7 @@ class Adjustment:
 
     @property
     def steps(self) -> str:
-        """How many iterations there were, in words; the start values of a survey are adjusted already."""
+        """Number of iterations, in words; start values of a survey are already adjusted."""
         return (
             counted(self.iterations, "iteration")
             if self.iterations
@@ -209,12 +214,12 @@ class Adjustment:
 
     @property
     def tau(self) -> FloatArray:
-        """Pope's tau of each image coordinate: Baarda's w over their sigma0 a posteriori, (k, 2)."""
+        """Pope's tau of each image coordinate: Baarda's w over the a posteriori sigma0, (k, 2)."""
         return self.standardised / self.image_sigma0
 
     @property
     def image_sigma0(self) -> float:
-        """As sigma0, of the image points by themselves: the stated precision of others has no effect."""
+        """Sigma0 from the image points alone, on which the stated precision of other kinds has no effect."""
         used, r = ~self.rejected, float(np.nansum(self.redundancy_numbers))
         if not r > 0:
             return self.sigma0
@@ -224,38 +229,38 @@ class Adjustment:
 
     @property
     def image_covariance(self) -> FloatArray:
-        """Covariance by which image points were weighted, stated times factor squared, px^2, (k, 2, 2)."""
+        """Covariance used to weight image points: stated covariance times squared factor, px^2, (k, 2, 2)."""
         return scaled_covariance(self.network.image_points.covariance, self.image_sigma_factor)
 
     @property
     def weight_factor(self) -> float:
-        """Factor on the stated standard deviations of the image points, the median where it differs."""
+        """Factor on the stated standard deviations of the image points; the median if factors differ."""
         return float(np.median(self.image_sigma_factor))
 
     @property
     def sigma0_px(self) -> float:
-        """A posteriori standard deviation of an image coordinate, the median of the accepted, px."""
+        """A posteriori standard deviation of an accepted image coordinate, median, px."""
         return self.sigma0 * self.usual_px
 
     @property
     def usual_px(self) -> float:
-        """A priori standard deviation of an image coordinate, the median of the accepted, px."""
+        """A priori standard deviation of an accepted image coordinate, median, px."""
         return _median_sigma(self.image_covariance[~self.rejected])
 
     @property
     def stated_px(self) -> float:
-        """Stated standard deviation of an image coordinate, the median of the accepted, px."""
+        """Stated standard deviation of an accepted image coordinate, median, px."""
         return _median_sigma(self.network.image_points.covariance[~self.rejected])
 
     @property
     def rms_px(self) -> float:
-        """Root mean square residual per coordinate over the accepted image points, px."""
+        """Root mean square residual per coordinate of the accepted image points, px."""
         used = self.residuals[~self.rejected]
         return float((used**2).mean() ** 0.5)
 
     @property
     def is_exact(self) -> bool:
-        """Whether the accepted residuals are rounding: of image points without noise, which test nothing."""
+        """Whether the accepted residuals are mere rounding, as for image points without noise."""
         return bool(self.rms_px <= ROUNDING * np.abs(self.network.image_points.xy).max())
 
     @property
@@ -267,7 +272,7 @@ class Adjustment:
     def interior_sigma(self, camera: int) -> FloatArray:
         """Return the standard deviation of each parameter of a camera, (p,).
 
-        It is NaN for those not adjusted, and infinite for those that are not determined.
+        It is NaN for parameters that were not adjusted, and infinite for parameters that are not determined.
         """
         free = np.flatnonzero(self.estimate.cameras[camera].free)
         sigma = np.full(len(self.estimate.cameras[camera].free), np.nan)
@@ -294,12 +299,17 @@ class Adjustment:
 
 
 def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
-    """Return covariances (k, 2, 2) of standard deviations multiplied by a factor of each, (k,)."""
+    """Return covariances after multiplying standard deviations by a factor.
+
+    Args:
+        covariance: covariances, (k, 2, 2).
+        sigma_factor: factor on the standard deviations of each, (k,).
+    """
     return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
 
 
 def _median_sigma(covariance: FloatArray) -> float:
-    """Return that of a coordinate, NaN of none: a few image points of little weight do not change it."""
+    """Return the median sigma of a coordinate, on which a few low weights have no effect; NaN if empty."""
     if not len(covariance):
         return float("nan")
     return float((np.median(np.trace(covariance, axis1=1, axis2=2)) / 2) ** 0.5)

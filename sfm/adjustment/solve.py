@@ -1,7 +1,8 @@
-"""Adjustment of a network by least squares: its solution, statistics and covariance from start values.
+"""Bundle adjustment of a network: solution, statistics and covariance from start values.
 
-Unified least squares on the collinearity equations with self-calibration; gross errors by iterative
-data snooping; rank defect found numerically; nothing is damped where the result is taken.
+`adjust` applies unified least squares to the collinearity equations, with self-calibration. It finds gross
+errors by iterative data snooping or robust estimation, and determines the rank defect numerically. The final
+normal equations are undamped. `predict` gives the same statistics for a planned network.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import Local, local_of
+from sfm.adjustment.covariance import LocalNetwork, local_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.cofactors import (
     Cofactors,
@@ -57,7 +58,7 @@ from sfm.remarks.remark import Remark, remark
 
 FREE = Datum("free")
 MIN_HOLD = 0.01  # largest weight of the image points of a photograph below which none of them fits
-SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
+SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # derivatives of psi of the M-estimators
 
 
 @checked_arguments()
@@ -79,27 +80,29 @@ def adjust(
 ) -> Adjustment:
     """Return the least-squares adjustment of a network.
 
-    Weights are the inverse covariances of the observations. Which interior parameters are free is
-    stated by the cameras of the estimate.
+    Weights are the inverse covariances of the observations. The cameras of the estimate state which interior
+    parameters are free.
 
     Args:
-        network: what was measured.
-        estimate: start values; NaN where a photograph or point has none (it is held out and named).
-        datum: how position, attitude and scale are decided; or only its kind.
-        sigma_px: standard deviation of unit weight, px; weights are stated by the network, so that it changes
-            sigma0 and not sigma0_px.
-        image_sigma_factor: on the stated standard deviations of the image points, of all or of each, (k,);
-            the network of the result keeps those stated.
-        reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
-            from Huber's start, rejects what it gives weight 0) or "none".
-        alpha: probability with which the test of one image coordinate rejects a good one.
-        rejected: image points that data snooping begins without, as those that it rejected before, (k,);
-            they return where they pass the test. The other ways to reject begin with all.
-        method: "gauss-newton" (line search) or "levenberg-marquardt" (ends in undamped Gauss-Newton).
-        max_iterations: steps at most, in each round of the robust test.
+        network: the measurements.
+        estimate: start values; a photograph or point without one (NaN) takes no part and is reported.
+        datum: definition of position, attitude and scale; or only its kind.
+        sigma_px: standard deviation of unit weight, px. The network states the weights, so this changes
+            sigma0 but not sigma0_px.
+        image_sigma_factor: factor on the stated standard deviations of the image points, one number or (k,).
+            The network of the result keeps the stated ones.
+        reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight starts
+            from Huber's result and rejects image points with weight 0) or "none".
+        alpha: probability that the test of one image coordinate rejects a good one.
+        rejected: image points that data snooping leaves out at the start, such as those rejected before,
+            (k,).
+            They return if they pass the test. The other options of `reject` start with all image points.
+        method: "gauss-newton" (line search) or "levenberg-marquardt" (ends with undamped Gauss-Newton).
+        max_iterations: largest number of steps in each round of the robust test.
         tolerance: |A dx| / |v| at which the iteration has converged.
-        covariance: whether covariance and redundancy numbers are wanted; NaN otherwise.
-        redundancy_numbers: whether they and standardised residuals are wanted beside the covariance.
+        covariance: whether to compute covariance and redundancy numbers; they are NaN otherwise.
+        redundancy_numbers: whether to compute redundancy numbers and standardised residuals, if there is a
+            covariance.
 
     Raises:
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
@@ -148,15 +151,15 @@ def adjust(
 def predict(
     network: Network, estimate: Estimate, *, datum: Datum | str = FREE, sigma_px: float = 0.1
 ) -> Adjustment:
-    """Return what an adjustment of a planned network will give: its covariance, redundancy and rank.
+    """Predict the covariance, redundancy and rank of a planned network.
 
-    Nothing is adjusted. Covariances are those of sigma0 = 1, that is of the standard deviations that the
-    network states; residuals are 0 up to rounding where the image points are projected ones.
+    Nothing is adjusted. Covariances refer to sigma0 = 1, that is, to the standard deviations stated by the
+    network. Residuals are 0 up to rounding if the image points are projected ones.
 
     Args:
         network: the planned image points with their standard deviations, scale bars and control.
-        estimate: the plan: cameras, exterior orientation and points.
-        datum: as of `adjust`.
+        estimate: the planned cameras, exterior orientations and points.
+        datum: definition of position, attitude and scale; or only its kind.
         sigma_px: standard deviation of unit weight, px.
 
     Raises:
@@ -189,7 +192,7 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
     """Return which image points are given as rejected, (k,).
 
     Raises:
-        GeometryError: not one truth value for each, or none is left.
+        GeometryError: the mask has another shape, or rejects all image points.
     """
     if rejected is None:
         return np.zeros(k, dtype=bool)
@@ -203,7 +206,7 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
 
 
 def _without_weight(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:
-    """Return the remark on photographs of small robust weights only: it converges wherever they are."""
+    """Return the remark on photographs with small robust weights only, whose orientation is arbitrary."""
     seen = layout.active
     image = layout.observations.image
     largest = np.zeros(len(network.images))
@@ -218,14 +221,14 @@ def _without_weight(layout: Unknowns, weight: FloatArray, network: Network) -> t
 
 
 def _level_of(reject: str, alpha: float, usual: float) -> float:
-    """Return the probability with which a good image coordinate is rejected; the usual one if none is."""
+    """Return the probability that a good image coordinate is rejected; the usual one without rejection."""
     if reject == "tukey":
         return float(2 * normal_sf(TUKEY))
     return alpha if reject == "tau" else usual
 
 
 def _result(
-    local: Local,
+    local: LocalNetwork,
     run: Run,
     optimum: Optimum,
     weight: FloatArray,
@@ -233,11 +236,12 @@ def _result(
     sigma_px: float,
     slopes: Callable[[FloatArray], FloatArray] | None,
     *,
-    sigma0: float | None = None,  # in place of the one a posteriori
+    sigma0: float | None = None,  # used instead of the a posteriori value
 ) -> Adjustment:
+    """Return the adjustment with statistics at an optimum; without cofactors Q, covariances are NaN."""
     layout, network, estimate = run.problem.layout, local.network, local.estimate
     of_control = run.problem.datum.kind == "control"
-    allowed = 0 if of_control else 7  # motions: control is meant to fix all of them
+    allowed = 0 if of_control else 7  # motions; control is expected to fix all of them
     defect = rank_defect(optimum, layout)
     undetermined = undetermined_of(optimum, layout, network, estimate, weight, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
@@ -253,7 +257,7 @@ def _result(
         )  # fmt: skip
         sigma0 *= factor
     k, n, m = len(weight), len(network.points), len(network.images)
-    back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
+    back = np.empty(k, dtype=np.int64)  # position of each image point of the network in the layout
     back[layout.order] = np.arange(k)
     numbers = standardised = residual_weight = np.full((k, 2), np.nan)
     if Q is None:
@@ -267,7 +271,7 @@ def _result(
         result = without_held(result, layout, optimum)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
-        # that of image points whose photograph nothing determines overflows, if it is far enough away
+        # it can overflow for image points of a photograph that nothing determines
         complement[~np.isfinite(complement).all(axis=(1, 2))] = np.nan
         numbers = numbers_of(complement, layout.observations.whitening)
         numbers[weight == 0] = np.nan

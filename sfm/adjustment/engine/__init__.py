@@ -1,7 +1,13 @@
-"""How a network is adjusted; in the order of use.
+"""Engine of the bundle adjustment.
 
-`unknowns` lays out what is solved for, `observed` what was observed beside image points; `collinearity` is
-the formula of one image point, `accumulate` sums it into `normals` in the order of `ordering`; `iterate` goes
-to the optimum with one of `solvers`; `cofactors` are the covariance there, `correlated` that of image points
-with errors in common. The null vectors that the datum fixes are in `sfm.adjustment.datum`.
+The modules in the order of use:
+
+- `unknowns`: order of the unknowns; `observed`: observations other than image points.
+- `collinearity`: observation equation of one image point.
+- `accumulate`: its sums over all image points, which form the `normals`.
+- `ordering`: order in which the solvers eliminate the poses.
+- `iterate`: iteration to the optimum with one of the `solvers`.
+- `cofactors`: covariance at the optimum; `correlated`: the same for image points with errors in common.
+
+The null vectors that the datum fixes are in `sfm.adjustment.datum`.
 """

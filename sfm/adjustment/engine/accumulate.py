@@ -1,8 +1,8 @@
 """Kernels that sum the normal equations of all image points, photograph by photograph, then point by point.
 
-With the derivatives A = (X0, w | interior) and B = (X, Y, Z) of an image point, weighted, and its residual r,
-a photograph adds (A r)'(A r) of all its image points in one product, and each image point W' = B'A, V = B'B
-and B'r to its object point. No Jacobian of more than one photograph is stored.
+An image point has weighted derivatives A = (X0, w | interior) and B = (X, Y, Z) and a residual r. A
+photograph adds (A r)'(A r) of all its image points in one product. Each image point adds W' = B'A, V = B'B
+and B'r to its object point. The Jacobian of only one photograph is stored at a time.
 
 Source: Brown (1976), Photogramm. Eng. Remote Sens. 42(8); Foerstner and Wrobel (2016), sec. 15.2.
 """
@@ -17,39 +17,39 @@ from sfm.adjustment.engine.collinearity import Observations, State, Workspace, c
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled, inlined, kernel
 
-SINGULAR_PIVOT = 1e-13  # share of the normal equation of a point left below which its rays are parallel
-STIFFENING = 1e10  # factor on the pivot that fixes such a direction of a point
-RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
+SINGULAR_PIVOT = 1e-13  # ratio of a pivot of a point to its diagonal term below which its rays are parallel
+STIFFENING = 1e10  # factor on the pivot that holds such a direction of a point
+RESIDUAL = 6  # column of the residual in A: X0, w, residual, interior
 
 
 class Blocks(NamedTuple):
-    """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
+    """Blocks of the normal equations that one pass over the image points fills; f = free ones per camera."""
 
-    U: FloatArray  # X0, w of each pose by themselves, (poses, 6, 6)
-    C: FloatArray  # X0, w of the pose of each photograph by the free parameters of its camera, (m, 6, f)
-    D: FloatArray  # free parameters of each camera by themselves, (a, f, f)
-    g: FloatArray  # right side of X0, w of each pose, (poses, 6)
-    gi: FloatArray  # right side of the free parameters of each camera, (a, f)
+    U: FloatArray  # X0, w of each pose, (poses, 6, 6)
+    C: FloatArray  # X0, w of the pose of each photograph x free parameters of its camera, (m, 6, f)
+    D: FloatArray  # free parameters of each camera, (a, f, f)
+    g: FloatArray  # right-hand side of X0, w of each pose, (poses, 6)
+    gi: FloatArray  # right-hand side of the free parameters of each camera, (a, f)
     V: FloatArray  # object points before elimination, (n, 3, 3)
-    gp: FloatArray  # right side of object points, (n, 3)
+    gp: FloatArray  # right-hand side of object points, (n, 3)
     L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
     y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
-    Y: FloatArray  # Y' of each image point by X0, w of its pose; 0 for kept points, (k, 3, 6)
-    Y_interior: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
-    Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
-    K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
-    held: IntArray  # how many directions of each point had to be held, (n,)
+    Y: FloatArray  # Y' of each image point, for X0, w of its pose; 0 for kept points, (k, 3, 6)
+    Y_interior: FloatArray  # Y' of each object point, for all interior unknowns; 0 for kept points, (n, 3, i)
+    Yy: FloatArray  # Y y, which is subtracted from the right-hand side, (reduced,)
+    K: FloatArray  # kept points x all reduced unknowns, (3 s, reduced)
+    held: IntArray  # number of directions of each point that had to be held, (n,)
     order: IntArray  # image points, photograph by photograph, (k,)
-    first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
+    first: IntArray  # index in `order` of the first image point of each photograph, and the end, (m + 1,)
 
 
 class Sums(NamedTuple):
-    """Sums over some photographs, as in `Blocks`, and space for one of them."""
+    """Sums over some photographs, as in `Blocks`, and work space for one photograph."""
 
-    first: int  # photograph
-    end: int  # photograph behind the last
-    U: FloatArray  # of each photograph; that of the blocks itself without rigs, (m, 6, 6)
-    g: FloatArray  # the same, (m, 6)
+    first: int  # first photograph
+    end: int  # photograph after the last
+    U: FloatArray  # U of each photograph; without rigs, the U of the blocks, (m, 6, 6)
+    g: FloatArray  # likewise, (m, 6)
     D: FloatArray
     gi: FloatArray
     V: FloatArray
@@ -74,13 +74,13 @@ def add_photographs(
         observations: image points.
         state: values of all parameters.
         weight: factor on the weight of each image point, (k,).
-        pose_free: (poses, 6).
-        workspace: of one image point.
-        sums: which photographs, and the sums that they add to.
-        blocks: of the photographs.
+        pose_free: which unknowns of each pose are free, (poses, 6).
+        workspace: work space for one image point.
+        sums: the range of photographs, and the sums that they add to.
+        blocks: the blocks to fill.
 
     Returns:
-        Their v'Pv, infinite with a point behind the camera.
+        v'Pv of these photographs, infinite if a point is behind the camera.
     """
     sums.D[:] = 0.0
     sums.gi[:] = 0.0
@@ -107,9 +107,9 @@ def _derivatives(
     A: FloatArray,
     blocks: Blocks,
 ) -> int:
-    """Fill two rows of A and B for each image point of photograph i that takes part.
+    """Fill two rows of A for each image point of photograph i that takes part.
 
-    Returns how many these are, made negative where one is behind the camera.
+    Return the number of these image points, negative if one is behind the camera.
     """
     a = observations.camera[i]
     rays, in_front = 0, True
@@ -133,7 +133,7 @@ def _derivatives(
 def _add_photograph(
     i: int, a: int, f: int, pose: int, N: FloatArray, pose_free: BoolArray, sums: Sums, blocks: Blocks
 ) -> None:
-    """Share out the sum (A r)'(A r) of photograph i; fixed unknowns keep their place with derivatives 0."""
+    """Distribute the sum (A r)'(A r) of photograph i; fixed unknowns keep their rows, with derivatives 0."""
     for p in range(6):
         on = 1.0 if pose_free[pose, p] else 0.0
         for q in range(6):
@@ -158,7 +158,7 @@ def _add_to_points(
     sums: Sums,
     blocks: Blocks,
 ) -> None:
-    """Add B'B, B'r, W' of the image points of photograph i; B = -A of the projection centre."""
+    """Add B'B, B'r and W' of the image points of photograph i; B is -A of the projection centre."""
     a = observations.camera[i]
     f = observations.free_count[a]
     first = 6 * observations.poses
@@ -202,7 +202,14 @@ def _add_to_points(
 
 @kernel
 def sum_poses(observations: Observations, pose_free: BoolArray, sums: Sums, blocks: Blocks) -> None:
-    """Sum U and g of the photographs of each pose; fixed unknowns keep their place."""
+    """Sum U and g of the photographs of each pose; fixed unknowns keep their rows.
+
+    Args:
+        observations: image points.
+        pose_free: which unknowns of each pose are free, (poses, 6).
+        sums: U and g of each photograph.
+        blocks: receive the sums.
+    """
     blocks.U[:] = 0.0
     blocks.g[:] = 0.0
     for i in range(len(observations.pose_of)):
@@ -231,10 +238,10 @@ def eliminate_points(
     Args:
         observations: image points.
         point_free: free coordinates, (n, 3).
-        slot: place of each object point among the kept ones, -1 for the others, (n,).
+        slot: index of each object point among the kept points, -1 for the others, (n,).
         kept_start: column of the first kept point.
-        stretch: factor on the diagonal of V (Marquardt), 1 for the truth.
-        blocks: what is filled.
+        stretch: factor on the diagonal of V (Marquardt), 1 without damping.
+        blocks: the blocks to fill.
     """
     blocks.Yy[:] = 0.0
     for j in range(len(slot)):
@@ -286,7 +293,7 @@ def _keep(j: int, row: int, observations: Observations, kept_start: int, blocks:
 
 @inlined
 def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
-    """Factor V, its diagonal times stretch, with directions that rays leave open held; how many these are."""
+    """Factor V with its diagonal times `stretch`; return the number of open directions, which are held."""
     held = 0
     for p in range(3):
         pivot = V[j, p, p] * stretch
@@ -308,7 +315,7 @@ def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
 
 @inlined
 def _forward(j: int, L: FloatArray, y: FloatArray, W: FloatArray, Yy: FloatArray, column: int) -> None:
-    """Replace some columns of the three rows W' of point j by L^-1 W' and add their part of Y y."""
+    """Replace columns of the three rows W' of point j by L^-1 W', and add their part of Y y."""
     i0, i1, i2 = 1.0 / L[j, 0, 0], 1.0 / L[j, 1, 1], 1.0 / L[j, 2, 2]
     l10, l20, l21 = L[j, 1, 0], L[j, 2, 0], L[j, 2, 1]
     for q in range(W.shape[1]):
@@ -323,7 +330,15 @@ def _forward(j: int, L: FloatArray, y: FloatArray, W: FloatArray, Yy: FloatArray
 def gather_interior(
     observations: Observations, blocks: Blocks, border: FloatArray, corner: FloatArray, g: FloatArray
 ) -> None:
-    """Write the blocks of photographs and cameras into border, corner and right side."""
+    """Write the blocks of photographs and cameras into the border, the corner and the right-hand side.
+
+    Args:
+        observations: image points.
+        blocks: filled blocks.
+        border: poses x interior unknowns, (6 poses, i).
+        corner: interior unknowns, (i, i).
+        g: right-hand side, (reduced,).
+    """
     first = 6 * observations.poses
     for i in range(observations.poses):
         for p in range(6):

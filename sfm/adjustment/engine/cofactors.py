@@ -1,8 +1,8 @@
 """Marginal covariance of points, exterior and interior orientation from the reduced system.
 
-The cofactor of the reduced unknowns is S^-1; points follow without the inverse of the whole:
+The cofactor matrix of the reduced unknowns is S^-1. Points follow without the inverse of the full system:
 Q_pp = L^-T (I + Y' S^-1 Y) L^-1 and Q_cp = -S^-1 Y L^-1. Any datum follows by S-transformation,
-Q <- S Q S' with S = I - H (B'H)^-1 B', block by block. The limiting precision, cameras fixed, is V^-1.
+Q <- S Q S' with S = I - H (B'H)^-1 B', block by block. The limiting precision, with fixed cameras, is V^-1.
 
 Source: Foerstner and Wrobel (2016), sec. 15.2.5 and 4.5; limiting precision: Fraser (1987),
 Photogramm. Eng. Remote Sens. 53(5).
@@ -25,28 +25,28 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.compiling import kernel
 from sfm.observations.pose import exterior_jacobian
 
-# Variance over its limiting value below which a coordinate is one that the datum fixes.
+# Ratio of a variance to its limiting value below which the datum fixes the coordinate.
 MAX_FIXED_VARIANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class Cofactors:
-    """Cofactor matrices (covariance for sigma0 = 1) in the datum of the adjustment, and what makes more."""
+    """Cofactor matrices (covariance for sigma0 = 1) in any datum, and the terms of the S-transformation."""
 
-    exterior: FloatArray  # of X0, w of each pose, any datum, (poses, 6, 6)
-    border: FloatArray  # of interior unknowns, mounts and kept points, any datum, (i + 3 s, i + 3 s)
-    mixed: FloatArray  # of poses by border unknowns, any datum, (6 poses, i + 3 s)
-    points: FloatArray  # of each object point, any datum, (n, 3, 3)
-    limiting: FloatArray  # of each object point with the cameras fixed, (n, 3, 3)
-    cross: FloatArray  # of the object point by the pose of each image point, any datum, (k, 3, 6)
-    cross_border: FloatArray  # of each object point by the border, any datum, (n, 3, i + 3 s)
+    exterior: FloatArray  # X0 and w of each pose, any datum, (poses, 6, 6)
+    border: FloatArray  # interior unknowns, mounts and kept points, any datum, (i + 3 s, i + 3 s)
+    mixed: FloatArray  # poses x border unknowns, any datum, (6 poses, i + 3 s)
+    points: FloatArray  # each object point, any datum, (n, 3, 3)
+    limiting: FloatArray  # each object point with the cameras held fixed, (n, 3, 3)
+    cross: FloatArray  # object point x pose of each image point, any datum, (k, 3, 6)
+    cross_border: FloatArray  # each object point x border, any datum, (n, 3, i + 3 s)
     F_reduced: FloatArray  # (B'H)^-1 B'Q of the reduced unknowns, (d, reduced)
-    F_points: FloatArray  # the same of object points, (n, d, 3)
+    F_points: FloatArray  # likewise of object points, (n, d, 3)
     G: FloatArray  # (B'H)^-1 B'QB (H'B)^-1, (d, d)
 
     @property
     def has_cross(self) -> bool:
-        """Whether those between points and photographs are there."""
+        """Whether cofactors between points and photographs were computed."""
         return len(self.cross) > 0
 
 
@@ -56,7 +56,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
-        cross: whether those between points and photographs are wanted; empty otherwise.
+        cross: whether to compute cofactors between points and photographs; they are empty otherwise.
     """
     b = optimum.equations.blocks
     q = optimum.factor.inverse(b, cross=cross)
@@ -66,7 +66,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     for s, j in enumerate(layout.kept):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         points[j] = q.border[at, at]
-        # a point that lost all its rays to the test has no precision by rays; it is held as others are
+        # a kept point may have lost all its rays to the test; its limiting precision is then undefined
         limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
     mask = layout.point_free.astype(float)
     points *= mask[:, :, None] * mask[:, None, :]
@@ -84,8 +84,8 @@ def marginal_covariance(
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
-        cofactors: of the same.
-        variance: sigma0^2 a posteriori.
+        cofactors: cofactors at the optimum.
+        variance: a posteriori sigma0^2.
     """
     H, P = optimum.motions.reduced, optimum.motions.points
     F, G = cofactors.F_reduced, cofactors.G
@@ -99,7 +99,7 @@ def marginal_covariance(
     columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
     T = exterior_jacobian(optimum.state.M) @ J
     exterior = _in_datum(_of_photographs(cofactors, columns), H[columns], np.moveaxis(F[:, columns], 1, 0), G)
-    with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing determines
+    with np.errstate(over="ignore", invalid="ignore"):  # undetermined photographs overflow
         exterior = T @ exterior @ np.swapaxes(T, 1, 2)
     interior = []
     for of_camera in layout.interior_column:
@@ -125,19 +125,19 @@ def hat_complement(
 ) -> FloatArray:
     """Return I - A Q A' of every image point in whitened coordinates, independent of the datum.
 
-    For an image point without weight it is I + A Q A', the cofactor of its predicted residual.
+    For an image point without weight the result is I + A Q A', the cofactor of its predicted residual.
 
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
-        cofactors: of the same, those between points and photographs included.
+        cofactors: cofactors at the optimum, including those between points and photographs.
         weight: factor on the weight of each image point, shape (k,).
 
     Returns:
         Cofactors of the whitened residuals, shape (k, 2, 2); NaN behind the camera.
     """
     Q, workspace, out = cofactors, new_workspace(), np.empty((len(weight), 2, 2))
-    # one layout whatever the parameters, so that one compiled form serves every network
+    # the same memory layout for all networks, so that one compiled form serves all
     mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
     border, points = np.ascontiguousarray(Q.border), np.ascontiguousarray(Q.points)
     count = 3 + workspace.A.shape[1]
@@ -149,13 +149,13 @@ def hat_complement(
 
 
 def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> Covariance:
-    """Return the covariance without what is not determined.
+    """Return the covariance with everything undetermined marked.
 
-    NaN marks photographs and points that took no part or have open directions. A parameter of interior
-    orientation that a null vector leaves open has an infinite variance and no covariances: no datum fixes it.
+    NaN marks photographs and points that took no part or have open directions. An interior parameter that a
+    null vector leaves open gets an infinite variance and no covariances, because no datum fixes it.
 
     Args:
-        covariance: of all photographs and points.
+        covariance: covariance of all photographs and points.
         layout: order of the unknowns.
         optimum: undamped normal equations, in which directions that the rays leave open were held.
     """
@@ -187,7 +187,7 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
 
 
 def _of_photographs(cofactors: Cofactors, columns: IntArray) -> FloatArray:
-    """Return the cofactors of the unknowns of each photograph: of its pose and its mount, (m, u, u)."""
+    """Return the cofactors of the unknowns of each photograph, its pose and its mount, (m, u, u)."""
     pose = columns[:, 0] // 6
     poses_alone = cofactors.exterior[pose]
     if columns.shape[1] == 6:
@@ -210,7 +210,10 @@ def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> Flo
 def _datum_terms(
     optimum: Optimum, layout: Unknowns, limiting: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return (B'H)^-1 B'Q and (B'H)^-1 B'QB (H'B)^-1; kept points appear in B of the points only."""
+    """Return (B'H)^-1 B'Q of reduced unknowns and points, and (B'H)^-1 B'QB (H'B)^-1.
+
+    In B of the motions, kept points appear among the points only.
+    """
     motions, b = optimum.motions, optimum.equations.blocks
     n, d = len(b.L), len(motions.inverse)
     B = motions.constraints
@@ -235,7 +238,7 @@ def _datum_terms(
 
 
 def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q_pc = -L^-T Y'S^-1 of each image point and of each object point by the border."""
+    """Return Q_pc = -L^-T Y'S^-1 of each image point x its pose, and of each object point x the border."""
     if len(q.YQ) == 0:
         return q.YQ, q.YQ_border
     point, first = layout.observations.point, 6 * len(q.exterior)
@@ -277,7 +280,7 @@ def _complement(
     Q: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Fill I - J Q J' of each image point, J and Q of its unknowns: pose, X, free ones of its camera."""
+    """Fill I - J Q J' of each image point; J and Q belong to its pose, X and free camera parameters."""
     first = 6 * observations.poses
     for o in range(len(observations.image)):
         i, j = observations.pose[o], observations.point[o]

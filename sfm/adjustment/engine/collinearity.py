@@ -2,8 +2,8 @@
 
     (U, V, W) = M (X - X0),  u = -U/W,  v = -V/W,  r = model(u, v, p) - measured
 
-The unknowns of a photograph are its projection centre X0 and a small rotation w in its image
-axes, R <- R exp([w]x), so that d(U, V, W)/dw = [(U, V, W)]x and no angle is singular.
+The unknowns of a photograph are its projection centre X0 and a small rotation w in its image axes,
+R <- R exp([w]x). Then d(U, V, W)/dw = [(U, V, W)]x, and no angle becomes singular.
 
 Source: Kraus, Photogrammetry (2007), sec. 5.3; small rotations as in Foerstner and Wrobel (2016),
 sec. 8.1 and 12.2.
@@ -23,7 +23,7 @@ CAMERA_UNKNOWNS = MAX_PARAMETERS + 6  # interior parameters and the mount of a c
 
 
 class Observations(NamedTuple):
-    """Image points in the order of their object points, as compiled code takes them."""
+    """Image points in the order of their object points, in the form that compiled code uses."""
 
     start: IntArray  # first image point of each object point, and the end, (n + 1,)
     image: IntArray  # photograph of each image point, (k,)
@@ -31,33 +31,33 @@ class Observations(NamedTuple):
     xy: FloatArray  # measured pixel, px, (k, 2)
     whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
     camera: IntArray  # camera of each photograph, (m,)
-    pose: IntArray  # pose of each image point: that of its photograph or of its rig, (k,)
+    pose: IntArray  # pose of each image point, that of its photograph or of its rig, (k,)
     pose_of: IntArray  # pose of each photograph, (m,)
-    poses: int  # how many there are
-    mounted: BoolArray  # cameras whose pose is that of a rig, beside its reference camera, (a,)
+    poses: int  # number of poses
+    mounted: BoolArray  # cameras of rigs other than the reference cameras, (a,)
     model: IntArray  # number of the distortion model of each camera, (a,)
     frame: FloatArray  # centre (px), pixel size (mm), planes of residuals and affinity of each camera, (a, 6)
-    interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
-    free_count: IntArray  # how many parameters of each camera and of its mount are free, (a,)
-    free_index: IntArray  # which they are, those of the mount from MAX_PARAMETERS on, (a, CAMERA_UNKNOWNS)
+    interior: IntArray  # number of parameters in the model of each camera, 0 if none is free, (a,)
+    free_count: IntArray  # number of free parameters of each camera and its mount, (a,)
+    free_index: IntArray  # their indices; those of the mount start at MAX_PARAMETERS, (a, CAMERA_UNKNOWNS)
     free_column: IntArray  # their columns among the reduced unknowns, (a, CAMERA_UNKNOWNS)
 
 
 class State(NamedTuple):
-    """Values of all parameters, as compiled code takes them."""
+    """Values of all parameters, in the form that compiled code uses."""
 
     position: FloatArray  # X0, (m, 3)
     M: FloatArray  # object to image axes, (m, 3, 3)
     parameters: FloatArray  # interior orientation, (a, MAX_PARAMETERS)
     points: FloatArray  # X, (n, 3)
     pose_position: FloatArray  # X0 of each pose; the same array as `position` without rigs, (poses, 3)
-    rig_from_object: FloatArray  # object axes to those of each pose, (poses, 3, 3)
+    rig_from_object: FloatArray  # object axes to the axes of each pose, (poses, 3, 3)
     mount_position: FloatArray  # X0 of each camera in the axes of its rig, (a, 3)
-    camera_from_rig: FloatArray  # axes of the rig to those of each camera, (a, 3, 3)
+    camera_from_rig: FloatArray  # rig axes to the image axes of each camera, (a, 3, 3)
 
 
 class Workspace(NamedTuple):
-    """Space of one image point for the compiled functions."""
+    """Work space for one image point in compiled functions."""
 
     r: FloatArray  # weighted residual, (2,)
     Ju: FloatArray  # d r / d (u, v), px, (2, 2)
@@ -69,7 +69,7 @@ class Workspace(NamedTuple):
 
 @inlined
 def new_workspace() -> Workspace:
-    """Return space for one image point."""
+    """Return a work space for one image point."""
     return Workspace(
         np.empty(2),
         np.empty((2, 2)),
@@ -83,7 +83,15 @@ def new_workspace() -> Workspace:
 def collinearity(
     o: int, observations: Observations, state: State, weight: float, workspace: Workspace
 ) -> bool:
-    """Fill the weighted residual and derivatives of image point o; False if it is behind the camera."""
+    """Fill the weighted residual and derivatives of image point o; False if it is behind the camera.
+
+    Args:
+        o: index of the image point.
+        observations: image points.
+        state: values of all parameters.
+        weight: factor on the weight of the image point.
+        workspace: receives residual and derivatives.
+    """
     i, j = observations.image[o], observations.point[o]
     a = observations.camera[i]
     m00, m01, m02 = state.M[i, 0, 0], state.M[i, 0, 1], state.M[i, 0, 2]
@@ -136,7 +144,7 @@ def collinearity(
     workspace.A[0, 3], workspace.A[1, 3] = xV * W - xW * V, yV * W - yW * V
     workspace.A[0, 4], workspace.A[1, 4] = xW * U - xU * W, yW * U - yU * W
     workspace.A[0, 5], workspace.A[1, 5] = xU * V - xV * U, yU * V - yV * U
-    for s in range(observations.interior[a]):  # all, not only free ones: gathering them here would cost more
+    for s in range(observations.interior[a]):  # all parameters: selecting the free ones here would cost more
         workspace.A[0, 6 + s] = f00 * workspace.Jp[0, s]
         workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
     if observations.mounted[a]:
@@ -147,7 +155,7 @@ def collinearity(
 
 @inlined
 def _of_rig(a: int, pose: int, state: State, A: FloatArray) -> None:
-    """Turn derivatives by X0, w of a photograph into those by its pose, X_p, w_p, and by its mount, X, w_a.
+    """Convert derivatives by X0, w of a photograph to derivatives by its pose X_p, w_p and its mount X, w_a.
 
     X0 = X_p + R_p X and R = R_p R_a, so that dX0 = dX_p - R_p [X]x w_p + R_p dX and w = R_a' w_p + w_a.
     """
@@ -167,12 +175,23 @@ def _of_rig(a: int, pose: int, state: State, A: FloatArray) -> None:
 
 
 def sum_of_squares(observations: Observations, state: State, weight: FloatArray) -> float:
-    """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
+    """Return v'Pv of the image points; infinite if one with weight > 0 lies behind its camera.
+
+    Args:
+        observations: image points.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, (k,).
+    """
     return float(_residuals(observations, state, weight, np.empty((0, 2))))
 
 
 def residuals(observations: Observations, state: State) -> FloatArray:
-    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
+    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera.
+
+    Args:
+        observations: image points.
+        state: values of all parameters.
+    """
     v = np.empty((len(observations.image), 2))
     _residuals(observations, state, np.ones(len(v)), v)
     return v
@@ -180,7 +199,7 @@ def residuals(observations: Observations, state: State) -> FloatArray:
 
 @compiled
 def _residuals(observations: Observations, state: State, weight: FloatArray, v: FloatArray) -> float:
-    """Return v'Pv and write the residuals into v unless it is empty (one kernel: compiling takes seconds)."""
+    """Return v'Pv and fill v with residuals unless it is empty; one kernel, as compiling takes seconds."""
     workspace = new_workspace()
     wanted = len(v) > 0
     total = 0.0
@@ -223,11 +242,16 @@ def _residual(o: int, observations: Observations, state: State, workspace: Works
         workspace.Jp,
     )
     in_front: bool = W < 0.0
-    return in_front  # one way out: with an early return the compiler keeps the unused derivatives
+    return in_front  # a single exit: with an early return the compiler keeps the unused derivatives
 
 
 def behind_camera(observations: Observations, state: State) -> BoolArray:
-    """Return which image points belong to object points behind their camera or undetermined, (k,)."""
+    """Return which image points belong to object points that are behind the camera or undetermined, (k,).
+
+    Args:
+        observations: image points.
+        state: values of all parameters.
+    """
     behind = np.empty(len(observations.image), dtype=np.bool_)
     _behind(observations, state, behind)
     return behind

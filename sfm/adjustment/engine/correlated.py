@@ -1,15 +1,16 @@
-"""Influence of image points on the unknowns, and covariance where neighbouring errors correlate.
+"""Influence of image points on the unknowns, and covariance with correlated errors of neighbouring points.
 
-Least squares with weights of independent errors stays unbiased where the errors of a photograph are
-correlated, but is less precise than its cofactors show. With the influence Z of the errors e on the unknowns,
-dx = Z'e, and their covariance sigma0^2 R, the covariance is sigma0^2 Z'R Z; with R = I it is the usual one.
-R has what each image point has alone, in units of its standard deviation, and what a photograph does to
-neighbours alike, in px: whitened, it is the larger the more precise an image point is.
+Least squares with weights for independent errors stays unbiased if the errors in a photograph are correlated,
+but it is less precise than its cofactors show. Errors e move the unknowns by dx = Z'e with the influence Z.
+If the errors have the covariance sigma0^2 R, the unknowns have sigma0^2 Z'R Z; R = I gives the usual
+covariance. R has two parts: the independent error of each image point, in units of its standard deviation,
+and an error common to neighbours in a photograph, in px. After whitening, the common part is larger for more
+precise image points.
 
-The adjustment as a linear function of the errors of its image points, at the optimum. With the whitened
-derivatives A (reduced unknowns) and B (eliminated object points), errors e of the image points, in units of
-their standard deviations, move the unknowns by dx = Q M e with M = A' - W V^-1 B', W = A'B and V = B'B with
-what is observed of points, and each point by V^-1 (B'e - W'dx).
+At the optimum the adjustment is a linear function of the errors. With the whitened derivatives A (reduced
+unknowns) and B (eliminated object points), errors e in units of their standard deviations move the reduced
+unknowns by dx = Q M e. Here M = A' - W V^-1 B', W = A'B, and V is B'B plus the observations of points. Each
+point moves by V^-1 (B'e - W'dx).
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.6 and 3.2;
 covariance function: Moritz (1980), Advanced Physical Geodesy, sec. 22; Foerstner and Wrobel (2016), sec. 4.2
@@ -42,22 +43,25 @@ from sfm.kernels.compiling import kernel
 from sfm.network import rows_of
 from sfm.observations.pose import exterior_jacobian
 
+POINTS_AT_ONCE = 2000
+BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time
+
 
 @dataclass(frozen=True)
 class Linearised:
-    """Whitened derivatives of all image points, in the order of the layout, and the factor at the optimum."""
+    """Whitened derivatives of all image points in the order of the layout, and the factor at the optimum."""
 
     layout: Unknowns
     factor: Factor
-    A: csr_matrix  # by reduced unknowns, (2k, reduced)
-    B: csr_matrix  # by eliminated points, (2k, 3n)
-    V_inverse: csr_matrix  # of eliminated points, (3n, 3n)
-    by_ray: FloatArray  # d X / d errors of each ray, (B V^-1), cameras fixed; 0 for kept points, (k, 2, 3)
+    A: csr_matrix  # derivatives by reduced unknowns, (2k, reduced)
+    B: csr_matrix  # derivatives by eliminated points, (2k, 3n)
+    V_inverse: csr_matrix  # V^-1 of the eliminated points, (3n, 3n)
+    by_ray: FloatArray  # B V^-1, d X / d errors of each ray with fixed cameras; 0 for kept points, (k, 2, 3)
     whitening: FloatArray  # F of each image point with F'F its weight, 1/px, (k, 2, 2)
 
     @property
     def through(self) -> csr_matrix:
-        """W V^-1: what a reduced unknown takes from the points, (reduced, 3n)."""
+        """W V^-1: effect of the points on the reduced unknowns, (reduced, 3n)."""
         return self.A.T @ self.B @ self.V_inverse
 
     def cofactor(self) -> FloatArray:
@@ -65,30 +69,26 @@ class Linearised:
         return self.solve(np.eye(self.layout.reduced))
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the reduced unknowns of right sides of their normal equations, (reduced, e)."""
+        """Solve the reduced normal equations for some right-hand sides, (reduced, e)."""
         free = self.layout.reduced_free()[:, None]
         return self.factor.solve(right * free) * free
 
     def residuals(self, errors: FloatArray) -> FloatArray:
-        """Return the residuals that errors of the image points leave, whitened, both (2k, e)."""
+        """Return the whitened residuals caused by whitened errors of image points, both (2k, e)."""
         of_points = self.B.T @ errors
         dx = self.solve(self.A.T @ (errors - self.B @ (self.V_inverse @ of_points)))
         moved = self.A @ dx
         return np.asarray(errors - moved - self.B @ (self.V_inverse @ (of_points - self.B.T @ moved)))
 
 
-POINTS_AT_ONCE = 2000
-BYTES_AT_ONCE = 16_000_000  # of the correlations of some image points with all others of a photograph
-
-
 @dataclass(frozen=True)
 class Influence:
-    """How the errors of image points move the unknowns of an adjustment in its datum."""
+    """Effect of errors of image points on the unknowns of an adjustment, in its datum."""
 
     linear: Linearised
-    through: csc_matrix  # what the object points take from the reduced unknowns, (reduced, 3n)
-    of_datum: FloatArray  # parameters of the datum by the object points, (n, 3, d)
-    unknowns: FloatArray  # reduced unknowns and parameters of the datum of both, (reduced + d, reduced + d)
+    through: csc_matrix  # effect of the reduced unknowns on the object points, transposed, (reduced, 3n)
+    of_datum: FloatArray  # datum parameters by the object points, (n, 3, d)
+    unknowns: FloatArray  # reduced unknowns and datum parameters by their scores, (reduced + d, reduced + d)
     H: FloatArray  # motions of the reduced unknowns, (reduced, d)
     H_points: FloatArray  # motions of the object points, (3n, d)
 
@@ -108,10 +108,10 @@ class Influence:
         return Z
 
     def scores_of(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
-        """Return which of `unknowns` some image points reach, and their scores, (k, 2, columns).
+        """Return the columns of `unknowns` that image points affect, and their scores, (k, 2, columns).
 
-        Scores are the right side of the reduced normal equations and of the datum, by errors. Of all image
-        points they would take more memory than all else of an adjustment.
+        Scores are the derivatives, by errors, of the right-hand side of the reduced normal equations and the
+        datum. Scores of all image points would take more memory than the rest of the adjustment.
         """
         both = (2 * rows[:, None] + np.arange(2)).ravel()
         scores, reduced = self.linear.A[both] - self.linear.B[both] @ self.through.T, len(self.H)
@@ -121,20 +121,20 @@ class Influence:
         return columns, np.concatenate([S, self._scores_of_datum(rows)], axis=2)
 
     def _scores_of_datum(self, rows: IntArray) -> FloatArray:
-        """Return what moves the datum by itself, by the errors of some image points, (k, 2, d)."""
+        """Return the derivatives of the datum parameters by the errors of some image points, (k, 2, d)."""
         return self.linear.by_ray[rows] @ self.of_datum[self.linear.layout.observations.point[rows]]
 
     def of_reduced(self) -> FloatArray:
-        """Return the reduced unknowns in the datum by those in any and its parameters."""
+        """Return the matrix that gives the reduced unknowns in the datum, (reduced + d, reduced)."""
         return np.vstack([np.eye(len(self.H)), -self.H.T])
 
     def of_points(self, rows: IntArray) -> FloatArray:
-        """Return the same of some coordinates of object points, without their errors."""
+        """Return the same matrix for some coordinates of points, without the direct effect of their rays."""
         return np.vstack([-self.through[:, rows].toarray(), -self.H_points[rows].T])
 
 
 def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Influence:
-    """Return how the errors of image points move the unknowns, in the datum of the optimum.
+    """Return the effect of errors of image points on the unknowns, in the datum of the optimum.
 
     Args:
         optimum: undamped normal equations and their factor.
@@ -168,12 +168,12 @@ class CorrelatedPart:
 
     influence: Influence
     correlation: ErrorCorrelation
-    relative: FloatArray  # whitening of each image point over that of a usual one, (k, 2, 2)
-    middle: FloatArray  # of the scores of reduced unknowns and datum, Z'(R - I) Z, (reduced + d, reduced + d)
-    points: FloatArray  # of each object point, (n, 3, 3)
+    relative: FloatArray  # whitening of each image point relative to a usual one, (k, 2, 2)
+    middle: FloatArray  # S'(R - I) S of the scores S, (reduced + d, reduced + d)
+    points: FloatArray  # covariance of each object point, (n, 3, 3)
 
     def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
-        """Return what is added to the joint cofactor of reduced unknowns and points, (u + 3 p, u + 3 p)."""
+        """Return the addition to the joint cofactor of reduced unknowns and points, (u + 3 p, u + 3 p)."""
         influence, p, u = self.influence, len(points), len(unknowns)
         coordinates = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         C = influence.unknowns @ np.hstack(
@@ -200,7 +200,7 @@ class CorrelatedPart:
         return np.asarray(added)
 
     def added_to(self, covariance: Covariance, variance: float, optimum: Optimum) -> Covariance:
-        """Return the marginal covariance with what correlation adds, of variance factor sigma0^2."""
+        """Return the marginal covariance plus the effect of the correlation; `variance` is sigma0^2."""
         layout = self.influence.linear.layout
         reduced = self.influence.unknowns @ self.influence.of_reduced()
         D = variance * reduced.T @ self.middle @ reduced
@@ -221,11 +221,11 @@ class CorrelatedPart:
 
 
 def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_px: float) -> CorrelatedPart:
-    """Return what the correlation of the errors adds to the cofactors of all unknowns.
+    """Return the addition to the cofactors of all unknowns due to correlated errors.
 
     Args:
-        influence: how errors move the unknowns.
-        correlation: of the errors.
+        influence: effect of errors on the unknowns.
+        correlation: correlation of the errors.
         usual_px: a priori standard deviation of a usual image coordinate, px.
     """
     linear, r = influence.linear, len(influence.unknowns)
@@ -254,14 +254,14 @@ def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_p
 def correlated_sum(
     image: IntArray, xy: FloatArray, relative: FloatArray, Z: FloatArray, correlation: ErrorCorrelation
 ) -> FloatArray:
-    """Return Z'(R - I) Z: what correlation adds to the covariance of functions of errors, for sigma0 = 1.
+    """Return Z'(R - I) Z, the addition to the covariance of functions of errors, for sigma0 = 1.
 
     Args:
         image: photograph of each image point, (k,).
         xy: image points, px, (k, 2).
-        relative: whitening of each image point over that of a usual one, (k, 2, 2).
+        relative: whitening of each image point relative to a usual one, (k, 2, 2).
         Z: derivatives of the functions by the errors in units of their standard deviations, (k, 2, u).
-        correlation: of the errors.
+        correlation: correlation of the errors.
     """
     total = np.zeros((Z.shape[2], Z.shape[2]))
     for one in _photographs(image, xy, relative, correlation):
@@ -272,7 +272,7 @@ def correlated_sum(
 
 @dataclass(frozen=True)
 class _Photograph:
-    """R - I of the image points of a photograph: (alone - 1) I and G C G' with G their relative whitening."""
+    """R - I of the image points of a photograph: (alone - 1) I + G C G' with the relative whitening G."""
 
     rows: IntArray  # its image points, (r,)
     xy: FloatArray  # px, (r, 2)
@@ -280,7 +280,7 @@ class _Photograph:
     correlation: ErrorCorrelation
 
     def times(self, Z: FloatArray, some: IntArray | None = None) -> FloatArray:
-        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u); C is formed by parts."""
+        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u); C is formed in parts."""
         some = np.arange(len(self.rows)) if some is None else some
         of_shift = (np.swapaxes(self.relative, 1, 2) @ Z).reshape(len(Z), -1)
         parts = np.array_split(some, 1 + 8 * len(some) * len(self.xy) // BYTES_AT_ONCE)
@@ -289,7 +289,7 @@ class _Photograph:
         return np.asarray((self.correlation.alone - 1.0) * Z[some] + self.relative[some] @ moved)
 
     def between(self, O: FloatArray, some: IntArray) -> FloatArray:
-        """Return O'(R - I) O of functions of some image points, three of each (s, 2, 3), (3 s, 3 s)."""
+        """Return O'(R - I) O for functions O of some image points, three each (s, 2, 3), as (3 s, 3 s)."""
         of_shift = np.swapaxes(self.relative[some], 1, 2) @ O
         pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(some, some), of_shift, optimize=True)
         each = np.arange(len(some))
@@ -297,12 +297,12 @@ class _Photograph:
         return np.asarray(pairs.reshape(3 * len(some), 3 * len(some)))
 
     def variances(self) -> FloatArray:
-        """Return R - I of each image point by itself, (r, 2, 2)."""
+        """Return the diagonal blocks of R - I, one per image point, (r, 2, 2)."""
         together = self.correlation.common * self.relative @ np.swapaxes(self.relative, 1, 2)
         return np.asarray((self.correlation.alone - 1.0) * np.eye(2) + together)
 
     def common(self, some: IntArray, others: IntArray | slice) -> FloatArray:
-        """Return C of some image points by others, (s, o)."""
+        """Return C between some image points and others, (s, o)."""
         C = cdist(self.xy[some], self.xy[others])
         C /= -self.correlation.length_px
         np.exp(C, out=C)
@@ -358,13 +358,13 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
 
 
 def _of_rays(values: FloatArray, column: IntArray, which: BoolArray, columns: int) -> csr_matrix:
-    """Return the derivatives of all image points, (2k, columns), of those of some.
+    """Return the derivatives of all image points, (2k, columns), from the image points that have some.
 
     Args:
         values: derivatives of x and y by q unknowns each, (s, 2, q).
-        column: of these unknowns, (s, q).
-        which: image points with derivatives, s of them, (k,).
-        columns: how many there are.
+        column: columns of these unknowns, (s, q).
+        which: which image points have derivatives, s of them, (k,).
+        columns: total number of columns.
     """
     first = np.concatenate([[0], np.cumsum(np.repeat(which, 2) * column.shape[1])])
     entries = (values.ravel(), np.repeat(column, 2, axis=0).ravel(), first)

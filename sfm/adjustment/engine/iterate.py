@@ -1,13 +1,14 @@
 """Iteration of the normal equations to the least sum of squares.
 
-Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to get near and Gauss-Newton to end:
-the last steps are undamped in either case. Where a bent valley leaves room for short straight steps only, a
-longer one is brought back to its bottom. Where only the values are wanted, the step that shows convergence
-may be taken with the reduced matrix of the step before, for the gradient of the current state (simplified
-Newton). A step that would bring a point behind a camera has an infinite sum of squares and is shortened or
-damped. Converged means that the predicted change of the adjusted observations, |A dx| weighted, is at most
-`tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would move by more than that
-share of its a priori standard deviation.
+The method is Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to approach the optimum and
+Gauss-Newton to finish. The last steps are undamped in either case. A bent valley allows only short straight
+steps; there a longer step is corrected back to the bottom of the valley. If only the values are wanted, the
+last step may use the current gradient with the reduced matrix of the step before (simplified Newton). A step
+that would bring a point behind a camera has an infinite sum of squares and is shortened or damped.
+
+The iteration has converged when the predicted change of the adjusted observations, |A dx| weighted, is at
+most `tolerance` times the residuals |v|, or at most MIN_SHIFT. In the latter case no unknown would move by
+more than that share of its a priori standard deviation.
 
 Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
 veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear
@@ -35,24 +36,24 @@ from sfm.runtime.progress import keep_freed_memory
 
 TOLERANCE = 1e-6
 MIN_SHIFT = 1e-6
-ARMIJO = 1e-4  # share of the predicted decrease that a step must bring (Nocedal and Wright, sec. 3.1)
-MIN_STEP_SHARE = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
-BENT_STEP_SHARE = 0.25  # share of a Gauss-Newton step below which a valley is bent
-CORRECTIONS = 3  # steps back to its bottom
+ARMIJO = 1e-4  # share of the predicted decrease that a step must achieve (Nocedal and Wright, sec. 3.1)
+MIN_STEP_SHARE = 2.0**-12  # smallest share of a Gauss-Newton step that is tried
+BENT_STEP_SHARE = 0.25  # share of a Gauss-Newton step below which a valley counts as bent
+CORRECTIONS = 3  # steps back to the bottom of a valley
 START_DAMPING = 1e-3  # share of the diagonal
 UNDAMPED_TOLERANCE = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
-ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
-FAR_TOLERANCE = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
-# |A dx| / |v| of a step below which its reduced matrix may show that the next is the last.
+ROUNDING = 1e-12  # relative difference between sums of the same squares in different orders
+FAR_TOLERANCE = 0.9  # |A dx| / |v| above which the step after the next is not expected to be the last
+# |A dx| / |v| of a step below which its reduced matrix may be used to test whether the next step is the last.
 SIMPLIFIED_TOLERANCE = 0.8
-SINGLE_TOLERANCE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
+SINGLE_TOLERANCE = 1e-2  # |A dx| / |v| above which steps may come from a product in single precision
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where an iteration ended, with the undamped normal equations of its last step."""
+    """Result of an iteration, with the undamped normal equations of its last step."""
 
     state: State
     equations: Equations
@@ -61,7 +62,7 @@ class Optimum:
     converged: bool
     iterations: int
     vPv: float
-    start_vPv: float  # at the start values
+    start_vPv: float  # v'Pv at the start values
 
 
 @dataclass(frozen=True)
@@ -69,41 +70,47 @@ class Problem:
     """Constants of all steps and rounds of an adjustment."""
 
     layout: Unknowns  # order of the unknowns
-    observed: tuple[ObservedKind, ...]  # observations beside image points
+    observed: tuple[ObservedKind, ...]  # observations other than image points
     datum: ResolvedDatum
-    space: Space  # for the normal equations, used again and again
-    solver: Solver  # of the reduced normal equations
+    space: Space  # memory of the normal equations, reused in every step
+    solver: Solver  # solver of the reduced normal equations
 
 
 @dataclass(frozen=True)
 class Move:
     """A step in the datum."""
 
-    reduced: FloatArray  # of the reduced unknowns, (reduced,)
-    points: FloatArray  # of the object points, (n, 3)
+    reduced: FloatArray  # step of the reduced unknowns, (reduced,)
+    points: FloatArray  # step of the object points, (n, 3)
     predicted: float  # g'N^-1 g = |A dx|^2 without damping
-    vPv: float  # where it starts
+    vPv: float  # v'Pv at its start
 
 
 @dataclass(frozen=True)
 class Step(Move):
-    """A step and what it was taken from."""
+    """A step with the normal equations that it comes from."""
 
     equations: Equations
     factor: Factor
     motions: Motions
 
     def move(self) -> Move:
-        """Return it without the normal equations, which fill memory."""
+        """Return the step without the normal equations, which take much memory."""
         return Move(self.reduced, self.points, self.predicted, self.vPv)
 
     def within(self, share: float) -> bool:
-        """Whether |A dx| is at most this share of |v|, or MIN_SHIFT."""
+        """Return whether |A dx| is at most this share of |v|, or at most MIN_SHIFT."""
         return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
 
 
 def problem_of(layout: Unknowns, observed: tuple[ObservedKind, ...], datum: ResolvedDatum) -> Problem:
-    """Return what all steps of an adjustment have in common; chooses the solver of the normal equations."""
+    """Return the constants of an adjustment, including the solver chosen for its normal equations.
+
+    Args:
+        layout: order of the unknowns.
+        observed: observations other than image points.
+        datum: kind and points.
+    """
     keep_freed_memory()
     solver = DenseSolver(layout) if couples_poses(observed) else choose_solver(layout)
     return Problem(layout, observed, datum, new_space(layout), solver)
@@ -120,21 +127,21 @@ def iterate(
     near: bool = False,
     exact: bool = True,
 ) -> Optimum:
-    """Return the state of least weighted sum of squares.
+    """Return the state with the least weighted sum of squares.
 
     Args:
-        problem: what is adjusted.
-        state: where to start.
+        problem: constants of the adjustment.
+        state: start values.
         weight: factor on the weight of each image point, shape (k,).
-        method: gauss-newton, levenberg-marquardt, or undamped (Gauss-Newton with full steps, to compare).
-        max_iterations: steps to try at most.
+        method: gauss-newton, levenberg-marquardt, or undamped (Gauss-Newton with full steps, for comparison).
+        max_iterations: largest number of steps.
         tolerance: |A dx| / |v| at which the iteration has converged.
-        near: whether the start is near the optimum, so that no step is taken in single precision.
-        exact: whether the factor must belong to the normal equations of the last step, as a covariance needs
-            it; else it may belong to those of the step before.
+        near: whether the start is near the optimum; then no step is computed in single precision.
+        exact: whether the factor must belong to the normal equations of the last step, as a covariance
+            requires; if not, it may belong to the step before.
 
     Raises:
-        GeometryError: unknown method, or start values whose normal equations cannot be solved.
+        GeometryError: unknown method, or start values with normal equations that cannot be solved.
     """
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
@@ -156,14 +163,14 @@ def iterate(
             if before is None:
                 if state is first:
                     _refuse(problem, state)
-                state = first  # the damped steps have led where nothing can be solved
+                state = first  # the damped steps have led to equations that cannot be solved
                 continue
             start, tried = before
             whole = share == 1.0
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
             if whole and better is not None and better[1] < BENT_STEP_SHARE:
                 better = _along_valley(problem, start, weight, tried, better[1]) or better
-            if better is None:  # no share of the last step leads where they can be solved
+            if better is None:  # no share of the last step leads to equations that can be solved
                 state, found = start, _solve(problem, start, weight)
                 break
             (state, share), limit = better, np.inf
@@ -174,10 +181,10 @@ def iterate(
         taken += 1
         single = single and not found.within(FAR_TOLERANCE)
         before, share = (state, found.move()), 1.0
-        state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
+        state = step(layout, state, found.reduced, found.points)  # tested by the next normal equations
         limit = _most_allowed(before[1], share, shortest)
         last = None if exact or not found.within(SIMPLIFIED_TOLERANCE) else found.factor
-        del found  # its memory is needed for the next
+        del found  # its memory is needed for the next step
     if found is None:
         _refuse(problem, state)
     converged, vPv = found.within(tolerance), found.equations.vPv
@@ -191,13 +198,19 @@ def iterate(
 
 
 def _refuse(problem: Problem, state: State) -> NoReturn:
-    """Say why the normal equations of the start values cannot be solved."""
-    motions_of(problem.layout, problem.observed, state, problem.datum)  # if the datum is the reason
+    """Raise the reason why the normal equations of the start values cannot be solved."""
+    motions_of(problem.layout, problem.observed, state, problem.datum)  # raises if the datum is the reason
     raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
 
 
 def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | None:
-    """Return the normal equations at a state that is taken as the optimum; None if they cannot be solved."""
+    """Return the normal equations at a state taken as the optimum; None if they cannot be solved.
+
+    Args:
+        problem: constants of the adjustment.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, (k,).
+    """
     found = _solve(problem, state, weight)
     if found is None:
         return None
@@ -216,16 +229,16 @@ def _solve(
     last: Factor | None = None,
     tolerance: float = 0.0,
 ) -> Step | None:
-    """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
+    """Return the step from a state; None if the normal equations cannot be solved or v'Pv is too large.
 
     Args:
-        problem: what is adjusted.
-        state: where the step starts.
+        problem: constants of the adjustment.
+        state: start of the step.
         weight: factor on the weight of each image point, shape (k,).
         damping: share of its diagonal added to the normal matrix.
-        single: whether single precision will do while the step is far from convergence.
-        limit: largest v'Pv.
-        last: factor of the step before, taken if it shows convergence.
+        single: whether single precision suffices while the step is far from convergence.
+        limit: largest v'Pv accepted.
+        last: factor of the step before, used if it shows convergence.
         tolerance: |A dx| / |v| of convergence.
     """
     p, layout = problem, problem.layout
@@ -234,7 +247,7 @@ def _solve(
         return None
     try:
         motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.blocks.held))
-    except GeometryError:  # the datum points have fallen together on the way
+    except GeometryError:  # the datum points have moved together during the iteration
         return None
     if last is not None:
         found = _step(p, equations, last, motions)
@@ -254,7 +267,7 @@ def _step(problem: Problem, equations: Equations, factor: Factor, motions: Motio
     layout = problem.layout
     datum = on_sound_points(problem.datum, equations.blocks.held)
     motions = with_further(motions, factor.further, equations, layout, datum)
-    with np.errstate(over="ignore", invalid="ignore"):  # a step without end is refused for what it leads to
+    with np.errstate(over="ignore", invalid="ignore"):  # an infinite step is refused by its sum of squares
         reduced = -factor.solve(equations.parts.g)
         points = point_step(equations, reduced, layout)
         y = equations.blocks.y.ravel()
@@ -266,7 +279,7 @@ def _step(problem: Problem, equations: Equations, factor: Factor, motions: Motio
 def _approach(
     problem: Problem, state: State, weight: FloatArray, max_iterations: int, single: bool
 ) -> tuple[State, int, float | None]:
-    """Return a state near the optimum by Levenberg-Marquardt, how many steps were tried, v'Pv at first."""
+    """Return a state near the optimum by Levenberg-Marquardt, the number of steps and v'Pv at the start."""
     damping, growth = START_DAMPING, 2.0
     start_vPv: float | None = None
     for taken in range(max_iterations):
@@ -291,7 +304,13 @@ def _approach(
 
 
 def total(problem: Problem, state: State, weight: FloatArray) -> float:
-    """Return v'Pv of all observations; infinite if a point is behind a camera."""
+    """Return v'Pv of all observations; infinite if a point is behind a camera.
+
+    Args:
+        problem: constants of the adjustment.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, (k,).
+    """
     p = problem
     return sum_of_squares(p.layout.observations, state, weight) + vPv_of(p.observed, state)
 
@@ -299,15 +318,15 @@ def total(problem: Problem, state: State, weight: FloatArray) -> float:
 def _line_search(
     problem: Problem, state: State, weight: FloatArray, found: Move, share: float, shortest: float
 ) -> tuple[State, float] | None:
-    """Return where the first of the shares 1, 1/2, 1/4 ... to meet Armijo's condition leads, and it.
+    """Halve a share of a step until it meets Armijo's condition; return the new state and the share.
 
     Args:
-        problem: what is adjusted.
-        state: where the step starts.
+        problem: constants of the adjustment.
+        state: start of the step.
         weight: factor on the weight of each image point, shape (k,).
         found: the step.
         share: first share to try.
-        shortest: last share to try; 1 takes the full step whatever it brings, if it can be computed.
+        shortest: last share to try; 1 accepts the full step without a condition, if it can be computed.
     """
     while share >= shortest:
         moved = step(problem.layout, state, share * found.reduced, share * found.points)
@@ -321,28 +340,30 @@ def _line_search(
 def _along_valley(
     problem: Problem, start: State, weight: FloatArray, found: Move, straight: float
 ) -> tuple[State, float] | None:
-    """Return where a share of a step leads along the bent valley that it runs in, and the share.
+    """Follow a bent valley along a share of a step; return the new state and the share.
 
-    A straight step leaves such a valley soon, and a share of it creeps. The way back to the bottom is the
-    next step under the condition that the unknowns of the cameras do not go on along the first. A valley that
-    a straight share leaves by the square of it, and the way back by its square, allows the root.
+    A straight step soon leaves such a valley, and small shares of it make little progress. So a longer share
+    is taken and then corrected back to the bottom. A correction is the next step with the condition that the
+    reduced unknowns do not move along the first step. A straight share s leaves the bottom by an amount
+    proportional to s^2, and its correction misses by the square of that. So the root of the straight share is
+    possible.
 
     Args:
-        problem: what is adjusted.
-        start: where the step starts.
+        problem: constants of the adjustment.
+        start: start of the step.
         weight: factor on the weight of each image point, shape (k,).
         found: the step.
-        straight: share of it that can be taken straight.
+        straight: share of the step that can be taken straight.
     """
     along, share = found.reduced, float(np.sqrt(straight))
     allowed, height = _most_allowed(found, share, MIN_STEP_SHARE), np.inf
     moved = step(problem.layout, start, share * found.reduced, share * found.points)
     for _ in range(CORRECTIONS):
         back = _solve(problem, moved, weight)
-        if back is None or back.vPv > height / 2:  # it does not lead back
+        if back is None or back.vPv > height / 2:  # the correction does not lead back
             return None
         height = back.vPv
-        with np.errstate(over="ignore", invalid="ignore"):  # as for the step itself
+        with np.errstate(over="ignore", invalid="ignore"):  # as in `_step`
             z = back.factor.solve(along)
             nothing = point_step(back.equations, np.zeros_like(z), problem.layout)
             z, Z = back.motions.transform(z, point_step(back.equations, z, problem.layout) - nothing)
@@ -354,7 +375,7 @@ def _along_valley(
 
 
 def _most_allowed(found: Move, share: float, shortest: float) -> float:
-    """Return the largest v'Pv with which a share of a step meets Armijo's condition."""
+    """Return the largest v'Pv at which a share of a step meets Armijo's condition."""
     if shortest == 1.0:
         return np.inf
     return found.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted

@@ -1,11 +1,11 @@
 """Normal equations of all image points, reduced to orientations and kept points by the Schur complement.
 
-With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
-normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Unknowns are
-scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into
-fronts, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
+With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced normal
+equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Unknowns are scaled so that the diagonal of U
+is 1. Y Y' is summed as one dense product, or pair by pair of rays into fronts, whichever is less work
+(`sfm.adjustment.engine.solvers.choice`).
 
-Products of Y with steps and right sides take it as `sfm.adjustment.engine.accumulate` stores it: by image
+Products of Y with steps and right-hand sides use Y as `sfm.adjustment.engine.accumulate` stores it: by image
 points and, for interior unknowns, by object points.
 
 Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016), sec.
@@ -35,31 +35,31 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.kernels.compiling import kernel
 from sfm.kernels.threads import at_once
 
-# Image points from which two halves of the photographs are summed by themselves; another thread takes 0.1 ms
-# to start and saves 0.07 microseconds for each.
+# Number of image points from which two halves of the photographs are summed separately. A second thread takes
+# 0.1 ms to start and saves 0.07 microseconds per image point.
 MIN_HALVED_POINTS = 8_000
 SUMMED = ("D", "gi", "V", "gp", "Y_interior")  # parts of `Sums` that both halves add to
 
 
 class Space(NamedTuple):
-    """Space for normal equations, used again and again."""
+    """Reusable memory for normal equations."""
 
     blocks: Blocks
-    sums: tuple[Sums, ...]  # of all photographs, or of two halves of them; the first are those of the blocks
+    sums: tuple[Sums, ...]  # sums of all photographs, or of each half; the first share arrays with `blocks`
 
 
 class Parts(NamedTuple):
-    """Reduced normal equations before Y Y' is taken off, without the exterior diagonal blocks."""
+    """Reduced normal equations before Y Y' is subtracted, without the exterior diagonal blocks."""
 
-    border: FloatArray  # X0, w of poses by interior unknowns, mounts and kept points, (6 poses, i + 3 s)
-    corner: FloatArray  # those by themselves, (i + 3 s, i + 3 s)
-    coupled: FloatArray | None  # poses by one another, from observations of two; None without, (6 poses,) * 2
-    g: FloatArray  # right side, reduced, (reduced,)
+    border: FloatArray  # X0, w of poses x interior unknowns, mounts and kept points, (6 poses, i + 3 s)
+    corner: FloatArray  # interior unknowns, mounts and kept points, (i + 3 s, i + 3 s)
+    coupled: FloatArray | None  # poses x poses, from observations of two poses; None without, (6 poses,) * 2
+    g: FloatArray  # reduced right-hand side, (reduced,)
     scale: FloatArray  # 1/sqrt of the diagonal of U, (reduced,)
 
 
 class Equations(NamedTuple):
-    """Normal equations at a state, object points eliminated, Y Y' not yet taken off."""
+    """Normal equations at a state, with object points eliminated but Y Y' not yet subtracted."""
 
     blocks: Blocks
     parts: Parts
@@ -80,11 +80,11 @@ def normal_equations(
 
     Args:
         layout: order of the unknowns.
-        observed: observations beside image points.
+        observed: observations other than image points.
         state: values of all parameters.
         weight: factor on the weight of each image point, 0 = takes no part, shape (k,).
-        damping: share of its diagonal added to the whole normal matrix (Marquardt); 0 for the truth.
-        space: to be used again.
+        damping: share of its diagonal added to the whole normal matrix (Marquardt); 0 without damping.
+        space: memory to reuse; new memory if not given.
     """
     space = new_space(layout) if space is None else space
     b = space.blocks
@@ -99,7 +99,7 @@ def normal_equations(
 
 
 def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: Space) -> float:
-    """Fill the blocks of all photographs and return v'Pv; the same two halves however many threads."""
+    """Fill the blocks of all photographs and return v'Pv; halves do not depend on the number of threads."""
     b = space.blocks
 
     def add(s: Sums) -> float:
@@ -123,7 +123,7 @@ def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: 
 
 
 def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
-    """Gather the blocks of interior unknowns, kept points and observations beside image points."""
+    """Gather the blocks of interior unknowns, kept points and observations other than image points."""
     first = 6 * len(b.U)
     inner = layout.kept_start - first
     border = np.zeros((first, layout.reduced - first))
@@ -148,7 +148,13 @@ def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
 
 
 def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
-    """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
+    """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3).
+
+    Args:
+        equations: normal equations.
+        reduced_step: step of the reduced unknowns, (reduced,).
+        layout: order of the unknowns.
+    """
     dX = np.empty_like(equations.blocks.y)
     step_points(layout.observations, layout.point_free, equations.blocks, reduced_step, dX)
     if len(layout.kept):
@@ -157,7 +163,13 @@ def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns)
 
 
 def times_schur(equations: Equations, layout: Unknowns, x: FloatArray) -> FloatArray:
-    """Return S x, the reduced normal matrix by some vectors without forming it, undamped, (reduced, e)."""
+    """Return S x with the undamped reduced normal matrix S, without forming S, (reduced, e).
+
+    Args:
+        equations: normal equations.
+        layout: order of the unknowns.
+        x: vectors, (reduced, e).
+    """
     b, parts = equations.blocks, equations.parts
     first, e = 6 * len(b.U), x.shape[1]
     x = np.ascontiguousarray(x)
@@ -174,7 +186,12 @@ def times_schur(equations: Equations, layout: Unknowns, x: FloatArray) -> FloatA
 
 
 def solve_lower(L: FloatArray, h: FloatArray) -> FloatArray:
-    """Return L^-1 h of every point, (n, 3, d)."""
+    """Return L^-1 h of every point, (n, 3, d).
+
+    Args:
+        L: lower triangular factors, (n, 3, 3).
+        h: right-hand sides, (n, 3, d).
+    """
     x = np.empty_like(h)
     x[:, 0] = h[:, 0] / L[:, 0, 0, None]
     x[:, 1] = (h[:, 1] - L[:, 1, 0, None] * x[:, 0]) / L[:, 1, 1, None]
@@ -183,7 +200,12 @@ def solve_lower(L: FloatArray, h: FloatArray) -> FloatArray:
 
 
 def solve_transposed(L: FloatArray, h: FloatArray) -> FloatArray:
-    """Return L^-T h of every point, (n, 3, d)."""
+    """Return L^-T h of every point, (n, 3, d).
+
+    Args:
+        L: lower triangular factors, (n, 3, 3).
+        h: right-hand sides, (n, 3, d).
+    """
     x = np.empty_like(h)
     x[:, 2] = h[:, 2] / L[:, 2, 2, None]
     x[:, 1] = (h[:, 1] - L[:, 2, 1, None] * x[:, 2]) / L[:, 1, 1, None]
@@ -192,7 +214,11 @@ def solve_transposed(L: FloatArray, h: FloatArray) -> FloatArray:
 
 
 def new_space(layout: Unknowns) -> Space:
-    """Return space for the normal equations of a network."""
+    """Return memory for the normal equations of a network.
+
+    Args:
+        layout: order of the unknowns.
+    """
     m, n, k = len(layout.image_on), len(layout.point_free), len(layout.order)
     a, poses = len(layout.interior_free), len(layout.pose_free)
     f = int(layout.observations.free_count.max())
@@ -231,7 +257,15 @@ def new_space(layout: Unknowns) -> Space:
 def step_points(
     observations: Observations, point_free: BoolArray, blocks: Blocks, dx: FloatArray, dX: FloatArray
 ) -> None:
-    """Fill the step of the object points dX = -L^-T (y + Y'dx), dx of the reduced unknowns; 0 where fixed."""
+    """Fill the step of the object points, dX = -L^-T (y + Y'dx); 0 where fixed.
+
+    Args:
+        observations: image points.
+        point_free: free coordinates, (n, 3).
+        blocks: filled blocks.
+        dx: step of the reduced unknowns, (reduced,).
+        dX: receives the step of the object points, (n, 3).
+    """
     first = 6 * observations.poses
     for j in range(len(dX)):
         h0, h1, h2 = blocks.y[j, 0], blocks.y[j, 1], blocks.y[j, 2]
@@ -258,7 +292,14 @@ def step_points(
 
 @kernel
 def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out: FloatArray) -> None:
-    """Fill out with Y' x: x of the reduced unknowns, (reduced, d), out of the object points, (n, 3, d)."""
+    """Fill `out` with Y' x.
+
+    Args:
+        observations: image points.
+        blocks: filled blocks.
+        x: vectors of the reduced unknowns, (reduced, d).
+        out: vectors of the object points, (n, 3, d).
+    """
     first = 6 * observations.poses
     out[:] = 0.0
     for j in range(len(out)):
@@ -278,7 +319,14 @@ def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out
 
 @kernel
 def times_points(observations: Observations, blocks: Blocks, h: FloatArray, out: FloatArray) -> None:
-    """Add Y h to out: h of the object points, (n, 3, d), out of the reduced unknowns, (reduced, d)."""
+    """Add Y h to `out`.
+
+    Args:
+        observations: image points.
+        blocks: filled blocks.
+        h: vectors of the object points, (n, 3, d).
+        out: vectors of the reduced unknowns, (reduced, d).
+    """
     first = 6 * observations.poses
     for j in range(len(h)):
         for p in range(3):

@@ -1,9 +1,9 @@
-"""Observations beside image points in an adjustment: what each kind adds to its normal equations.
+"""Observations other than image points: the terms that each kind adds to the normal equations.
 
-Unified least squares: with the derivatives J of an observation by the unknowns of its blocks, its weight P
-and its difference l, computed minus observed, J'P J is added to N and J'P l to g. Observations of object
-points alone are added before these are eliminated; all others to the reduced normal equations. The kinds are
-those of `sfm.observations`; nothing here knows one of them.
+The method is unified least squares. An observation has derivatives J by the unknowns of its blocks, a weight
+P and a difference l, computed minus observed. It adds J'P J to N and J'P l to g. Observations of object
+points alone are added before the points are eliminated; all others are added to the reduced normal equations.
+The kinds are those of `sfm.observations`, and this module does not depend on any particular one.
 
 Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least
 squares).
@@ -28,33 +28,31 @@ from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse
 class ObservedKind:
     """Observations of one kind that take part in an adjustment."""
 
-    index: int  # of their kind among `Network.kinds`
-    kind: Kind  # those that take part, n of them
-    rows: IntArray  # which of the observations of the kind these are, (n,)
-    weight: (
-        FloatArray  # inverse covariance, 0 where not observed, (n, d, d); or of all together, (1, n d, n d)
-    )
+    index: int  # index of the kind in `Network.kinds`
+    kind: Kind  # the n observations that take part
+    rows: IntArray  # their rows among all observations of the kind, (n,)
+    weight: FloatArray  # inverse covariance, 0 where not observed, (n, d, d); or joint, (1, n d, n d)
 
     @property
     def components(self) -> BoolArray:
         """Which components were observed, (n, d)."""
         return np.reshape(np.diagonal(self.weight, axis1=1, axis2=2) > 0, (len(self.kind), -1))
 
-    fitted: int = 0  # parameters of groups, which are not among the unknowns
+    fitted: int = 0  # number of group parameters, which are not among the unknowns
 
     @property
     def count(self) -> int:
-        """How many scalar observations these are, less parameters of groups."""
+        """Number of scalar observations minus the number of group parameters."""
         return int(self.components.sum()) - self.fitted
 
     @property
     def point(self) -> IntArray | None:
-        """Object point of each observation where it is all that they depend on; else None, (n,)."""
+        """Object point of each observation if it depends on nothing else, (n,); otherwise None."""
         blocks = self.kind.blocks()
         return blocks[0].at if len(blocks) == 1 and blocks[0].of == POINT else None
 
     def vPv(self, state: State) -> float:
-        """Return v'Pv at some values of the unknowns."""
+        """Return v'Pv at the given values of the unknowns."""
         l = self.kind.linearise(state).difference.reshape(self.weight.shape[:2])
         return float(np.einsum("na,nab,nb->", l, self.weight, l))
 
@@ -62,15 +60,22 @@ class ObservedKind:
 class Reduced(NamedTuple):
     """Derivatives of observations by the reduced unknowns."""
 
-    columns: IntArray  # of the reduced unknowns, (n, u)
-    J: FloatArray  # 0 where they are fixed, (n, d, u)
+    columns: IntArray  # columns of the reduced unknowns, (n, u)
+    J: FloatArray  # 0 for fixed unknowns, (n, d, u)
     l: FloatArray  # computed minus observed, (n, d)
 
 
 def observed_of(
     network: Network, layout: Unknowns, state: State, *, use_control: bool
 ) -> tuple[ObservedKind, ...]:
-    """Return the observations of a network beside its image points that take part in its adjustment."""
+    """Return the observations other than image points that take part in the adjustment of a network.
+
+    Args:
+        network: the network.
+        layout: order of the unknowns.
+        state: values of all unknowns.
+        use_control: whether control points take part.
+    """
     found = []
     for index, kind in enumerate(network.kinds):
         if not len(kind) or (isinstance(kind, ObjectPoints) and not use_control):
@@ -89,7 +94,11 @@ def observed_of(
 
 
 def _takes_part(kind: Kind, layout: Unknowns) -> BoolArray:
-    """Return which observations have all their unknowns in an adjustment, and any that is free, (n,)."""
+    """Return which observations take part, (n,).
+
+    All their points and photographs must be in the adjustment. They must have a free unknown or several
+    blocks.
+    """
     variance = np.diagonal(kind.covariances(), axis1=1, axis2=2)
     on = ((variance > 0) & np.isfinite(variance)).any(axis=1)
     free = np.zeros(len(kind), dtype=bool)
@@ -105,12 +114,12 @@ def _takes_part(kind: Kind, layout: Unknowns) -> BoolArray:
             free |= (layout.mount_column[index] >= 0).any(axis=1)
         else:
             free |= _parameter_columns(layout, index) >= 0
-    # a distance between two fixed points checks nothing, but it counts: its contradiction shows in sigma0
+    # a distance between two fixed points determines nothing, but it counts: a contradiction shows in sigma0
     return on & (free | (len(blocks) > 1))
 
 
 def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
-    """Return the column of interior parameters (camera, parameter), -1 where they are not free, (n,)."""
+    """Return the columns of interior parameters (camera, parameter), -1 where not free, (n,)."""
     columns = np.full(len(index), -1)
     for row, (a, s) in enumerate(index):
         where = np.flatnonzero(layout.interior_free[a] == s)
@@ -120,17 +129,23 @@ def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
 
 
 def count_of(observed: tuple[ObservedKind, ...]) -> int:
-    """Return how many scalar observations there are beside image points."""
+    """Return the number of scalar observations other than image points."""
     return sum(one.count for one in observed)
 
 
 def vPv_of(observed: tuple[ObservedKind, ...], state: State) -> float:
-    """Return v'Pv of the observations beside image points."""
+    """Return v'Pv of the observations other than image points."""
     return sum(one.vPv(state) for one in observed)
 
 
 def reduced_rows(one: ObservedKind, layout: Unknowns, state: State) -> Reduced:
-    """Return the derivatives of observations of a kind by the reduced unknowns, kept points included."""
+    """Return the derivatives of observations of a kind by the reduced unknowns, including kept points.
+
+    Args:
+        one: observations of one kind.
+        layout: order of the unknowns.
+        state: values of all unknowns.
+    """
     linear = one.kind.linearise(state)
     columns, parts = [], []
     for block, J in zip(one.kind.blocks(), linear.J, strict=True):
@@ -142,7 +157,7 @@ def reduced_rows(one: ObservedKind, layout: Unknowns, state: State) -> Reduced:
 
 
 def _together(found: Reduced) -> Reduced:
-    """Return observations that are correlated with one another as a single one."""
+    """Return mutually correlated observations as a single observation."""
     n, d, u = found.J.shape
     J = np.zeros((n, d, n, u))
     J[np.arange(n), :, np.arange(n)] = found.J
@@ -150,7 +165,7 @@ def _together(found: Reduced) -> Reduced:
 
 
 def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, FloatArray]:
-    """Return the reduced unknowns of a block, (n, u), and its derivatives by them, (n, 1, 3 or 6, u)."""
+    """Return the columns of the reduced unknowns of a block, (n, u), and its derivatives by them."""
     if block.of == PHOTOGRAPH:
         return layout.photograph_terms(state, block.at)
     if block.of == POINT:
@@ -166,10 +181,10 @@ def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, F
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms in the reduced normal equations of observations that do not depend on an object point alone."""
+    """Terms of the reduced normal equations, from observations that depend on more than one object point."""
 
     rows: tuple[tuple[Reduced, FloatArray], ...]  # derivatives and J'P of each kind, (n, u, d)
-    vPv: float  # of all kinds
+    vPv: float  # v'Pv of all kinds
 
     def add_to(
         self, U: FloatArray, border: FloatArray, corner: FloatArray, g: FloatArray
@@ -177,13 +192,13 @@ class Terms:
         """Add J'P J and J'P l to the blocks of the reduced normal equations.
 
         Args:
-            U: of poses by themselves, (poses, 6, 6).
-            border: of poses by the other reduced unknowns, (6 poses, b).
-            corner: of these by themselves, (b, b).
-            g: right side, (6 poses + b,).
+            U: diagonal blocks of poses, (poses, 6, 6).
+            border: poses x other reduced unknowns, (6 poses, b).
+            corner: other reduced unknowns, (b, b).
+            g: right-hand side, (6 poses + b,).
 
         Returns:
-            The terms that couple poses with one another, (6 poses, 6 poses); None without.
+            The terms that couple poses with one another, (6 poses, 6 poses); None without such terms.
         """
         first, coupled = 6 * len(U), None
         for (columns, J, l), JP in self.rows:
@@ -209,14 +224,14 @@ class Terms:
 def terms_of(
     observed: tuple[ObservedKind, ...], layout: Unknowns, state: State, V: FloatArray, gp: FloatArray
 ) -> Terms:
-    """Return what the observations add to the reduced normal equations; those of points alone to V and gp.
+    """Return the terms of the reduced normal equations; observations of one point alone go to V and gp.
 
     Args:
         observed: kinds of observations.
         layout: order of the unknowns.
         state: values of all unknowns.
-        V: normal equations of each object point, added to, (n, 3, 3).
-        gp: right side of each object point, added to, (n, 3).
+        V: normal equations of each object point, to add to, (n, 3, 3).
+        gp: right-hand side of each object point, to add to, (n, 3).
     """
     rows, vPv = [], 0.0
     for one in observed:
@@ -236,5 +251,5 @@ def terms_of(
 
 
 def couples_poses(observed: tuple[ObservedKind, ...]) -> bool:
-    """Return whether observations depend on two photographs each, which only a full matrix has room for."""
+    """Return whether any observations depend on two photographs each, which requires a full matrix."""
     return any(sum(block.of == PHOTOGRAPH for block in one.kind.blocks()) > 1 for one in observed)

@@ -1,7 +1,7 @@
-"""Image points of a network in the order that the compiled kernels go through them.
+"""Orders the image points of a network for the compiled kernels.
 
-Object points are eliminated one by one, so image points are stored object point by object point, poses
-ascending; the derivatives are taken photograph by photograph, for which an index gives their places.
+Object points are eliminated one by one. So image points are stored object point by object point, with
+ascending poses. Derivatives are computed photograph by photograph, through an index into this order.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from sfm.kernels.compiling import compiled
 
 
 def by_point(image: IntArray, point: IntArray, pose_of: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return the image points object point by object point (k,), and where each one starts (n + 1,).
+    """Return the image points sorted by object point (k,), and the start of each object point (n + 1,).
 
     Args:
         image: photograph of each image point, (k,).
-        point: object point of each, (k,).
-        pose_of: pose of each photograph; those of an object point ascend, (m,).
-        n: how many object points there are.
+        point: object point of each image point, (k,).
+        pose_of: pose of each photograph, (m,); the poses of an object point are sorted in ascending order.
+        n: number of object points.
     """
     m = len(pose_of)
     order = _sorted(image, np.arange(len(image)), _starts(image, m))
@@ -31,17 +31,22 @@ def by_point(image: IntArray, point: IntArray, pose_of: IntArray, n: int) -> tup
 
 
 def by_photograph(image: IntArray, m: int) -> tuple[IntArray, IntArray]:
-    """Return the image points photograph by photograph (k,), and where each one starts (m + 1,)."""
+    """Return the image points sorted by photograph (k,), and the start of each photograph (m + 1,).
+
+    Args:
+        image: photograph of each image point, (k,).
+        m: number of photographs.
+    """
     first = _starts(image, m)
     return _sorted(image, np.arange(len(image)), first), first
 
 
 def whitening_of(covariance: FloatArray, order: IntArray) -> FloatArray:
-    """Return a, b, c of F = (a 0; b c) with F'F = inverse covariance, the inverse of its Cholesky factor.
+    """Return a, b, c of F = (a 0; b c) with F'F the inverse covariance; F inverts the Cholesky factor.
 
     Args:
-        covariance: of image points, px^2, shape (k, 2, 2).
-        order: image points in the order wanted, shape (k,).
+        covariance: covariance of image points, px^2, shape (k, 2, 2).
+        order: image points in the desired order, shape (k,).
 
     Returns:
         Factors, 1/px, shape (k, 3).
@@ -65,7 +70,7 @@ def _sorted(key: IntArray, before: IntArray, start: IntArray) -> IntArray:
 
 @compiled
 def _sort(key: IntArray, before: IntArray, place: IntArray, order: IntArray) -> None:
-    """Counting sort of an order before: `place` is where the next one of each key goes."""
+    """Sort the order `before` stably by key (counting sort); `place` is the next free place of each key."""
     for o in before:
         order[place[key[o]]] = o
         place[key[o]] += 1

@@ -1,11 +1,11 @@
-"""The unknowns of an adjustment: which there are, which are free, in what order, and how a step moves them.
+"""Layout of the unknowns of an adjustment: their order, which of them are free, and how a step changes them.
 
 The reduced unknowns are blocks: [6 per pose: X0, w | free interior parameters, camera by camera | free
-parts of mounts, camera by camera | 3 per kept point]; all other object points are eliminated. A pose is
-that of a photograph, or of a rig at one moment; `photograph_terms` gives the orientation of a photograph by
-the unknowns, whichever they are. Points that observations couple with other unknowns are kept, as those at
-the ends of scale bars. Fixed unknowns keep their place with derivatives 0. A parameter that several cameras
-share has one column, that of the first of them.
+parts of mounts, camera by camera | 3 per kept point]. All other object points are eliminated. A pose belongs
+to a photograph, or to a rig at one moment; `photograph_terms` relates the orientation of a photograph to the
+unknowns in both cases. Points that observations couple with other unknowns are kept, for example the ends of
+scale bars. Fixed unknowns keep their columns, with derivatives 0. A parameter shared by several cameras has
+one column, that of the first camera.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from sfm.network import Estimate, Mounts, Network
 from sfm.observations.kind import POINT
 from sfm.observations.pose import exterior_jacobian
 
-MIN_RAYS = 2  # per object point that is not known otherwise
-MIN_POINTS = 3  # per pose that is not known otherwise
+MIN_RAYS = 2  # fewest rays of an object point that nothing else determines
+MIN_POINTS = 3  # fewest points of a pose that nothing else determines
 MOUNT_PARTS = ("X", "Y", "Z", "x rotation", "y rotation", "z rotation")
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Layout of the unknowns of one network and the image points as compiled code takes them."""
+    """Layout of the unknowns of a network, with the image points in the form that compiled code uses."""
 
     observations: Observations  # image points, grouped by object point
-    order: IntArray  # index in network.image_points of each of observations, (k,)
-    active: BoolArray  # image points of observations that can take part, (k,)
-    pose_free: BoolArray  # (poses, 6)
+    order: IntArray  # index in network.image_points of each image point of `observations`, (k,)
+    active: BoolArray  # image points of `observations` that can take part, (k,)
+    pose_free: BoolArray  # which unknowns of each pose are free, (poses, 6)
     interior_free: tuple[IntArray, ...]  # indices of the free parameters of each camera
     interior_column: tuple[IntArray, ...]  # their columns among the reduced unknowns
-    mount_column: IntArray  # columns of X, w of the mount of each camera, -1 where they are not free, (a, 6)
-    point_free: BoolArray  # (n, 3)
+    mount_column: IntArray  # columns of X, w of the mount of each camera, -1 where not free, (a, 6)
+    point_free: BoolArray  # which coordinates of each object point are free, (n, 3)
     image_on: BoolArray  # photographs that take part, (m,)
     point_on: BoolArray  # object points that take part, (n,)
     kept: IntArray  # object points that stay among the reduced unknowns, (s,)
-    reduced: int  # number of reduced unknowns, fixed ones included
+    reduced: int  # number of reduced unknowns, including fixed ones
     held: tuple[str, ...]  # photographs and points held because nothing determines them, in words
-    held_defect: int  # rank defect that their unknowns would have had
+    held_defect: int  # rank defect that their unknowns would have caused
 
     @property
     def kept_start(self) -> int:
@@ -70,18 +70,18 @@ class Unknowns:
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Numbers of free unknowns: poses and mounts, interior orientation, coordinates of points."""
+        """Numbers of free unknowns of poses and mounts, interior orientation, and points."""
         mounts = int((self.mount_column >= 0).sum())
         interior = self.kept_start - self.pose_free.size - mounts
         return int(self.pose_free.sum()) + mounts, interior, int(self.point_free.sum())
 
     @property
     def all_free(self) -> bool:
-        """Whether nothing is fixed or held."""
+        """Whether all unknowns are free and there are no rigs."""
         return bool(self.pose_free.all() and self.point_free.all()) and not self.rigged
 
     def reduced_free(self) -> BoolArray:
-        """Return which of the reduced unknowns are free, (reduced,)."""
+        """Return which reduced unknowns are free, (reduced,)."""
         interior = np.ones(self.kept_start - self.pose_free.size, dtype=bool)
         return np.concatenate([self.pose_free.ravel(), interior, self.point_free[self.kept].ravel()])
 
@@ -93,8 +93,8 @@ class Unknowns:
             images: indices of photographs, (e,).
 
         Returns:
-            Columns among the reduced unknowns, (e, u), and d (X0, w) / d unknowns, (e, 6, u); 0 where they
-            are fixed. Without rigs the unknowns are X0, w themselves.
+            Columns among the reduced unknowns, (e, u), and d (X0, w) / d unknowns, (e, 6, u), 0 for fixed
+            unknowns. Without rigs the unknowns are X0, w themselves.
         """
         o, e = self.observations, len(images)
         pose = o.pose_of[images]
@@ -114,15 +114,15 @@ class Unknowns:
         return columns, J
 
     def rig_terms(self, state: State) -> tuple[IntArray, FloatArray]:
-        """Return the unknowns that photographs of rigs share, and d (what is stated of them) by them.
+        """Return the unknowns that photographs of rigs share, and the derivatives of their parameters.
 
         Args:
             state: values of all unknowns.
 
         Returns:
-            Columns among the reduced unknowns, of the free interior parameters of all cameras and then of
-            all mounts, (s,), and the derivatives of these parameters and of X, Y, Z, omega, phi, kappa of
-            each mount, 0 where it is fixed, (s, s); both empty without rigs.
+            Columns among the reduced unknowns of the free interior parameters of all cameras and then of all
+            mounts, (s,). Derivatives of these parameters and of X, Y, Z, omega, phi, kappa of each mount by
+            the unknowns, 0 for fixed ones, (s, s). Both are empty without rigs.
         """
         if not self.rigged:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 0))
@@ -140,13 +140,14 @@ def unknowns_of(
     use_control: bool,
     image_sigma_factor: FloatArray | None = None,
 ) -> tuple[Unknowns, State]:
-    """Return the layout of the unknowns of a network and the state they start from.
+    """Return the layout of the unknowns of a network and their start values.
 
     Args:
-        network: what was measured.
-        estimate: start values; photographs and points without (NaN) are held out.
+        network: the measurements.
+        estimate: start values; photographs and points without start values (NaN) take no part.
         use_control: whether the control points of the network take part.
-        image_sigma_factor: on the stated standard deviations of each image point, 1 if not given, (k,).
+        image_sigma_factor: factor on the stated standard deviations of each image point, 1 if not given,
+            (k,).
 
     Raises:
         GeometryError: no image point can take part.
@@ -253,13 +254,13 @@ def unknowns_of(
 
 
 def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray) -> State:
-    """Return the state moved by a step.
+    """Return the state after a step.
 
     Args:
         layout: order of the unknowns.
-        state: where the step starts.
+        state: values of all unknowns before the step.
         reduced: step of the reduced unknowns, shape (reduced,).
-        points: step of the object points, kept ones included, shape (n, 3).
+        points: step of the object points, including kept ones, shape (n, 3).
     """
     poses = len(state.rig_from_object)
     moved = reduced[: 6 * poses].reshape(poses, 6)
@@ -294,13 +295,18 @@ def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray
 
 @compiled
 def _turn(M: FloatArray, exterior: FloatArray, turned: FloatArray) -> None:
-    """Fill turned (m, 3, 3) = exp(-[w]x) M, the inverse of R exp([w]x), with the steps (m, 6) of X0, w."""
+    """Fill `turned` with exp(-[w]x) M, the inverse of R exp([w]x), (m, 3, 3), from steps of X0, w, (m, 6)."""
     for i in range(len(M)):
         turn(M[i].T, exterior[i, 3], exterior[i, 4], exterior[i, 5], turned[i].T)
 
 
 def estimate_of(state: State, estimate: Estimate) -> Estimate:
-    """Return an estimate of the values of a state; cameras keep their names and models."""
+    """Return the values of a state as an estimate.
+
+    Args:
+        state: values of all unknowns.
+        estimate: estimate with the names and models of the cameras.
+    """
     cameras = tuple(
         camera.with_parameters(state.parameters[a, : len(camera.parameters)])
         for a, camera in enumerate(estimate.cameras)
@@ -313,12 +319,22 @@ def estimate_of(state: State, estimate: Estimate) -> Estimate:
 
 
 def start_weights(layout: Unknowns, state: State) -> FloatArray:
-    """Return weight 1 for image points that can take part, 0 for others and those behind the camera, (k,)."""
+    """Return weight 1 for image points that can take part and are in front of the camera, else 0, (k,).
+
+    Args:
+        layout: order of the unknowns.
+        state: values of all unknowns.
+    """
     return (layout.active & ~behind_camera(layout.observations, state)).astype(float)
 
 
 def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]]:
-    """Return (parameter, camera or group of cameras) of each interior unknown, in order of columns."""
+    """Return (parameter, camera or group of cameras) of each interior or mount unknown, in order of columns.
+
+    Args:
+        layout: order of the unknowns.
+        estimate: estimate with the cameras.
+    """
     first = layout.pose_free.size
     names = [("", "")] * (layout.kept_start - first)
     for camera, free, columns in zip(
@@ -337,10 +353,10 @@ def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]
 def _interior_columns(
     cameras: tuple[Camera, ...], interior_free: tuple[IntArray, ...], first: int
 ) -> tuple[tuple[IntArray, ...], int]:
-    """Return the column of each free parameter of each camera, from the first on, and how many there are.
+    """Return the column of each free parameter of each camera, starting at `first`, and their number.
 
     Raises:
-        GeometryError: cameras that share a parameter start from different values of it.
+        GeometryError: cameras that share a parameter have different start values for it.
     """
     seen: dict[tuple[str, str], tuple[int, Camera, float]] = {}
     columns, count = [], 0
@@ -373,10 +389,10 @@ def _hold_undetermined(
     point_free: BoolArray,
     point_known: BoolArray,
 ) -> tuple[BoolArray, IntArray, IntArray, tuple[str, ...], int]:
-    """Hold poses and points with too few image points, until none is left; clears their free flags.
+    """Hold poses and points with too few image points, repeatedly until none is left; clear their free flags.
 
-    Returns which image points take part, how many of the pose of each photograph and of each point, who is
-    held, in words, and the rank defect that these would have had.
+    Return which image points take part, their number for the pose of each photograph and for each point, the
+    held photographs and points in words, and the rank defect that these would have caused.
     """
     k = network.image_points
     n, poses = len(network.points), len(pose_free)
@@ -413,7 +429,7 @@ def _hold_undetermined(
 
 
 def _coupled_points(network: Network, point_on: BoolArray) -> IntArray:
-    """Return the points that observations couple with other unknowns, of those that take part, (s,)."""
+    """Return the points that take part and that observations couple with other unknowns, (s,)."""
     found = [np.zeros(0, dtype=np.int64)]
     for kind in network.kinds:
         blocks = kind.blocks()
@@ -425,10 +441,10 @@ def _coupled_points(network: Network, point_on: BoolArray) -> IntArray:
 
 
 def _rigs_of(network: Network, estimate: Estimate) -> tuple[IntArray, int, Mounts, BoolArray]:
-    """Return the pose of each photograph, how many there are, the mounts, and cameras with one beside 0.
+    """Return the pose of each photograph, the number of poses, the mounts, and cameras off the reference.
 
     Raises:
-        GeometryError: photographs of one moment that their cameras' rig does not join.
+        GeometryError: photographs of one moment have cameras that are not on one rig.
     """
     m, a = len(network.images), len(estimate.cameras)
     mounts = estimate.mounts
@@ -453,7 +469,7 @@ def _rigs_of(network: Network, estimate: Estimate) -> tuple[IntArray, int, Mount
 def _start_state(
     estimate: Estimate, o: Observations, mounts: Mounts, parameters: FloatArray, points: FloatArray
 ) -> State:
-    """Return the state of start values; the pose of a rig is that of its first oriented photograph."""
+    """Return the state of the start values; a rig takes the pose of its first oriented photograph."""
     M = np.ascontiguousarray(np.swapaxes(estimate.rotation, 1, 2))
     position, camera_from_rig = (
         estimate.position.copy(),
@@ -463,7 +479,7 @@ def _start_state(
         return State(position, M, parameters, points, position, M, mounts.position, camera_from_rig)
     first = np.full(o.poses, len(position), dtype=np.int64)
     oriented = np.flatnonzero(estimate.oriented)
-    # the reference camera before others
+    # the reference camera first
     order = oriented[np.argsort(o.mounted[o.camera[oriented]], kind="stable")]
     first[o.pose_of[order[::-1]]] = order[::-1]
     known = np.flatnonzero(first < len(position))
@@ -485,7 +501,7 @@ def _derived(
     poses: tuple[FloatArray, FloatArray],
     mounts: tuple[FloatArray, FloatArray],
 ) -> State:
-    """Return the state of poses and mounts, with the orientation of each photograph from both."""
+    """Return the state with the orientation of each photograph computed from its pose and mount."""
     (pose_position, rig_from_object), (mount_position, camera_from_rig) = poses, mounts
     at = rig_from_object[o.pose_of]
     position = pose_position[o.pose_of] + np.einsum("mba,mb->ma", at, mount_position[o.camera])

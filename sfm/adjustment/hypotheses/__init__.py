@@ -1,1 +1,1 @@
-"""Which assumption of a survey is wrong: alternatives that free something, tested against one another."""
+"""Finds wrong assumptions of a survey by alternative hypotheses, which free parameters and are compared."""

@@ -1,12 +1,12 @@
 """Alternative hypotheses, each with its gain, and common causes of rejected image points.
 
-A family is a set of columns; a pattern gives each photograph a factor on them, see `moved`. The level of
-the test is shared out among all alternatives, and lowered by what was searched inside each: the number of
-patterns, or of sets of points, from which the best one was taken.
+A family is a set of columns, and a pattern gives each photograph a factor on them, see `moved`. The level of
+the test is divided among all alternatives. It is also lowered by the search inside an alternative: the number
+of patterns, or of sets of points, from which the best was chosen.
 
-Common causes of rejected image points: names that were exchanged, points at a second place. The test of the
-adjustment has separated them from the good ones; here they are explained among themselves, with photographs
-as adjusted. They take no part in the tests of `alternatives`, which a few of them would decide.
+Rejected image points have common causes, such as exchanged names or points at a second position. The test of
+the adjustment has separated them from the good image points. Here they are explained on their own, with the
+adjusted photographs. They take no part in the tests of alternatives, because a few of them would dominate.
 
 Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
@@ -68,25 +68,25 @@ from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 
-MIN_EXCHANGED = 2  # photographs in which two names are exchanged, from which it is a rule and no accident
-MIN_RAYS = 3  # that meet at a second place; two nearly meet wherever they are along an epipolar line
-# Variance of a prediction and its measurement over that of the measurement, at most.
+MIN_EXCHANGED = 2  # photographs with two names exchanged from which this is systematic, not accidental
+MIN_RAYS = 3  # rays that meet at a second position; two nearly meet anywhere along an epipolar line
+# Largest ratio of the variance of a prediction plus its measurement to that of the measurement.
 MAX_PREDICTION_RATIO = 2.0
-ALPHA = 0.01  # probability of naming any alternative where none is true
+ALPHA = 0.01  # probability of naming any alternative if none is true
 OF_ONE = ("single", "pair")  # patterns of one photograph
 
 
 def alternatives_of(
     a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray] = ()
 ) -> tuple[Alternative, ...]:
-    """Return all alternatives, the best evidence first.
+    """Return all alternatives, best evidence first.
 
     Args:
-        a: adjustment of the image points alone; or with control, beside which only a change of the camera is
-            looked for, and what a wrong shape of the control explains as well.
+        a: adjustment of the image points alone, or with control. With control, only changes of the camera and
+            of the object, and a wrong shape of the control, are tested.
         reduced: its normal equations.
         columns: its derivatives.
-        bodies: object points of each rigid body that may move against the others.
+        bodies: object points of each rigid body that may move relative to the others.
     """
     if a.datum == "control":
         found = [*_by_photographs(a, reduced, columns), *_shapes_of_control(reduced, columns)]
@@ -105,12 +105,12 @@ def alternatives_of(
 def _by_evidence(
     a: Adjustment, reduced: Reduced, columns: Columns, found: Sequence[Alternative]
 ) -> tuple[Alternative, ...]:
-    """Return alternatives, the best evidence first, gains divided by what correlated errors make of them."""
+    """Sort alternatives by evidence, after dividing their gains by the design effect of correlated errors."""
 
     def tested(one: Alternative) -> Alternative:
         grows = log_likelihood_gain(one.gain.value, reduced.redundancy) - one.price
         if reduced.correlation is None or not grows > np.log(1 / ALPHA):
-            return one  # not named anyhow
+            return one  # not significant in any case
         effect = reduced.design_effect(reduced.whiten(one.columns(a, columns)))
         return one.with_design_effect(effect, reduced.redundancy)
 
@@ -118,10 +118,14 @@ def _by_evidence(
 
 
 def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
-    """Return how many alternatives are tested of an adjustment, but for some without any gain.
+    """Return the number of alternatives tested for an adjustment, including some that have no gain.
 
-    They are the held and given parameters, the families of photographs by their patterns, the format,
-    points that moved, and so many bodies.
+    They are held and given parameters, families of photographs with their patterns, the format, moved points
+    and moved bodies.
+
+    Args:
+        a: adjustment.
+        bodies: number of rigid bodies.
     """
     owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
     held = sum(len(one) + (len(one) > 1) for one in owners)
@@ -138,25 +142,35 @@ def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
 
 
 def is_significant(one: Alternative, rows: int) -> bool:
-    """Return whether chance makes so large a gain in fewer than ALPHA of the surveys, all rows together."""
+    """Return whether chance would produce such a gain in fewer than ALPHA of all surveys.
+
+    Args:
+        one: alternative.
+        rows: number of alternatives tested together.
+    """
     return bool(one.log_p < np.log(ALPHA / rows) - one.search)
 
 
 def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
-    """Return the gain from which an alternative is named, of a known variance factor.
+    """Return the smallest gain for which an alternative is named, with a known variance factor.
 
     Args:
-        rank: parameters of the alternative.
-        touched: image points that they move.
-        search: ln of the number of patterns from which it was taken.
-        rows: alternatives that are tested.
+        rank: number of parameters of the alternative.
+        touched: number of image points that they move.
+        search: ln of the number of patterns from which it was chosen.
+        rows: number of alternatives tested together.
     """
     level = np.exp(np.log(ALPHA / rows) - search)
     return float(max(chi2_isf(level, rank), 2 * (price_of(rank, touched, search) + np.log(1 / ALPHA))))
 
 
 def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tuple[tuple[int, int], ...]]]:
-    """Return for each camera, or group of cameras, its held or its given parameters: (camera, parameter)."""
+    """Return the held or given parameters of each camera or group of cameras, as (camera, parameter).
+
+    Args:
+        a: adjustment.
+        family: family of held or of given parameters.
+    """
     network = a.network
     given = network.interior
     owners: dict[str, dict[str, list[tuple[int, int]]]] = {}
@@ -167,7 +181,7 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
         if family.of_given:
             weighted = given.parameter[(given.camera == index) & (given.sigma > 0)]
             some = camera.free & np.isin(np.arange(len(camera.free)), weighted)
-        # the denominator of a fraction describes the same as its numerator
+        # the denominator of a fraction describes the same effect as its numerator
         for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
             owner = owners.setdefault(camera.owner_of(s), {})
             owner.setdefault(camera.names[s], []).append((index, s))
@@ -175,7 +189,13 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
 
 
 def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
-    """Return an alternative for each held or given interior parameter, and one for all of a camera."""
+    """Yield an alternative for each held or given interior parameter, and one for all of a camera.
+
+    Args:
+        a: adjustment.
+        reduced: its normal equations.
+        family: family of held or of given parameters.
+    """
     everywhere = Pattern("all", np.ones(len(a.network.images)))
     for sets in interior_parameters(a, family):
         whole = tuple(pair for one in sets for pair in one)
@@ -189,7 +209,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
             H, g, squares = reduced.project(freed)
             gain = gain_of(H, g, squares, least_share(len(H)))
             if gain.rank:
-                # what the photographs show of it once it, or all of the camera, are free
+                # evidence of the photographs once this parameter, or all parameters of the camera, are free
                 variance = float(gain.beta @ H @ gain.beta)
                 spread = min(
                     (
@@ -202,7 +222,7 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
 
 
 def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[Alternative]:
-    """Return the alternative of a family whose columns, px, (k, 2, q), are the same in all photographs."""
+    """Yield the alternative of a family with the same columns, px, (k, 2, q), in all photographs."""
     D = reduced.whiten(columns)
     H, g, squares = reduced.project(D)
     gain = gain_of(H, g, squares)
@@ -213,7 +233,7 @@ def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[A
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
-    """Return the spread of what the photographs show of one direction, (m,), over its expected variance.
+    """Return the spread of the scores of photographs in one direction, (m,), over their expected variance.
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
@@ -222,10 +242,10 @@ def _of_scores(scores: FloatArray, variance: float) -> Spread:
 
 
 def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
-    """Return the alternatives of cameras, strain and bending in some of the photographs.
+    """Yield the alternatives of cameras, strain and bending in some of the photographs.
 
-    Of more than MAX_RUNS photographs those next to one another in the sequence are taken together. A camera
-    changes in some of its photographs, an object in some of all.
+    If there are more than MAX_RUNS photographs, neighbours in the sequence are combined. A camera changes in
+    some of its own photographs, an object in some of all photographs.
     """
     camera = cameras_of_photographs(a)
     run = runs_of(camera)
@@ -240,7 +260,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
             part = Part(H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)])
             for pattern, factors, search in patterns_of(len(runs)):
                 if pattern in OF_ONE and not family.of_camera:
-                    continue  # an object that one photograph shows otherwise is that photograph's fault
+                    continue  # if only one photograph shows another shape, the fault lies with the photograph
                 gains = [part.gain(factor) for factor in factors]
                 best = max(range(len(gains)), key=lambda k: gains[k].value)
                 spread = part.spread(factors[best], gains[best])
@@ -261,27 +281,31 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
 
 
 def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
-    """Return the alternatives of control that is strained or bent, as all photographs show it."""
+    """Yield the alternatives of strained or bent control, which affects all photographs alike."""
     for family in OF_PHOTOGRAPHS:
         if not family.of_camera:
             yield from _in_all(reduced, family, columns.freedoms[:, :, list(family.places)])
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
-    """Return the number of the camera that took each photograph, (m,); varying parameters leave it one."""
+    """Return the camera number of each photograph, (m,); cameras that share parameters count as one.
+
+    Args:
+        a: adjustment.
+    """
     names = [camera.shared_name for camera in a.estimate.cameras]
     _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
     return np.asarray(number)
 
 
 def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> list[BoolArray]:
-    """Return the photographs among which some may differ, (m,) each: of each camera, or all of the object.
+    """Return the sets of photographs within which some may differ: those of each camera, or all, (m,) each.
 
     More than MAX_RUNS cameras are too many to test.
 
     Args:
-        family: what differs.
-        camera: `cameras_of_photographs`, (m,).
+        family: family of a camera or of the object.
+        camera: camera of each photograph, see `cameras_of_photographs`, (m,).
     """
     if not family.of_camera:
         return [np.ones(len(camera), dtype=bool)]
@@ -289,7 +313,7 @@ def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> 
 
 
 def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: int) -> FloatArray:
-    """Return the factors of photographs, (m,), from those of some of the runs, 0 in the others."""
+    """Return the factors of photographs, (m,), from the factors of some runs, with 0 in the others."""
     every = np.zeros(count)
     every[runs] = factor
     return every[run]
@@ -298,10 +322,10 @@ def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: in
 def _each(
     reduced: Reduced, H: FloatArray, g: FloatArray, squares: FloatArray, run: IntArray
 ) -> Iterator[Alternative]:
-    """Return the alternatives of a per-photograph camera.
+    """Yield the alternatives of a per-photograph camera.
 
-    It must exceed what all other freedoms of the photographs show once it is in, by an F test: errors that
-    the image points of a photograph have in common need not be those of a camera.
+    Such a camera must exceed, by an F test, the effect of all other freedoms of the photographs once it is
+    included. Errors common to the image points of a photograph need not come from the camera.
     """
     m, f = g.shape
     for family in OF_EACH:
@@ -324,7 +348,7 @@ def _each(
 
 
 def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
-    """Return the variance that an alternative leaves in some photographs, (m,), over that of all."""
+    """Return the variance that remains in some photographs, (m,), relative to that of all photographs."""
     v = reduced.v[some[reduced.image]]
     expected = v.size * reduced.redundancy / reduced.count
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
@@ -332,23 +356,23 @@ def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
 
 @dataclass(frozen=True)
 class SecondPlace:
-    """A point that some photographs show elsewhere."""
+    """A point that some photographs show at another position."""
 
     point: int
-    distance: float  # object unit
+    distance: float  # between both positions, object unit
     over_sigma: float  # the same in standard deviations of the difference
-    images: IntArray  # that show it there
+    images: IntArray  # photographs that show it there
 
 
 def explain_rejections(
     a: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
 ) -> tuple[Remark, ...]:
-    """Return what explains the rejected image points of an adjustment.
+    """Return remarks that explain the rejected image points of an adjustment.
 
     Args:
-        a: finished.
+        a: finished adjustment.
         unit: object unit, for the remarks.
-        bodies: names of the points of each rigid body, as a plate, that may move against the others.
+        bodies: names of the points of each rigid body, such as a plate, that may move relative to the others.
     """
     if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
         return ()
@@ -377,7 +401,7 @@ def explain_rejections(
 
 
 def _other_points(a: Adjustment) -> dict[int, int]:
-    """Return the rejected image points that lie where another point is seen, with that point."""
+    """Return the rejected image points that lie where another point is expected, with that point."""
     network, estimate, seen = a.network, a.estimate, a.network.image_points
     rejected = np.flatnonzero(a.rejected)
     tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(ALPHA, 2))) * a.sigma0_px
@@ -402,7 +426,7 @@ def _key(a: Adjustment, row: int, q: int) -> tuple[int, int]:
 
 
 def _exchanged(a: Adjustment, misnamed: dict[int, int]) -> tuple[dict[tuple[int, int], list[int]], list[int]]:
-    """Return the pairs of points exchanged in several photographs, with these, and the other image points."""
+    """Return the point pairs exchanged in several photographs, with these, and the remaining image points."""
     seen = a.network.image_points
     where: dict[tuple[int, int], dict[int, list[int]]] = defaultdict(lambda: defaultdict(list))
     for row, q in misnamed.items():
@@ -418,7 +442,7 @@ def _exchanged(a: Adjustment, misnamed: dict[int, int]) -> tuple[dict[tuple[int,
 
 
 def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
-    """Return the points of which rejected rays meet at another place."""
+    """Return the points with rejected rays that meet at another position."""
     seen = a.network.image_points
     left = np.array([row for row in np.flatnonzero(a.rejected).tolist() if row not in explained], dtype=int)
     places = []
@@ -441,9 +465,9 @@ def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
 def _of_places(
     a: Adjustment, places: list[SecondPlace], unit: str, bodies: Sequence[Collection[str]] = ()
 ) -> list[Remark]:
-    """Return a remark on points that moved together at one place in the sequence, and on each other point.
+    """Return remarks on points that moved together at one photograph, and on each other point.
 
-    Most of the points of one of several bodies, and no others, are that body.
+    Points that are most of one of several bodies, and nothing else, are reported as that body.
     """
     names = a.network.images
     together: dict[int, list[SecondPlace]] = defaultdict(list)

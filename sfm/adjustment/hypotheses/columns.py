@@ -1,9 +1,10 @@
-"""The columns that alternatives add: how each freedom moves an image point.
+"""Columns of the design matrix that alternatives add: derivatives of image points by each freedom.
 
-Camera: what c does to an image point in the camera's model, distortion included; and what principal point,
-radial, decentring and affine distortion do to it, for every model alike. Strain: a homogeneous deformation of
-the object without scale, which a photograph takes for its distance. Bending: a displacement that is quadratic
-in the coordinates. Interior: the derivatives of the camera's model.
+- Camera: the effect of c in the camera's model, including distortion; effects of principal point, radial,
+  decentring and affine distortion, the same for all models.
+- Strain: a homogeneous deformation of the object, without scale, which a photograph absorbs by its distance.
+- Bending: a displacement quadratic in the coordinates.
+- Interior: the derivatives by the parameters of the camera's model.
 
 Source: Brown (1971), Close-range camera calibration, Photogramm. Eng. 37(8); Foerstner and Wrobel (2016),
 Photogrammetric Computer Vision, sec. 4.6.4 (systematic errors), 12.2 (small rotations).
@@ -24,21 +25,21 @@ from sfm.similarity import mean_distance
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 STRAIN, BENDING = 5, 18  # columns
-CAMERA_PLACES = tuple(range(len(CAMERA)))  # in the freedoms of a photograph
+CAMERA_PLACES = tuple(range(len(CAMERA)))  # indices in the freedoms of a photograph
 STRAIN_PLACES = tuple(range(len(CAMERA), len(CAMERA) + STRAIN))
 BENDING_PLACES = tuple(range(len(CAMERA) + STRAIN, len(CAMERA) + STRAIN + BENDING))
-SMALL_MOVE_PX = 0.01  # by which a parameter moves image points where its derivative is taken
+SMALL_MOVE_PX = 0.01  # shift of image points by a parameter in its numerical derivative
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Derivatives of the k image points of an adjustment, rejected ones included, px."""
+    """Derivatives of the k image points of an adjustment, including rejected ones, px."""
 
-    exterior: FloatArray  # by X0 and the small rotation of their photograph, (k, 2, 6)
-    point: FloatArray  # by their object point, (k, 2, 3)
+    exterior: FloatArray  # derivatives by X0 and small rotation of the photograph, (k, 2, 6)
+    point: FloatArray  # derivatives by the object point, (k, 2, 3)
     freedoms: FloatArray
-    """by what a photograph may have by itself: `CAMERA`, px at the edge of the photograph, then strain and
-    bending of the object, its size as unit, (k, 2, 9 + 5 + 18)"""
+    """by the freedoms of a single photograph: `CAMERA`, px at the edge of the photograph, then strain and
+    bending of the object, with its size as unit, (k, 2, 9 + 5 + 18)"""
     usable: BoolArray  # whether all of these are finite, (k,)
 
 
@@ -79,9 +80,9 @@ def columns_of(a: Adjustment) -> Columns:
 
 
 def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return what the focal lengths of a camera do to image points, 1 px at the edge, (k, 2).
+    """Return the effect of the focal lengths of a camera on image points, 1 px at the edge, (k, 2).
 
-    A lens of another c takes the same rays through other parts of its distortion.
+    With another c, the same rays pass through other parts of the distortion.
 
     Args:
         camera: camera.
@@ -98,10 +99,10 @@ def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
 
 
 def _camera(flat: FloatArray) -> FloatArray:
-    """Return what the freedoms of a camera but c do to image points, 1 px at the edge, (k, 2, 8).
+    """Return the effect of the freedoms of a camera other than c, 1 px at the edge, (k, 2, 8).
 
     Args:
-        flat: tangents over that of half the longer side, y up, (k, 2).
+        flat: tangents divided by that of half the longer side, y up, (k, 2).
     """
     x, y = flat.T
     r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
@@ -111,9 +112,12 @@ def _camera(flat: FloatArray) -> FloatArray:
 
 
 def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
-    """Return the displacement of points by strain and bending, (n, 3, 5 + 18), and the object's size.
+    """Return the displacements of points by strain and bending, (n, 3, 5 + 18), and the size of the object.
 
-    A parameter of 1 is a displacement as large as the object, its root mean square distance from the centre.
+    The size is the root mean square distance from the centre. A parameter of 1 displaces points by that size.
+
+    Args:
+        points: object points, NaN where unknown, (n, 3).
     """
     known = np.asarray(np.isfinite(points).all(axis=1))
     centre = points[known].mean(axis=0)
@@ -136,9 +140,13 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 def body_motions(points: FloatArray, some: IntArray) -> FloatArray:
-    """Return the displacement of points (n, 3) by the motions of a body that some of them are on, (n, 3, 6).
+    """Return the displacements of points by the six motions of a rigid body, (n, 3, 6).
 
-    Three shifts, and three small rotations about its centre, which move its points by 1 as well.
+    The motions are three shifts and three small rotations about its centre, which also move its points by 1.
+
+    Args:
+        points: object points, (n, 3).
+        some: indices of the points on the body.
     """
     away = points[some] - points[some].mean(axis=0)
     moved = np.zeros((len(points), 3, 6))
@@ -150,8 +158,13 @@ def body_motions(points: FloatArray, some: IntArray) -> FloatArray:
 def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatArray:
     """Return the derivatives of all image points by parameters of one camera, (k, 2, len(parameters)).
 
-    They are 0 in photographs of other cameras, and in px for a move of `SMALL_MOVE_PX`, so that parameters of
-    all units have columns of about one size.
+    They are 0 in photographs of other cameras. The unit of a parameter is scaled so that its largest effect
+    is 1 px. So parameters of all units have columns of similar size.
+
+    Args:
+        a: adjustment.
+        index: index of the camera.
+        parameters: indices of its parameters.
     """
     camera = a.estimate.cameras[index]
     rows, uv = _tangents_of(a, index)
@@ -167,7 +180,13 @@ def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatA
 
 
 def interior_step(a: Adjustment, index: int, parameter: int) -> float:
-    """Return by how much a parameter changes for one unit of its column in `interior_columns`."""
+    """Return the change of a parameter for one unit of its column in `interior_columns`.
+
+    Args:
+        a: adjustment.
+        index: index of the camera.
+        parameter: index of the parameter.
+    """
     return _step(a.estimate.cameras[index], parameter, _tangents_of(a, index)[1]) / SMALL_MOVE_PX
 
 
@@ -184,14 +203,15 @@ def _tangents_of(a: Adjustment, index: int) -> tuple[IntArray, FloatArray]:
 def shared_columns(
     a: Adjustment, parameters: list[tuple[int, int]]
 ) -> tuple[FloatArray, list[tuple[str, str]], list[float]]:
-    """Return the columns of interior parameters, one for all cameras that share a parameter.
+    """Return the columns of interior parameters; cameras that share a parameter have one column for it.
 
     Args:
-        a: the adjustment.
-        parameters: (camera, index of the parameter).
+        a: adjustment.
+        parameters: (camera, parameter) by their indices.
 
     Returns:
-        Columns (k, 2, g), (camera or group, name) of each, and the change of the parameter for one unit.
+        Columns (k, 2, g), (camera or group, parameter name) of each, and the change of the parameter for one
+        unit of the column.
     """
     groups: dict[tuple[str, str], FloatArray] = {}
     units: dict[tuple[str, str], float] = {}
@@ -207,7 +227,7 @@ def shared_columns(
 
 
 def _step(camera: Camera, s: int, uv: FloatArray) -> float:
-    """Return the step of a parameter that moves the image points by `SMALL_MOVE_PX` at most."""
+    """Return the step of a parameter that moves image points by at most `SMALL_MOVE_PX`."""
     step = 1e-6 * max(abs(float(camera.parameters[s])), 1e-6)
     at = pixel_from_tangents(camera, uv)
     for _ in range(20):

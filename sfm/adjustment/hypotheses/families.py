@@ -1,7 +1,6 @@
-"""Alternatives: one class for each family, with the columns it frees, its remark and displacements.
+"""Families of alternatives: a class for each, with the columns that it frees, its remark and displacements.
 
-A family is a set of columns. A new one is a class here, and a line that looks for it in
-`sfm.adjustment.hypotheses.alternatives`.
+A new family needs a class here, and a line in `sfm.adjustment.hypotheses.alternatives` that tests it.
 """
 
 from __future__ import annotations
@@ -35,33 +34,33 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.remarks.remark import Quantity
 from sfm.similarity import without_motions
 
-SEEN_PX = 1e-3  # change of an image coordinate that no measurement shows
-CELLS = 5  # of the format in each direction
+SEEN_PX = 1e-3  # change of an image coordinate below which no measurement shows it
+CELLS = 5  # cells of the format in each direction
 
 Parts = dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | None]
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """One alternative and the outcome of its score test."""
+    """One alternative and the result of its score test."""
 
     family: Family
     pattern: str  # single | split | linear | alternating | group | each | all
-    factor: FloatArray  # of each photograph, (m,)
+    factor: FloatArray  # factor of each photograph, (m,)
     gain: Gain
-    spread: Spread  # of the parts that it does not concern
+    spread: Spread  # spread of the photographs or cameras outside the family
     log_p: float  # ln of the probability by chance
-    price: float  # q / 2 ln n and ln of the number of patterns and sets from which it was taken
-    search: float  # the latter
-    evidence: float  # gain of ln likelihood less the price
-    points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
+    price: float  # q / 2 ln n, plus ln of the number of patterns and sets from which it was chosen
+    search: float  # ln of that number
+    evidence: float  # gain of ln likelihood minus the price
+    points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # moved points
     parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
-    among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
-    design_effect: float = 1.0  # by which errors that neighbours have in common multiply its gain by chance
+    among: BoolArray | None = None  # photographs within which some differ, (m,); None: all
+    design_effect: float = 1.0  # factor of correlated errors of neighbours on the gain expected by chance
 
     @property
     def photographs(self) -> IntArray:
-        """The fewer photographs: those that differ from the others."""
+        """Photographs that differ from the others: the smaller of the two sets."""
         among = np.ones(len(self.factor), dtype=bool) if self.among is None else self.among
         on = np.flatnonzero(among & (self.factor > 0))
         off = np.flatnonzero(among & (self.factor <= 0))
@@ -69,15 +68,25 @@ class Alternative:
 
     @property
     def kind(self) -> str:
-        """Kind of the remark that it is."""
+        """Kind of its remark."""
         return self.family.kind(self.pattern)
 
     def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
+        """Return its columns for all image points of an adjustment, px, (k, 2, q).
+
+        Args:
+            a: adjustment.
+            columns: derivatives of its image points.
+        """
         return self.family.columns(self, a, columns)
 
     def with_design_effect(self, effect: float, redundancy: int) -> Alternative:
-        """Return it tested with its gain divided by a design effect, of an adjustment of some redundancy."""
+        """Return the alternative tested with its gain divided by a design effect.
+
+        Args:
+            effect: design effect of correlated errors.
+            redundancy: redundancy of the adjustment.
+        """
         gain = self.gain.value / effect
         return replace(
             self,
@@ -87,7 +96,12 @@ class Alternative:
         )
 
     def deflated(self, gain: float, redundancy: int) -> float:
-        """Return a gain of ln likelihood by it with that of v'Pv divided by its design effect."""
+        """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect.
+
+        Args:
+            gain: gain of ln likelihood.
+            redundancy: redundancy of the adjustment.
+        """
         if self.design_effect == 1:
             return gain
         return log_likelihood_gain(squares_gained(gain, redundancy) / self.design_effect, redundancy)
@@ -98,11 +112,11 @@ class Family(ABC):
     """A set of columns that may be freed."""
 
     name: str
-    unchecked: ClassVar[str] = ""  # the remark where errors of the assumption stay unnoticed, if it is made
+    unchecked: ClassVar[str] = ""  # remark if errors of the assumption would stay unnoticed; "": none
 
     @abstractmethod
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
 
     @abstractmethod
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
@@ -114,33 +128,33 @@ class Family(ABC):
 
         Args:
             one: the alternative.
-            a: adjustment with it.
-            beta: its parameters, (q,).
+            a: adjustment with the alternative.
+            beta: parameters of the alternative, (q,).
             unit: object unit.
         """
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of: of those with one cause the best is adjusted only."""
+        """Return a key for the cause; of alternatives with the same cause only the best is adjusted."""
         return (self.name,)
 
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
-        """Return how far object points are from their mean where photographs differ most, (n, 3)."""
+        """Return the displacement of object points in the photographs that differ most, (n, 3)."""
         return np.zeros_like(points)
 
 
 @dataclass(frozen=True)
 class OfPhotographs(Family):
-    """Some of the freedoms that a photograph may have by itself: `Columns.freedoms`.
+    """Some of the freedoms of a single photograph, see `Columns.freedoms`.
 
-    In the pattern `each` every photograph, or run of photographs, has a factor: their factors number the
-    runs.
+    In the pattern `each`, every photograph or run of photographs has its own parameters; the factors are then
+    the numbers of the runs.
     """
 
-    places: tuple[int, ...]  # in the freedoms
-    of_camera: ClassVar[bool]  # whether a camera has it, which took some of the photographs
+    places: tuple[int, ...]  # indices in the freedoms
+    of_camera: ClassVar[bool]  # whether the freedoms belong to a camera rather than the object
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points, px, (k, 2, q)."""
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         factor = one.factor[a.network.image_points.image]
         freedoms = columns.freedoms[:, :, list(self.places)]
         if one.pattern != "each":
@@ -158,27 +172,27 @@ class CameraFamily(OfPhotographs):
     unchecked = "camera_weakly_tested"
 
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
         kinds = {"linear": "camera_drift", "each": "camera_varies", "pair": "two_cameras"}
         return kinds.get(pattern, "other_camera")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of."""
+        """Return a key for the cause: photographs of a camera."""
         if one.pattern == "each":
             return ("camera", "each")
-        return ("camera", *one.photographs.tolist())  # with few or many parameters
+        return ("camera", *one.photographs.tolist())  # one key for any number of parameters
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return by how much c and the principal point differ."""
+        """Return the photographs and the differences of c and of the principal point."""
         half = max(a.estimate.cameras[a.network.camera[one.photographs[0]]].size_px) / 2
         if one.pattern == "each":
             return self._of_each(beta.reshape(-1, len(self.places)), half)
         linear = one.pattern == "linear"
         photographs = one.photographs
-        if one.pattern == "pair" and one.among is not None:  # which of the two differs is not known
+        if one.pattern == "pair" and one.among is not None:  # it is unknown which of the two differs
             photographs = np.flatnonzero(one.among)
         sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
-        # a column is 1 px at the edge, and moves what is measured
+        # a column of 1 moves an image point at the edge by 1 px
         largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
         parts: Parts = {
             "photographs": tuple(a.network.images[i] for i in photographs),
@@ -193,7 +207,7 @@ class CameraFamily(OfPhotographs):
         return parts
 
     def _of_each(self, beta: FloatArray, half: float) -> Parts:
-        """Return how far photographs are from their mean at most, of parameters of each, (m, f)."""
+        """Return the largest deviations of photographs from their mean; beta are their parameters, (m, f)."""
         off = beta - beta.mean(axis=0)
         parts: Parts = {}
         if 0 in self.places:
@@ -212,16 +226,16 @@ class ObjectFamily(OfPhotographs):
     unchecked = "shape_weakly_tested"
 
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
         kinds = {"linear": "object_deforming", "all": "shape_of_control"}
         return kinds.get(pattern, "object_deformed")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of."""
+        """Return a key for the cause: a pattern of the object."""
         return ("object", one.pattern)
 
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
-        """Return how far points are from their mean where photographs differ most, (n, 3)."""
+        """Return the displacement of points in the photographs that differ most, (n, 3)."""
         largest = float(np.abs(one.factor - one.factor.mean()).max())
         return largest * without_motions(points, (self._field(points)[0] @ beta)[:, :, None])[:, :, 0]
 
@@ -242,30 +256,30 @@ class ObjectFamily(OfPhotographs):
 
 @dataclass(frozen=True)
 class PointFamily(Family):
-    """Object points that moved: each by itself, all by one vector, or all as a body."""
+    """Object points that moved: each on its own, all by one vector, or all as a body."""
 
     remark: str = "points_moved"
 
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
         return self.remark
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of."""
+        """Return a key for the cause: a pattern of the object."""
         return ("object", one.pattern)
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points, px, (k, 2, q)."""
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         seen = a.network.image_points
         field_ = self.field(a.estimate.points, one.points)[seen.point]
         return np.asarray(one.factor[seen.image][:, None, None] * (columns.point @ field_))
 
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
-        """Return how far points are from their mean where photographs differ most, (n, 3)."""
+        """Return the displacement of points in the photographs that differ most, (n, 3)."""
         return np.asarray(self.field(points, one.points) @ beta)
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return which points moved, how far at most, and the first photograph after."""
+        """Return the points that moved, the largest displacement, and the first photograph afterwards."""
         away = self.displaced(one, a.estimate.points, beta)[one.points]
         return {
             "photographs": tuple(a.network.images[i] for i in one.photographs),
@@ -275,7 +289,7 @@ class PointFamily(Family):
         }
 
     def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) where some of them move, (n, 3, q)."""
+        """Return the displacements of points (n, 3) if some of them move, (n, 3, q)."""
         each = np.zeros((len(points), 3, len(some), 3))
         each[some, :, np.arange(len(some))] = np.eye(3)
         return each.reshape(len(points), 3, -1)
@@ -286,7 +300,7 @@ class ShiftedFamily(PointFamily):
     """Object points that moved by one vector."""
 
     def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) where some of them move, (n, 3, 3)."""
+        """Return the displacements of points (n, 3) if some of them move, (n, 3, 3)."""
         shift = np.zeros((len(points), 3, 3))
         shift[some] = np.eye(3)
         return shift
@@ -297,38 +311,38 @@ class BodyFamily(PointFamily):
     """Object points of a rigid body that moved, by a vector and a small rotation."""
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of."""
+        """Return a key for the cause: a body."""
         return ("body", int(one.points[0]))
 
     def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) where some of them move, (n, 3, 6)."""
+        """Return the displacements of points (n, 3) if some of them move, (n, 3, 6)."""
         return body_motions(points, some)
 
 
 @dataclass(frozen=True)
 class InteriorFamily(Family):
-    """Interior parameters that are held, or given with a standard deviation.
+    """Interior parameters that are held fixed, or given with a standard deviation.
 
-    A column for a given parameter, free already, takes from the image points what its given value asks for:
-    what is then adjusted is the given value, and the gain is that of leaving it out.
+    A given parameter is already free. Its additional column lets the image points deviate from the given
+    value. The adjusted value then equals the given one, and the gain is that of leaving the given value out.
     """
 
     of_given: bool = False
 
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
         return "given_parameter" if self.of_given else "held_parameter"
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return what an alternative is a case of: single ones, and all of a camera."""
+        """Return a key for the cause: single parameters, or all of a camera."""
         return (self.name, len({s for _, s in one.parameters}) > 1)
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points, px, (k, 2, q)."""
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         return shared_columns(a, list(one.parameters))[0]
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return which parameters they are, and the value of a single one that the image points ask for."""
+        """Return the parameters and, for a single one, the value that fits the image points."""
         index, s = one.parameters[0]
         camera = a.estimate.cameras[index]
         measure = "" if camera.units[s] == "1" else camera.units[s]
@@ -349,11 +363,11 @@ class FormatFamily(Family):
     """A displacement of image points for each cell of the format."""
 
     def kind(self, pattern: str) -> str:
-        """Return the kind of remark that an alternative of this family is."""
+        """Return the kind of remark for an alternative of this family."""
         return "distortion_not_described"
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points, px, (k, 2, q)."""
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         return format_columns(a)
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
@@ -362,7 +376,13 @@ class FormatFamily(Family):
 
 
 def format_columns(a: Adjustment) -> FloatArray:
-    """Return a displacement for each cell of the format, photographs of all sizes alike, (k, 2, 2 cells)."""
+    """Return the columns of a displacement of each cell of the format, (k, 2, 2 cells).
+
+    Photographs of all sizes have the same cells.
+
+    Args:
+        a: adjustment.
+    """
     network = a.network
     seen = network.image_points
     size = np.array([camera.size_px for camera in a.estimate.cameras])[network.camera[seen.image]]
@@ -379,7 +399,7 @@ CAMERA_FAMILIES = (
     CameraFamily("camera", CAMERA_PLACES),
 )
 STRAIN = ObjectFamily("strain", STRAIN_PLACES)
-# what a stabiliser moves is x0 and y0 alone; of each photograph these few are affordable
+# a stabiliser moves x0 and y0 only; such a small set is affordable for each photograph
 OF_EACH = (CAMERA_FAMILIES[0], CameraFamily("point", (1, 2)), *CAMERA_FAMILIES[1:])
 OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     *CAMERA_FAMILIES,

@@ -1,8 +1,9 @@
-"""Which assumption of a survey is wrong, if any: alternatives are tested, the best is adjusted and judged.
+"""Finds the assumption of a survey that is wrong, if any: tests alternatives, adjusts and judges the best.
 
-All alternatives are tested at once over the accepted image points of the free network, without adjusting
-again. The best one that chance does not make is adjusted with everything; it is named if its likelihood
-pays for its parameters and for the search, and if coordinates shift by a standard deviation or more.
+All alternatives are tested at once with the accepted image points of the free network, without a new
+adjustment. The best alternatives that chance does not explain are adjusted with all unknowns. The best of
+these is named if its likelihood outweighs its parameters and the search, and if coordinates shift by at least
+one standard deviation.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4 and 4.6.5 (separability).
 """
@@ -45,16 +46,16 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import reported
 
-MAX_CAUSES = 2  # that are looked for one after another
-MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
-MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
-MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
-MIN_OF_BODY = 3  # points that determine its six motions
-OF_FREE_POINTS = (  # which given points make untrue
+MAX_CAUSES = 2  # number of causes, sought one after another
+MAX_TRIED = 2  # alternatives of each kind that are adjusted, those with most evidence in the score test
+MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points with most rays are used
+MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
+MIN_OF_BODY = 3  # points that determine the six motions of a body
+OF_FREE_POINTS = (  # remarks that do not apply to given points
     *("assumptions_untested", "photographs_untested"),
     *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
 )
-# Standard deviations by which coordinates shift, below which a cause is of no consequence.
+# Shift of coordinates, in standard deviations, below which a cause does not matter.
 MIN_NAMED_SIGMAS = 1.0
 
 
@@ -64,11 +65,11 @@ class Cause:
 
     alternative: Alternative
     refit: Refit
-    as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
+    as_well: tuple[Alternative, ...]  # other causes that explain the image points almost as well
 
     @property
     def evidence(self) -> float:
-        """Gain of ln likelihood, freedoms and search paid for."""
+        """Gain of ln likelihood minus the price of parameters and search."""
         redundancy = self.refit.adjustment.redundancy
         return self.alternative.deflated(self.refit.gain, redundancy) - self.alternative.price
 
@@ -77,8 +78,8 @@ class Cause:
 class JudgedAssumptions:
     """Tests of the assumptions of an adjustment by the image points."""
 
-    causes: tuple[Remark, ...] = ()  # of what contradicts them, the clearest first
-    unchecked: tuple[Remark, ...] = ()  # on assumptions that are not tested, or weakly
+    causes: tuple[Remark, ...] = ()  # causes of contradictions, clearest first
+    unchecked: tuple[Remark, ...] = ()  # assumptions that are not tested, or only weakly
 
 
 def judge_alternatives(
@@ -87,13 +88,13 @@ def judge_alternatives(
     """Return the evidence of the image points against the assumptions of an adjustment.
 
     Args:
-        final: a finished adjustment with its covariance.
+        final: finished adjustment with its covariance.
         unit: object unit, for the remarks.
-        bodies: names of the points of each rigid body, as a plate, that may move against the others.
+        bodies: names of the points of each rigid body, such as a plate, that may move relative to the others.
     """
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
-        return JudgedAssumptions()  # no result, or one that nothing contradicts
+        return JudgedAssumptions()  # no result, or an exact one, which nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return JudgedAssumptions(unchecked=(remark("too_many_to_test", photographs=photographs),))
     calibration = _is_calibration(final)
@@ -115,7 +116,7 @@ def judge_alternatives(
 def _judge_free(
     plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], without: str | None
 ) -> JudgedAssumptions:
-    """Return the evidence of the image points alone; without their network if they determine none."""
+    """Return the evidence of the image points alone; `plain` is None if they determine no network."""
     if plain is None:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
@@ -132,9 +133,9 @@ def _judge_free(
 
 
 def _is_calibration(final: Adjustment) -> bool:
-    """Return whether cameras are adjusted, most points are given, and nothing else is.
+    """Return whether cameras are adjusted, most points are given, and nothing else is given.
 
-    Those that are not may be given ones that were left out, as a changed camera moves them.
+    The other points may be given ones that were left out because a changed camera displaces them.
     """
     network = final.network
     given, seen = network.control.complete.point, network.image_points.point[~final.rejected]
@@ -144,7 +145,7 @@ def _is_calibration(final: Adjustment) -> bool:
 
 
 def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
-    """Return a remark for each camera of which there are MIN_GROUP photographs at most."""
+    """Return a remark for each camera with at most MIN_GROUP photographs."""
     number, names = cameras_of_photographs(final), np.array(final.network.images)
     return tuple(
         remark(
@@ -158,13 +159,15 @@ def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
 
 
 def cause_in_calibration(final: Adjustment) -> Cause | None:
-    """Return what given points show: another camera in some photographs, or control that is strained.
+    """Return the cause that given points reveal: another camera in some photographs, or strained control.
 
-    Image points alone show little of the cameras of a few photographs, or of many of a plane. Control that is
-    bent takes up what targets of a plate have in common as well, and is no more than what no camera explains.
+    Image points alone reveal little about the cameras of a few photographs, or of many photographs of a
+    plane.
+    Bent control is no cause. It also absorbs errors common to the targets of a plate, so it only represents
+    what no camera explains.
 
     Args:
-        final: a finished adjustment of photographs of points most of which are given.
+        final: finished adjustment in which most points are given.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -179,10 +182,10 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     """Return the remark on a cause.
 
     Args:
-        plain: the adjustment without it.
+        plain: adjustment without the cause.
         cause: the accepted alternative.
         unit: object unit.
-        without: what fixes all coordinates of the result, so that only those of `plain` shift.
+        without: name of what fixes all coordinates of the result, so that only those of `plain` shift.
     """
     one, found = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
@@ -195,7 +198,7 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
 
 
 def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:
-    """Return the points of each body that may move against others; of two both motions are the same."""
+    """Return the points of each body that may move relative to others; of a pair only one body is kept."""
     names, known = plain.network.points, np.isfinite(plain.estimate.points).all(axis=1)
     members = [known & np.isin(names, list(one)) for one in bodies]
     members = [one for one in members if one.sum() >= MIN_OF_BODY and (known & ~one).sum() >= MIN_OF_BODY]
@@ -208,11 +211,11 @@ def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tupl
 
 
 def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cause, ...]:
-    """Return the alternatives that hold, the clearest first.
+    """Return the accepted alternatives, clearest first.
 
     Args:
-        plain: adjustment of the image points alone, gross errors rejected.
-        bodies: object points of each rigid body that may move against the others.
+        plain: adjustment of the image points alone, with gross errors rejected.
+        bodies: object points of each rigid body that may move relative to the others.
     """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
@@ -222,13 +225,14 @@ def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cau
         causes = _still_needed(plain, causes, found)
     return tuple(
         one for one in causes if not one.refit.shift < MIN_NAMED_SIGMAS
-    )  # one not known is as bad as can be
+    )  # an unknown shift (NaN) counts as large
 
 
 def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArray] = ()) -> Cause | None:
-    """Return the accepted alternative beside others: of those of most evidence the one that adjusts best.
+    """Return the accepted alternative, in addition to known causes, that gives the best adjustment.
 
-    The score test is linear, and of a large error the alternative with most parameters has most evidence.
+    The alternatives with most evidence are adjusted, because the score test is linear: for a large error it
+    favours the alternative with most parameters.
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(one.alternative, one.refit.beta) for one in causes]
@@ -239,7 +243,7 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
     for one in every:
         if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA):
             once.setdefault(one.family.cause(one), one)
-    if once:  # what one parameter of all photographs explains needs no other cause, however these differ
+    if once:  # if one parameter of all photographs explains the errors, no other cause is needed
         for one in every:
             gained = log_likelihood_gain(one.gain.value / one.design_effect, reduced.redundancy)
             if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
@@ -285,9 +289,9 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
 
 
 def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
-    """Return the gain of ln likelihood by another cause beyond what photographs differ by anyhow.
+    """Return the gain of ln likelihood by another cause beyond the usual differences between photographs.
 
-    Of the first cause it is not known: the same large error makes photographs differ.
+    It is not known for the first cause, because its large error itself makes photographs differ.
     """
     if isinstance(one.family, InteriorFamily):
         return gain
@@ -296,7 +300,7 @@ def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
-    """Return the causes with another one: those before, adjusted with it, unless it explains them too."""
+    """Return the causes with a new one; the earlier ones are dropped if the new one explains them too."""
     if not causes:
         return (found,)
     together = found.refit
@@ -317,13 +321,14 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) ->
 
 
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
-    """Return the held interior parameters that the image points contradict, the clearest first.
+    """Return the held interior parameters that the image points contradict, clearest first.
 
     Args:
-        a: a finished adjustment.
+        a: finished adjustment.
 
     Returns:
-        (camera or group of cameras, parameter) of each that freeing alone improves beyond chance.
+        (camera or group of cameras, parameter) for each parameter that improves the fit beyond chance when
+        it alone is freed.
     """
     plain = free_network(a) if len(a.network.images) <= MAX_PHOTOGRAPHS else None
     if plain is None:
@@ -343,7 +348,11 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
 
 
 def free_network(final: Adjustment) -> Adjustment | None:
-    """Return the adjustment of the image points alone, gross errors rejected; None if it is no solution."""
+    """Return the adjustment of the image points alone, with gross errors rejected; None without a solution.
+
+    Args:
+        final: finished adjustment.
+    """
     if not final.converged or not final.sigma0 > 0 or final.redundancy < 2:
         return None
     network, correlation = final.network, final.error_correlation
@@ -358,13 +367,13 @@ def free_network(final: Adjustment) -> Adjustment | None:
 def adjust_image_points(
     network: Network, estimate: Estimate, rejected: BoolArray, factor: FloatArray
 ) -> Adjustment | None:
-    """Adjust the image points of a network alone, a part of many; None where they determine no solution.
+    """Adjust the image points of a network alone, or a sample of many; None if they determine no solution.
 
     Args:
-        network: of photographs and points that are all known.
+        network: network in which all photographs and points have start values.
         estimate: start values.
-        rejected: image points that are left out at the start, (k,).
-        factor: on the standard deviations of image points, (k,).
+        rejected: image points left out at the start, (k,).
+        factor: factor on the standard deviations of image points, (k,).
     """
     part, start, rows = _sample(without_given(network), estimate)
     try:
@@ -383,7 +392,11 @@ def adjust_image_points(
 
 
 def best_explanation(plain: Adjustment) -> Cause | None:
-    """Return the alternative that explains an adjustment of image points alone best, if one does."""
+    """Return the alternative that best explains an adjustment of image points alone; None if none does.
+
+    Args:
+        plain: adjustment of image points alone.
+    """
     if len(plain.network.images) > MAX_PHOTOGRAPHS:
         return None
     try:
@@ -393,9 +406,9 @@ def best_explanation(plain: Adjustment) -> Cause | None:
 
 
 def _sample(network: Network, whole: Estimate) -> tuple[Network, Estimate, BoolArray]:
-    """Return a network of about `MAX_IMAGE_POINTS`, its estimate, and which image points it has.
+    """Return a network of about MAX_IMAGE_POINTS image points, its estimate, and which these are.
 
-    Points of many rays come first, and each photograph has its share.
+    Points with many rays are preferred, and each photograph gets its share.
     """
     seen, m = network.image_points, len(network.images)
     points = np.ones(len(network.points), dtype=bool)

@@ -1,16 +1,17 @@
-"""Alternatives of an object or a rig that moved, and the patterns of photographs they affect.
+"""Alternatives of moved points, bodies and rig cameras, and the patterns of photographs that they affect.
 
-They moved at a place in the sequence of photographs. Points that move by different vectors are tried by
-their single gains, those that shift by one vector by two means, and bodies as they are known.
+Points move between two photographs of the sequence. Sets of points with different vectors are built in the
+order of their single gains. Sets that shift by one vector are found by two-means clustering. Bodies are
+given.
 
-Whether the cameras of a rig kept their places: a test of each photograph for a separate pose.
+`find_bumps` tests whether the cameras of a rig kept their mounts, by a separate pose of each photograph. E
+are the derivatives of its image points by a separate pose, v the whitened residuals, and R = I - A Q A'. The
+shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square with six degrees of
+freedom. The photographs of all rigs are tested together. The largest shift comes first, and each further one
+is tested jointly with those found before.
 
-With the derivatives E of the image points of one photograph by a separate pose, the whitened residuals v
-and R = I - A Q A', its shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square
-of six. The photographs of a rig are tested together, the largest shift first, each beside those found before.
-
-The patterns: photographs in which a family is freed, with its gain and the test of the alternative. A pattern
-gives each photograph, or run of photographs, a factor on the columns of a family.
+A `Pattern` gives each photograph, or run of photographs, a factor on the columns of a family. `Part` computes
+the gain of a pattern, and `score_alternative` the test.
 
 Source: Baarda (1968), A testing procedure for use in geodetic networks; Foerstner and Wrobel (2016), sec.
 4.6.4 (groups of parameters).
@@ -55,23 +56,27 @@ from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
 
 MIN_GROUP = 2  # photographs on each side of a split
-MAX_RUNS = 60  # photographs, or runs of them, that have freedoms by themselves
-ROUNDS = 20  # of two means
-STARTS = 8  # photographs from which a group is grown
-FALSE_ALARM = 0.01  # probability that a rig without a bump is reported to have one
+MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
+ROUNDS = 20  # iterations of two-means clustering
+STARTS = 8  # photographs or points from which a group is grown
+FALSE_ALARM = 0.01  # probability that a bump is reported for a rig without one
 MIN_REDUNDANCY = 1e-9  # redundancy of a separate pose below which nothing checks it
-MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten seconds
-MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
-MAX_MOVED = 60  # points that are tried together
+MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds
+MAX_SPLITS = 12  # positions in the sequence at which a movement is tested
+MAX_MOVED = 60  # points that are tested together
 
 
 def moved_points(reduced: Reduced) -> Iterator[Alternative]:
-    """Return for each place in the sequence the set of points that moved there with the best evidence."""
+    """Yield the best alternative of each family of moved points, over all positions in the sequence.
+
+    Args:
+        reduced: normal equations of the adjustment.
+    """
     m = reduced.photographs
     if m < 2 * MIN_GROUP:
         return
     splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
-    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # of one place
+    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # products of one split
     affordable = max(1, min(MAX_SPLITS, int(MAX_PRODUCTS / products)))
     splits = splits[:: -(-len(splits) // affordable)]
     best: dict[str, Alternative] = {}
@@ -83,7 +88,7 @@ def moved_points(reduced: Reduced) -> Iterator[Alternative]:
 
 
 def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[Alternative]:
-    """Return the set of points that moved between the photographs of factor 0 and those of factor 1."""
+    """Yield the sets of points that moved between the photographs with factor 0 and those with factor 1."""
     n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
     on = factor[reduced.image] > 0
     D = np.where(on[:, None, None], reduced.B, 0.0)
@@ -95,7 +100,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     movable = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
     if not len(movable):
         return
-    # A'D of each point, reduced by the point itself
+    # A'D of each point, with the point itself eliminated
     by = np.swapaxes(reduced.B[on], 1, 2) @ reduced.A[on]
     K = points_by_cameras(by, reduced.point[on], reduced.image[on], n, m)
     K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
@@ -137,9 +142,16 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
 def moved_bodies(
     a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray]
 ) -> Iterator[Alternative]:
-    """Return for each body that it moved, at the best place in the sequence.
+    """Yield the alternative that a body moved, for each body, at the best position in the sequence.
 
-    One photograph gives the place of a body, so that it may move behind the first and before the last.
+    One photograph determines the pose of a body. So a body may move right after the first photograph, or
+    right before the last.
+
+    Args:
+        a: adjustment.
+        reduced: its normal equations.
+        columns: derivatives of its image points.
+        bodies: object points of each body.
     """
     if reduced.photographs < 2 * MIN_GROUP:
         return
@@ -157,7 +169,7 @@ def moved_bodies(
 
 
 def _log_sets(total: int, count: int) -> float:
-    """Return ln of the number of sets of so many points."""
+    """Return ln of the number of sets of `count` points out of `total`."""
     return float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
 
 
@@ -167,10 +179,10 @@ def _shifted(
     search: float,
     parts: tuple[IntArray, FloatArray, FloatArray],
 ) -> Iterator[Alternative]:
-    """Return the set of points that moved by one and the same vector, as a part of the object that shifted.
+    """Yield the set of points that moved by the same vector, like a part of the object that shifted.
 
-    By two means over the points, from those that moved most; parts are the points that can have moved, their
-    normal equations (n, 3, 3) and right sides (n, 3).
+    Two-means clustering starts from the points that moved most. `parts` are the points that can have moved,
+    their normal equations (n, 3, 3) and right-hand sides (n, 3).
     """
     movable, blocks, g = parts
     total = len(movable)
@@ -187,8 +199,8 @@ def _shifted(
                 break
             members = again
         if 2 * members.sum() > total:
-            members = ~members  # that the others moved the other way is the same statement
-        count = int(members.sum())  # not more than half
+            members = ~members  # equivalent: the other points moved in the opposite direction
+        count = int(members.sum())  # at most half of the points
         if count < MIN_GROUP:
             continue
         points = movable[members]
@@ -210,24 +222,24 @@ def _shifted(
 
 @dataclass(frozen=True)
 class Bump:
-    """A photograph whose camera has left its place on the rig."""
+    """A photograph whose camera was displaced on the rig."""
 
     photograph: str
     camera: str
-    shift: float  # of the projection centre, object unit
-    turn: float  # rad
-    sigmas: float  # root of chi-square
-    probability: float  # of so large a shift by chance, in one test
+    shift: float  # shift of the projection centre, object unit
+    turn: float  # rotation, rad
+    sigmas: float  # square root of chi-square
+    probability: float  # probability of such a shift by chance, in one test
 
 
 def find_bumps(a: Adjustment) -> tuple[Bump, ...]:
-    """Return the photographs whose cameras have left their places on a rig, the largest shift first.
+    """Return the photographs whose cameras were displaced on a rig, largest shift first.
 
-    Of a moment with two photographs nothing shows which of them; the one that is not of the reference camera
-    is named.
+    With two photographs at a moment, nothing shows which camera was displaced; the one that is not the
+    reference camera is named.
 
     Args:
-        a: an adjustment with rigs, of independent errors.
+        a: adjustment with rigs and independent errors.
     """
     moment, mounts = a.network.moment, a.estimate.mounts
     if moment is None or mounts is None or a.error_correlation is not None:
@@ -269,11 +281,11 @@ def find_bumps(a: Adjustment) -> tuple[Bump, ...]:
 
 
 def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
-    """Return the remark on cameras that have left their places on a rig; none without.
+    """Return the remark on cameras that were displaced on a rig; empty if there are none.
 
     Args:
-        a: an adjustment.
-        unit: of its coordinates.
+        a: adjustment.
+        unit: unit of its coordinates.
     """
     found = find_bumps(a)
     if not found:
@@ -294,13 +306,13 @@ def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
 
 
 def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:
-    """Whether all but one photograph of the moment of a photograph have a separate pose already."""
+    """Return whether all other photographs but one of the same moment already have a separate pose."""
     taken_with = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
     return taken_with + 2 > int((moment == moment[tested[k]]).sum())
 
 
 def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return E'v (t, 6) and E'R E (t, 6, t, 6) of the photographs that are tested."""
+    """Return E'v (t, 6) and E'R E (t, 6, t, 6) of the tested photographs."""
     m = marginal_of(a, cross=False)
     o, weight = m.layout.observations, np.ascontiguousarray(a.weights[m.layout.order])
     linear = linearise(m.optimum, m.layout, weight)
@@ -317,7 +329,7 @@ def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _gain(s: FloatArray, G: FloatArray, k: int, taken: list[int]) -> tuple[float, FloatArray]:
-    """Return chi-square of a separate pose of a photograph beside those of others, and the shift, (6,)."""
+    """Return chi-square and shift (6,) of a separate pose of a photograph, jointly with those taken."""
     t, M = s[k], G[k][:, k]
     if taken:
         across = G[k][:, taken].reshape(6, -1)
@@ -336,10 +348,10 @@ class Pattern:
     """Photographs in which a family is freed."""
 
     name: str
-    factor: FloatArray  # of each photograph, (m,)
-    search: float = 0.0  # ln of the number of patterns, or of sets of points, from which it was taken
-    among: BoolArray | None = None  # photographs of which some differ, (m,); None: all
-    parts: int = 1  # each of which has parameters by itself
+    factor: FloatArray  # factor of each photograph, (m,)
+    search: float = 0.0  # ln of the number of patterns, or sets of points, from which it was chosen
+    among: BoolArray | None = None  # photographs within which some differ, (m,); None: all
+    parts: int = 1  # number of parts with separate parameters
 
 
 def score_alternative(
@@ -352,7 +364,17 @@ def score_alternative(
     points: IntArray | None = None,
     parameters: tuple[tuple[int, int], ...] = (),
 ) -> Alternative:
-    """Return an alternative with its test."""
+    """Return an alternative with its test.
+
+    Args:
+        reduced: normal equations of the adjustment.
+        family: family that is freed.
+        pattern: photographs in which it is freed.
+        gain: gain of the family in this pattern.
+        spread: spread of the parts that it does not concern.
+        points: points that moved, if any.
+        parameters: interior parameters freed, (camera, parameter).
+    """
     r, parts, search = reduced.redundancy, pattern.parts, pattern.search
     on = pattern.factor[reduced.image] != 0 if parts == 1 else np.ones(len(reduced.image), dtype=bool)
     some = np.zeros(0, dtype=np.int64) if points is None else points
@@ -374,7 +396,12 @@ def score_alternative(
 
 
 def price_of(rank: int, touched: int, search: float) -> float:
-    """Return what parameters must gain in ln likelihood, by the number of image points that they move.
+    """Return the gain of ln likelihood that parameters must reach.
+
+    Args:
+        rank: number of parameters.
+        touched: number of image points that they move.
+        search: ln of the number of patterns from which the alternative was chosen.
 
     Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90, on the n of the Bayesian information criterion.
     """
@@ -382,9 +409,9 @@ def price_of(rank: int, touched: int, search: float) -> float:
 
 
 def patterns_of(m: int) -> Iterator[tuple[str, FloatArray, float]]:
-    """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
+    """Yield the patterns of m photographs: name, factors of the photographs (p, m), ln of the number p."""
     if m == MIN_GROUP:
-        yield "pair", np.eye(m)[1:], 0.0  # that the other one differs is the same statement
+        yield "pair", np.eye(m)[1:], 0.0  # equivalent: the other photograph differs
     elif m > MIN_GROUP:
         yield "single", np.eye(m), np.log(m)
     if m < 2 * MIN_GROUP:
@@ -404,7 +431,7 @@ class Part:
     squares: FloatArray  # (m, f)
 
     def gain(self, factor: FloatArray) -> Gain:
-        """Return the gain where the photographs have the family with these factors."""
+        """Return the gain if the photographs have the family with these factors, (m,)."""
         return gain_of(
             np.tensordot(np.tensordot(factor, self.H, (0, 0)), factor, (1, 0)),
             factor @ self.g,
@@ -413,7 +440,12 @@ class Part:
         )
 
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:
-        """Return how much the photographs differ in the family beyond what a pattern explains."""
+        """Return the spread of the photographs in the family beyond what a pattern explains.
+
+        Args:
+            factor: factors of the pattern, (m,).
+            gain: gain of the pattern.
+        """
         m = len(self.g)
         left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
         some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
@@ -423,11 +455,11 @@ class Part:
 
     @property
     def blocks(self) -> FloatArray:
-        """Normal equations of each photograph by itself, (m, f, f)."""
+        """Normal equations of each photograph alone, (m, f, f)."""
         return np.asarray(np.einsum("iaib->iab", self.H))
 
     def group(self) -> tuple[FloatArray, Gain]:
-        """Return the photographs that together have the largest gain, as factors 0 and 1, by two means."""
+        """Return the group of photographs with the largest gain, by two-means, as factors 0 and 1."""
         m = len(self.g)
         single, _ = gains_of(self.blocks, self.g, self.squares)
         best, most = np.zeros(m), None
@@ -435,7 +467,7 @@ class Part:
             factor = (np.arange(m) == first).astype(float)
             for _ in range(ROUNDS):
                 beta = self.gain(factor).beta
-                # v'Pv as a function of the factors: s'Qs + 2 l's with beta held, one photograph after another
+                # v'Pv as a function of the factors s, with beta held: s'Qs + 2 l's, minimised one by one
                 Q = np.tensordot(beta, self.H, (0, 1)) @ beta
                 linear = self.g @ beta
                 again = factor.copy()
@@ -453,9 +485,12 @@ class Part:
 
 
 def runs_of(camera: IntArray) -> IntArray:
-    """Return the run of each photograph, (m,): those of one camera that follow one another.
+    """Return the run of each photograph, (m,): a run has successive photographs of one camera.
 
-    Of more cameras than are tested a run has several.
+    With too many cameras to test, a run includes photographs of several cameras.
+
+    Args:
+        camera: camera of each photograph, (m,).
     """
     m = len(camera)
     if m <= MAX_RUNS:
@@ -470,5 +505,5 @@ def runs_of(camera: IntArray) -> IntArray:
 
 
 def too_many_cameras(camera: IntArray) -> bool:
-    """Return whether there are more cameras, by `cameras_of_photographs`, than are tested."""
+    """Return whether there are too many cameras to test, given the camera of each photograph, (m,)."""
     return int(camera.max()) >= MAX_RUNS

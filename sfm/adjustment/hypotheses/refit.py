@@ -1,12 +1,12 @@
-"""The winning alternative adjusted with everything else; external reliability of alternatives.
+"""Refit: adjusts the winning alternative with all other unknowns; external reliability of alternatives.
 
-The parameters of the alternative take the score step, their effect leaves the image points, and the network
-is adjusted anew; a few rounds end at the joint optimum. Rejected image points come back where they fit.
+The parameters of the alternative take the score step, their effect is removed from the image points, and the
+network is adjusted again. A few rounds reach the joint optimum. Rejected image points return if they fit.
 
-External reliability is how wrong an assumption may be before the tests name it. Parameters b of an
-alternative have the noncentrality b'Hb and shift coordinates by E b. Where lambda is the noncentrality that
-the tests find with 80 % probability, a coordinate of standard deviation s with the row e of E shifts by up to
-sqrt(lambda e H^-1 e') / s before.
+External reliability is the largest error of an assumption that the tests do not detect. Parameters b of an
+alternative have the noncentrality b'Hb and shift coordinates by E b. Let lambda be the noncentrality that the
+tests detect with 80 % probability. A coordinate with standard deviation s and row e of E can shift undetected
+by up to sqrt(lambda e H^-1 e') / s.
 
 Source: Baarda (1968), A testing procedure for use in geodetic networks (external reliability); Foerstner and
 Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4.2.
@@ -56,23 +56,23 @@ from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity, without_motions
 
-POWER = 0.80  # with which a detectable error is found; Baarda (1968)
+POWER = 0.80  # probability of finding a detectable error; Baarda (1968)
 ROUNDS = 6
-HALVINGS = 4  # of a step: linear in what a large error makes of the image points, it may go too far
-MAX_ITERATIONS = 15  # of an adjustment that starts next to its optimum; half of those that converge need 3
-LAST_GAIN = 0.01  # gain of v'Pv over the variance factor at which the rounds end
+HALVINGS = 4  # most halvings of a step, because a linear step may go too far for a large error
+MAX_ITERATIONS = 15  # the start is near the optimum; half of the adjustments that converge need 3
+LAST_GAIN = 0.01  # gain of v'Pv over the variance factor below which the rounds end
 
 
 @dataclass(frozen=True)
 class Refit:
     """An adjustment with an alternative."""
 
-    adjustment: Adjustment  # of the image points without the effect of the alternative
+    adjustment: Adjustment  # adjustment of image points from which the effect of the alternative is removed
     beta: FloatArray  # parameters of the alternative, (q,)
-    gain: float  # of ln likelihood, rejected image points counted as spread over their photograph
-    shift: float  # largest change of a coordinate, in the standard deviations stated without the alternative
-    rms: float  # root mean square of the same
-    before: tuple[FloatArray, ...] = ()  # parameters of the alternatives that were there before
+    gain: float  # gain of ln likelihood; rejected image points are assumed uniform over their photograph
+    shift: float  # largest change of a coordinate, in standard deviations stated without the alternative
+    rms: float  # root mean square of these changes
+    before: tuple[FloatArray, ...] = ()  # parameters of the earlier alternatives
 
 
 def refit(
@@ -81,13 +81,13 @@ def refit(
     start: Adjustment,
     before: Sequence[tuple[Alternative, FloatArray]] = (),
 ) -> Refit | None:
-    """Adjust with an alternative; None where that does not converge.
+    """Adjust with an alternative; None if the adjustment does not converge.
 
     Args:
-        plain: the adjustment that states coordinates and standard deviations.
+        plain: adjustment that states coordinates and standard deviations.
         one: the alternative.
-        start: adjustment to begin from, of image points without the effect of others.
-        before: these others with their parameters, which are adjusted along with it.
+        start: adjustment to start from, of image points without the effect of earlier alternatives.
+        before: earlier alternatives with their parameters, which are adjusted jointly.
     """
     every = (*(other for other, _ in before), one)
     ends = np.cumsum([0, *(len(beta) for _, beta in before), len(one.gain.beta)])
@@ -120,7 +120,7 @@ def refit(
 def _stepped(
     plain: Adjustment, D: FloatArray, start: Adjustment, beta: FloatArray, step: FloatArray
 ) -> tuple[Adjustment, FloatArray] | None:
-    """Return the adjustment after a step of the parameters, halved while it makes v'Pv larger, and these."""
+    """Return the adjustment after a step of the parameters, halved while v'Pv grows, and the parameters."""
     xy, best = plain.network.image_points.xy, None
     for _ in range(HALVINGS):
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
@@ -138,7 +138,7 @@ def _stepped(
         except GeometryError:
             found = None
         if found is not None and found.converged:
-            found = replace(found, error_correlation=plain.error_correlation)  # as far as is known
+            found = replace(found, error_correlation=plain.error_correlation)  # the best known one
             if log_likelihood(found) > log_likelihood(start) - LAST_GAIN:
                 return found, beta + step
             best = best or (found, beta + step)
@@ -152,13 +152,13 @@ def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns)
 
 
 def log_likelihood(a: Adjustment, freed: int = 0) -> float:
-    """Return ln of the likelihood, rejected image points spread evenly over their photograph.
+    """Return ln of the likelihood; rejected image points have a uniform distribution over their photograph.
 
-    Without redundancy, where every network fits, it is that of the rejected image points alone.
+    Without redundancy every network fits, and only the rejected image points count.
 
     Args:
-        a: the adjustment.
-        freed: unknowns in it that others it is compared with do not have; their price is reckoned apart.
+        a: adjustment.
+        freed: number of unknowns that adjustments it is compared with lack; their price is counted elsewhere.
 
     Source: Rissanen (1978), Automatica 14; Foerstner and Wrobel (2016), sec. 4.7 (mixture of good and bad).
     """
@@ -174,16 +174,17 @@ def log_likelihood(a: Adjustment, freed: int = 0) -> float:
 def shifts_of(
     plain: Adjustment, before: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
 ) -> tuple[float, float]:
-    """Return the largest and the RMS change of what a survey determines, in standard deviations.
+    """Return the largest and the RMS change of the result of a survey, in standard deviations.
 
-    It is that of coordinates after a similarity; with control, which is given them, of the cameras.
+    The change is that of coordinates after a similarity. With control, coordinates are given, and the change
+    is that of the cameras.
 
     Args:
-        plain: states the standard deviations.
-        before: without the alternative.
-        other: with it.
+        plain: adjustment that states the standard deviations.
+        before: adjustment without the alternative.
+        other: adjustment with the alternative.
         one: the alternative.
-        beta: its parameters, (q,).
+        beta: parameters of the alternative, (q,).
     """
     if plain.datum == "control":
         return _shifts_of_cameras(plain, before, other)
@@ -214,12 +215,13 @@ def _shifts_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment)
 
 
 def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = None) -> tuple[Remark, ...]:
-    """Return which assumptions the tests hardly check, with the shift that an error may cause unnoticed.
+    """Return remarks on assumptions that the tests hardly check, with the shift of an undetected error.
 
     Args:
         a: adjustment of the image points alone, with its covariance.
-        bodies: bodies that are tested for having moved.
-        without: what fixes all coordinates of the result, so that only those of `a` shift; None if nothing.
+        bodies: number of bodies that are tested for movement.
+        without: name of what fixes all coordinates of the result, so that only those of `a` shift; None if
+            nothing does.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -259,10 +261,10 @@ def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = 
 
 
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
-    """Return each held parameter, and a change of the camera and a strain of the object half way through.
+    """Yield alternatives for each held parameter, and for a change of camera or a strain halfway through.
 
-    Of two or three photographs of a camera the last one differs. There is no bending: the worst of its 18
-    directions is the shape of no object.
+    If a camera has two or three photographs, the last one differs. Bending is left out, because the worst of
+    its 18 directions is not the shape of any real object.
     """
     nothing = Gain(0.0, 0, np.zeros(0))
     for owner in interior_parameters(a, HELD):
@@ -287,14 +289,14 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int) -> float:
-    """Return by how much coordinates shift at most before an alternative is named, in standard deviations.
+    """Return the largest shift of coordinates before an alternative is detected, in standard deviations.
 
     Args:
         one: the alternative.
         a: the adjustment.
         reduced: its normal equations.
         columns: its derivatives.
-        rows: alternatives that are tested, which share the level.
+        rows: number of alternatives tested together, which share the level.
     """
     D = reduced.whiten(one.columns(a, columns))
     H, _, squares = reduced.project(D)
@@ -302,7 +304,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, rows)
-    least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # noncentrality that is found
+    least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # detected noncentrality
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, MIN_DETERMINED_SHARE))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))

@@ -1,14 +1,15 @@
-"""Score test: by how much v'Pv would fall with more freedom, from the finished adjustment alone.
+"""Score test: the decrease of v'Pv that more freedom would bring, from the finished adjustment alone.
 
     H = B'PB - B'PA N^- A'PB,  g = B'Pv - B'PA N^- A'Pv,  gain = g' H^-1 g
 
-A are the columns of the adjustment (photographs, free interior parameters, object points), B those of an
-alternative, v the residuals of the accepted image points. Object points are eliminated first, then
-photographs and cameras, whose seven motions are fixed by inner constraints. Where the alternative is none,
-(gain / q) / ((v'Pv - gain) / (r - q)) is F distributed. Where neighbouring image points have errors
-in common, the variance of g is D'RD in place of H = D'D, with D what the unknowns leave of B. Gains are then
-divided by the design effect, the sum of squares of the eigenvalues of H^-1 D'RD over their sum: many points
-with one error in common show it many times.
+A are the columns of the adjustment (photographs, free interior parameters, object points), B the columns of
+an alternative, and v the residuals of the accepted image points. Object points are eliminated first, then
+photographs and cameras, whose seven motions are fixed by inner constraints. If the alternative is false,
+(gain / q) / ((v'Pv - gain) / (r - q)) has an F distribution.
+
+If neighbouring image points have errors in common, the variance of g is D'RD instead of H = D'D, where D is B
+after elimination of the unknowns. Many points with one common error then show it many times. So gains are
+divided by the design effect, the sum of squares of the eigenvalues of H^-1 D'RD over their sum.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 4.2; Rao (1948), Proc.
 Camb. Phil. Soc. 44, for the score test; Rao and Scott (1984), Annals of Statistics 12, for the design effect;
@@ -30,51 +31,56 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.distributions import f_sf
 from sfm.network import rows_of
 
-# Of the squares of combined columns that photographs, cameras and points must leave.
+# Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5
-ROUNDING = float(np.sqrt(np.finfo(float).eps))  # of the squares of a column alone that rounding may leave
-SMALLEST_LOG = -600.0  # of a probability that `f_sf` still gives
-MAX_TERMS = 10_000  # of the series beyond it
+ROUNDING = float(np.sqrt(np.finfo(float).eps))  # share of the squares of a single column left by rounding
+SMALLEST_LOG = -600.0  # ln of the smallest probability that `f_sf` is used for
+MAX_TERMS = 10_000  # most terms of the series for smaller probabilities
 
 
 @dataclass(frozen=True)
 class Reduced:
     """The accepted image points with object points, photographs and cameras eliminated.
 
-    Whitened by the weights and sigma0 a posteriori, so that a gain is in units of the variance factor.
+    They are whitened by the weights and the a posteriori sigma0, so a gain is in units of the variance
+    factor.
     """
 
     used: IntArray  # accepted image points, (k,)
-    F: FloatArray  # whitening of each, (k, 2, 2)
-    v: FloatArray  # residuals, whitened, (k, 2)
-    image: IntArray  # photograph of each, (k,)
-    point: IntArray  # object point of each, (k,)
-    B: FloatArray  # by object points, whitened, (k, 2, 3)
-    A: FloatArray  # by photographs and free interior parameters, whitened, (k, 2, 6 + i)
-    L: FloatArray  # inverse Cholesky factors of the object points' normals, (n, 3, 3)
-    W: FloatArray  # L^-1 B'A of each object point, (n, 3, a)
-    Sinv: FloatArray  # inverse of the reduced normals with inner constraints, (a, a)
-    y: FloatArray  # L^-1 B'v, (n, 3)
-    t: FloatArray  # right side of photographs and cameras, reduced by the points, (a,)
+    F: FloatArray  # whitening of each image point, (k, 2, 2)
+    v: FloatArray  # whitened residuals, (k, 2)
+    image: IntArray  # photograph of each image point, (k,)
+    point: IntArray  # object point of each image point, (k,)
+    B: FloatArray  # whitened derivatives by object points, (k, 2, 3)
+    A: FloatArray  # whitened derivatives by photographs and free interior parameters, (k, 2, 6 + i)
+    L: FloatArray  # inverse Cholesky factors of the object points' normal equations, (n, 3, 3)
+    W: FloatArray  # L B'A of each object point, (n, 3, a)
+    Sinv: FloatArray  # inverse of the reduced normal matrix with inner constraints, (a, a)
+    y: FloatArray  # L B'v, (n, 3)
+    t: FloatArray  # right-hand side of photographs and cameras, reduced by the points, (a,)
     photographs: int
     redundancy: int
-    xy: FloatArray  # measured position of each, px, (k, 2)
-    correlation: ErrorCorrelation | None  # of the errors of neighbours
-    sigma0_px: float  # a posteriori, of a usual image coordinate, px
+    xy: FloatArray  # measured position of each image point, px, (k, 2)
+    correlation: ErrorCorrelation | None  # correlation of the errors of neighbours
+    sigma0_px: float  # a posteriori standard deviation of a usual image coordinate, px
 
     @property
     def count(self) -> int:
-        """Accepted image coordinates."""
+        """Number of accepted image coordinates."""
         return 2 * len(self.used)
 
     def whiten(self, columns: FloatArray) -> FloatArray:
-        """Return columns of all image points (k, 2, q) as whitened ones of the accepted."""
+        """Return the whitened columns of accepted image points, from columns of all (k, 2, q)."""
         return np.asarray(self.F @ columns[self.used])
 
     def project_by_run(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns (k, 2, f).
+        """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns.
 
-        Every run of photographs has f separate freedoms; `run` is that of each photograph, (m,).
+        Every run of photographs has f separate freedoms.
+
+        Args:
+            D: whitened columns, (k, 2, f).
+            run: run of each photograph, (m,).
         """
         n, f, count = len(self.L), D.shape[2], int(run.max()) + 1
         owner = run[self.image]
@@ -103,9 +109,12 @@ class Reduced:
         return self._eliminated(D)[:3]
 
     def design_effect(self, D: FloatArray) -> float:
-        """Return by how much errors that neighbours have in common multiply the gain of columns by chance.
+        """Return the factor by which correlated errors of neighbours multiply a gain by chance, at least 1.
 
-        It is that of whitened columns (k, 2, q), in the directions that these determine, and 1 at least.
+        Only the directions that the columns determine count.
+
+        Args:
+            D: whitened columns, (k, 2, q).
         """
         if self.correlation is None:
             return 1.0
@@ -117,25 +126,28 @@ class Reduced:
         return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
 
     def shifts(self, D: FloatArray) -> FloatArray:
-        """Return by how much object points shift where whitened columns (k, 2, q) are in the image points.
+        """Return the shifts of object points if the effect of columns is in the image points, (n, 3, q).
 
-        The shifts (n, 3, q) are those of a network that knows nothing of the columns.
+        The shifts are those of an adjustment without the columns.
+
+        Args:
+            D: whitened columns, (k, 2, q).
         """
         return self._eliminated(D)[4]
 
     def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
-        """Return what each photograph adds to the slope along a direction, after a step, (m,).
+        """Return the contribution of each photograph to the slope along a direction, after a step, (m,).
 
         Args:
-            direction: whitened effect on the image points, (k, 2).
-            step: whitened effect of what was changed, (k, 2).
+            direction: whitened effect of the direction on the image points, (k, 2).
+            step: whitened effect of the step on the image points, (k, 2).
         """
         left = self._eliminated(np.stack([direction, step], axis=2))[3]
         slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
         return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
 
     def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return H, g and squares of whitened columns, what unknowns leave of them, and shifts of points."""
+        """Return H, g, squares, remainder after elimination and shifts of points, for whitened columns."""
         n, q = len(self.L), D.shape[2]
         C = np.zeros((n, 3, q))
         np.add.at(C, self.point, np.swapaxes(self.B, 1, 2) @ D)
@@ -166,10 +178,10 @@ class Reduced:
 
 
 def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
-    """Return the accepted image points of a free adjustment with everything in it eliminated.
+    """Return the accepted image points of an adjustment with all its unknowns eliminated.
 
     Args:
-        a: adjustment of image points, alone or with control; no scale bars, no observed orientation.
+        a: adjustment of image points, alone or with control, without scale bars or observed orientation.
         columns: derivatives of its image points.
 
     Raises:
@@ -195,7 +207,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     np.add.at(V, point, Bt @ B)
     np.add.at(gp, point, np.einsum("kab,kb->ka", Bt, v))
     V, gp = V + weight, gp + slope_of_given
-    V[~V.any(axis=2)] += np.tile(np.eye(3), (n, 1, 1))[~V.any(axis=2)]  # fixed, or not seen
+    V[~V.any(axis=2)] += np.tile(np.eye(3), (n, 1, 1))[~V.any(axis=2)]  # fixed or not seen
     L = np.linalg.inv(np.linalg.cholesky(V))
     W = L @ points_by_cameras(Bt @ A, point, image, n, m)
     y = np.einsum("nab,nb->na", L, gp)
@@ -218,7 +230,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
 
 
 def _given_points(a: Adjustment) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return weight (n, 3, 3) and slope (n, 3) of control, and which coordinates are fixed, (n, 3)."""
+    """Return weight (n, 3, 3) and slope (n, 3) of control points, and which coordinates are fixed, (n, 3)."""
     n, control = len(a.network.points), a.network.control
     weight, slope, fixed = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3), dtype=bool)
     if a.datum != "control":
@@ -233,12 +245,12 @@ def _given_points(a: Adjustment) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, m: int) -> FloatArray:
-    """Return B'A of object points and photographs and cameras, (n, 3, 6 m + i).
+    """Return B'A of object points x photographs and cameras, (n, 3, 6 m + i).
 
     Args:
         by: B'A of each image point, (k, 3, 6 + i).
-        point: object point of each, (k,).
-        image: photograph of each, (k,).
+        point: object point of each image point, (k,).
+        image: photograph of each image point, (k,).
         n: number of points.
         m: number of photographs.
     """
@@ -251,7 +263,7 @@ def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, 
 
 
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the columns of free interior parameters, (k, 2, i), weight and slope of given values."""
+    """Return the columns of free interior parameters, (k, 2, i), and weight and slope of given values."""
     network, cameras = a.network, a.estimate.cameras
     used = np.unique(network.camera).tolist()
     columns, keys, units = shared_columns(
@@ -293,7 +305,7 @@ def _camera_normals(
 
 
 def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
-    """Return G G' of the seven motions of the photographs, as heavy as the normals are."""
+    """Return G G' of the seven motions of the photographs, scaled like the normal equations."""
     X0, R = a.estimate.position, a.estimate.rotation
     centre = X0.mean(axis=0)
     G = np.zeros((m, 6, 7))
@@ -310,19 +322,23 @@ def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Gain:
-    """The decrease of v'Pv by an alternative over the variance factor."""
+    """The decrease of v'Pv by an alternative, divided by the variance factor."""
 
     value: float
-    rank: int  # of its parameters those that the image points determine
+    rank: int  # number of its parameters that the image points determine
     beta: FloatArray  # step of its parameters, (q,)
 
 
 def directions_of(H: FloatArray, squares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what normal equations (..., q, q) leave of the squares of their columns (..., q).
+    """Return the eigenvectors of scaled normal equations, and the share of the squares left in each.
+
+    Args:
+        H: normal equations after elimination, (..., q, q).
+        squares: squares of the columns before elimination, (..., q).
 
     Returns:
-        Share that is left in each direction, (..., q), the directions, (..., q, q), and the scale of the
-        columns in which they are, (..., q).
+        Share left in each direction, (..., q), the directions, (..., q, q), and the scale of the columns to
+        which they refer, (..., q).
     """
     scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(H * scale[..., :, None] * scale[..., None, :])
@@ -330,22 +346,22 @@ def directions_of(H: FloatArray, squares: FloatArray) -> tuple[FloatArray, Float
 
 
 def least_share(columns: int) -> float:
-    """Return the share of their squares above which directions of so many columns count as determined.
+    """Return the share of the squares above which directions of a number of columns count as determined.
 
-    Of several columns a direction below it is left out, as the step along it is larger than what is linear.
-    One column alone has no other direction, as x0 has none where P1 and a rotation take most of it.
+    With several columns, a direction below it is left out, because the step along it would exceed the linear
+    range. A single column has no other direction; an example is x0, if P1 and a rotation absorb most of it.
     """
     return MIN_DETERMINED_SHARE if columns > 1 else ROUNDING
 
 
 def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MIN_DETERMINED_SHARE) -> Gain:
-    """Return the gain of columns with normal equations H, g and squares before the elimination.
+    """Return the gain of columns.
 
     Args:
-        H: normal equations, (q, q).
-        g: right sides, (q,).
-        squares: of the columns before the elimination, (q,).
-        least: share of their squares above which directions count as determined.
+        H: normal equations after elimination, (q, q).
+        g: right-hand side, (q,).
+        squares: squares of the columns before elimination, (q,).
+        least: share of the squares above which directions count as determined.
     """
     values, vectors, scale = directions_of(H, squares)
     good = values > least
@@ -355,11 +371,11 @@ def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MI
 
 
 def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
-    """Return the inverse of normal equations in the directions of which `gain_of` takes the gain.
+    """Return the inverse of normal equations in the directions that are determined, as in `gain_of`.
 
     Args:
-        H: normal equations, (q, q).
-        squares: of the columns before the elimination, (q,).
+        H: normal equations after elimination, (q, q).
+        squares: squares of the columns before elimination, (q,).
     """
     values, vectors, scale = directions_of(H, squares)
     good = values > MIN_DETERMINED_SHARE
@@ -368,12 +384,12 @@ def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
 
 
 def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the gains (n,) and ranks (n,) of n alternatives that do not concern one another.
+    """Return the gains (n,) and ranks (n,) of n separate alternatives.
 
     Args:
-        H: normal equations of each, (n, q, q).
-        g: right sides, (n, q).
-        squares: of the columns before the elimination, (n, q).
+        H: normal equations of each after elimination, (n, q, q).
+        g: right-hand sides, (n, q).
+        squares: squares of the columns before elimination, (n, q).
     """
     values, vectors, scale = directions_of(H, squares)
     good = values > MIN_DETERMINED_SHARE
@@ -383,7 +399,13 @@ def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatAr
 
 
 def log_probability(gain: float, q: int, redundancy: int) -> float:
-    """Return ln of the probability of so large a gain by chance; v'Pv over the variance factor is r."""
+    """Return ln of the probability of such a gain by chance.
+
+    Args:
+        gain: decrease of v'Pv over the variance factor.
+        q: number of parameters.
+        redundancy: redundancy r, which equals v'Pv over the variance factor.
+    """
     left = redundancy - gain
     if q < 1 or redundancy <= q:
         return 0.0
@@ -395,7 +417,7 @@ def log_probability(gain: float, q: int, redundancy: int) -> float:
 def log_f_sf(f: float, q: int, d: int) -> float:
     """Return ln of the probability that F of redundancies q and d is larger than f.
 
-    Beyond the range of a float by the series of the incomplete beta function.
+    Probabilities below the range of a float come from the series of the incomplete beta function.
 
     Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.5.2 and 26.6.2.
     """
@@ -415,7 +437,7 @@ def log_f_sf(f: float, q: int, d: int) -> float:
 
 
 def log_likelihood_gain(gain: float, redundancy: int) -> float:
-    """Return by how much ln of the likelihood grows where v'Pv falls from r by a gain; sigma0 unknown.
+    """Return the growth of ln likelihood if v'Pv falls from r by a gain, with unknown sigma0.
 
     Source: Patterson and Thompson (1971), Biometrika 58, for the restricted likelihood.
     """
@@ -424,30 +446,36 @@ def log_likelihood_gain(gain: float, redundancy: int) -> float:
 
 
 def squares_gained(gain: float, redundancy: int) -> float:
-    """Return by how much v'Pv falls from r where ln of the likelihood grows by a gain."""
+    """Return the decrease of v'Pv from r if ln likelihood grows by a gain."""
     return float(redundancy * -np.expm1(-2 * gain / redundancy))
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How much parts that an alternative does not concern differ among themselves, over what chance makes.
+    """Variance between parts that an alternative does not concern, relative to that expected by chance.
 
-    Image points of one photograph have errors in common that no weight states: the lens, its shutter, light
-    from one side. Photographs then differ, each in its way, and what differs in some of them must be larger
-    than that. So must points, of which each has errors of its target.
+    Image points of one photograph have common errors that no weight states: from the lens, the shutter, or
+    light from one side. Photographs then differ individually, and an effect in some of them must be larger
+    than that. The same holds for points, because each has errors of its target.
     """
 
-    factor: float = 1.0  # of the variance
-    redundancy: int = 10**9  # by which it is known
+    factor: float = 1.0  # ratio of the variances
+    redundancy: int = 10**9  # redundancy of the variance
     among: bool = True  # whether an alternative that concerns some of the parts was chosen from them
 
     def ratio(self, gain: float, q: int, redundancy: int) -> float:
-        """Return how much larger a gain of v'Pv by q parameters is than the parts differ, for each."""
-        left = max(redundancy - gain, 1.0) / redundancy  # of the variance factor
+        """Return the ratio of a gain of v'Pv, per parameter, to the spread of the parts.
+
+        Args:
+            gain: decrease of v'Pv over the variance factor.
+            q: number of parameters.
+            redundancy: redundancy of the adjustment.
+        """
+        left = max(redundancy - gain, 1.0) / redundancy  # remaining share of the variance factor
         return gain / max(q, 1) / max(self.factor, 1.0) / left
 
     def evidence(self, gain: float, q: int, redundancy: int) -> float:
-        """Return by how much ln of the likelihood grows, q parameters not yet paid for."""
+        """Return the growth of ln likelihood before the price of the parameters; arguments as in `ratio`."""
         grows = log_likelihood_gain(gain, redundancy)
         if self.factor <= 1:
             return grows

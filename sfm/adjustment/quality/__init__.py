@@ -1,4 +1,4 @@
-"""How good an adjustment is: gross errors, reliability, tests, variance components, rank, correlations.
+"""Quality of an adjustment: gross errors, reliability, tests, variance components, rank, correlations.
 
-Begin with `statistics`: Baarda's w, Pope's tau, the global test, minimal detectable errors.
+Start with `statistics`: Baarda's w, Pope's tau, the global test, minimal detectable errors.
 """

@@ -1,16 +1,16 @@
-"""Whether points and photographs were measured alike, and which rays cannot be distinguished.
+"""Consistency: tests if points and photographs were measured equally well, and finds doubtful rejections.
 
-A bent target or a blurred photograph leaves residuals small enough for the tests of single image coordinates,
-and yet larger than chance makes them together. All tests are against sigma0 a posteriori, with cameras and
-orientations as adjusted, which makes them a little too cautious.
+A bent target or a blurred photograph can leave residuals that pass the tests of single image coordinates, and
+yet are jointly larger than chance allows. All tests use the a posteriori sigma0 with adjusted cameras and
+orientations, which makes them slightly too cautious.
 
-Rejected rays for which another ray of the same point could have been rejected just as well. Of three rays two
-always nearly meet: which one is wrong is decided by what remains along the epipolar line, and data snooping
-blames the wrong one in a quarter of such points with an error of ten standard deviations. Both explanations
-are compared by what they leave; where they differ by less than chance, the point is doubtful.
+A rejection is doubtful if another ray of the same point could have been rejected just as well. Of three rays,
+two always nearly meet, and only the misfit along the epipolar line shows which ray is wrong. With an error of
+ten standard deviations, data snooping rejects the wrong ray in a quarter of such points. So both explanations
+are compared by their remaining misfit. If the difference may be due to chance, the point is doubtful.
 
-Rays of single object points: what each adds to the normal equations of its point, cameras as adjusted. By
-these the tests of single points try other explanations of a point's residuals, without adjusting again.
+`PointNormals` is the contribution of each ray to the normal equations of its object point, with adjusted
+cameras. With it, the tests of single points try other explanations of residuals without a new adjustment.
 
 Source: Bartlett (1937), Proc. R. Soc. A 160; Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.2;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (separability of alternative
@@ -31,34 +31,38 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import Estimate, rows_of
 
-CHANCE = 1e-3  # of so much larger a misfit where the other explanation is the true one
-MOVED_SIGMAS = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
-FAMILY = 0.01  # chance with which each test reports anything in a survey in which nothing is wrong
-# Largest component of a photograph over their median, below which a difference is of no use.
+CHANCE = 1e-3  # probability of such a larger misfit if the other explanation is true
+MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
+FAMILY = 0.01  # probability that a test reports anything in a survey without errors
+# Ratio of the largest component of a photograph to the median below which a difference does not matter.
 MIN_UNEVEN_RATIO = 1.5
 
 
 @dataclass(frozen=True)
 class Uneven:
-    """Photographs whose residuals are not alike."""
+    """Photographs with residuals of unequal size."""
 
-    probability: float  # of so different components by chance, Bartlett's test
+    probability: float  # chance probability of components that differ as much, by Bartlett's test
     worst: str  # photograph with the largest component
     largest: float  # its component
-    median: float  # of all photographs
+    median: float  # median component of all photographs
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Results of the tests inside a result."""
+    """Results of the consistency tests."""
 
-    large: tuple[str, ...]  # points whose residuals are together larger than chance
-    uneven: Uneven | None  # None where the photographs are alike
-    doubtful: tuple[DoubtfulPoint, ...] = ()  # points of which another ray may be the wrong one
+    large: tuple[str, ...]  # points with residuals jointly larger than chance allows
+    uneven: Uneven | None  # None if the photographs are equally good
+    doubtful: tuple[DoubtfulPoint, ...] = ()  # points with another ray that may be the wrong one
 
 
 def consistency_of(adjustment: Adjustment) -> Consistency:
-    """Return what the tests of points and photographs find; nothing without covariance or noise."""
+    """Return the results of the tests of points and photographs; empty without covariance or noise.
+
+    Args:
+        adjustment: finished adjustment.
+    """
     if not np.isfinite(adjustment.redundancy_numbers).any() or adjustment.is_exact:
         return Consistency((), None)
     parts = point_normals(adjustment)
@@ -70,7 +74,7 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
 
 
 def _large(adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]) -> tuple[str, ...]:
-    """Return the points whose accepted residuals are together larger than chance makes them."""
+    """Return the points with accepted residuals that are jointly larger than chance allows."""
     network, n = adjustment.network, len(adjustment.network.points)
     level = level_of_single(FAMILY, n)
     large: list[str] = []
@@ -83,7 +87,7 @@ def _large(adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]) ->
 
 
 def _uneven(photographs: VarianceComponents) -> Uneven | None:
-    """Test whether all photographs were measured alike, by Bartlett's test of their components."""
+    """Test by Bartlett's test whether all photographs have the same variance component."""
     known = np.isfinite(photographs.sigma0) & (photographs.redundancy > 1)
     s2, r = photographs.sigma0[known] ** 2, photographs.redundancy[known]
     if known.sum() < 3 or not (s2 > 0).all():
@@ -103,23 +107,23 @@ def _uneven(photographs: VarianceComponents) -> Uneven | None:
 
 @dataclass(frozen=True)
 class DoubtfulPoint:
-    """A point of which another ray may be the wrong one."""
+    """A point with another ray that may be the wrong one."""
 
     point: str
-    rejected: str  # photograph of the ray that was rejected
-    instead: str  # photograph of the ray that may as well be wrong
-    misfit: float  # v'Pv that is left over sigma0^2
-    other: float  # the same with the other ray rejected in its place
+    rejected: str  # photograph of the rejected ray
+    instead: str  # photograph of the other ray that may be wrong
+    misfit: float  # remaining v'Pv over sigma0^2
+    other: float  # the same with the other ray rejected instead
 
 
 def doubtful_points(
     adjustment: Adjustment, parts: PointNormals, rows_of: list[IntArray]
 ) -> tuple[DoubtfulPoint, ...]:
-    """Return the points of which another ray could have been rejected, the most doubtful first.
+    """Return the points with another ray that could have been rejected, most doubtful first.
 
     Args:
-        adjustment: with rejected image points.
-        parts: its normal equations by image point.
+        adjustment: adjustment with rejected image points.
+        parts: normal equations of its image points.
         rows_of: usable image points of each object point.
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
@@ -144,29 +148,29 @@ def doubtful_points(
 
 
 def _moved(parts: PointNormals, kept: IntArray, other: IntArray) -> float:
-    """Return how far a point moves from one choice of its rays to another, in standard deviations."""
+    """Return the shift of a point from one choice of its rays to another, in standard deviations."""
     step = parts.step(other) - parts.step(kept)
     return float(np.sqrt(step @ parts.N[kept].sum(axis=0) @ step))
 
 
 @dataclass(frozen=True)
 class PointNormals:
-    """Contribution of each image point to the normal equations of its object point, over their sigma0^2."""
+    """Contribution of each image point to the normal equations of its object point, divided by sigma0^2."""
 
     N: FloatArray  # (k, 3, 3)
     b: FloatArray  # A'Pv, (k, 3)
     q: FloatArray  # v'Pv, (k,)
 
     def misfit(self, rows: IntArray) -> float:
-        """Return v'Pv after a fit of the point to these rows alone."""
+        """Return v'Pv after fitting the point to these image points alone."""
         N, b = self.N[rows].sum(axis=0), self.b[rows].sum(axis=0)
         return float(self.q[rows].sum() - b @ np.linalg.lstsq(N, b, rcond=None)[0])
 
     def misfits(self, groups: BoolArray, rows: IntArray) -> FloatArray:
-        """Return v'Pv after a fit of the point to each of some groups of rows alone, (g,).
+        """Return v'Pv after fitting the point to each of several groups of image points, (g,).
 
         Args:
-            groups: which of the rows are in each group, (g, m).
+            groups: which image points are in each group, (g, m).
             rows: image points of one object point, (m,).
         """
         some = groups.astype(float)
@@ -175,7 +179,7 @@ class PointNormals:
         return np.asarray(some @ self.q[rows] - fitted)
 
     def step(self, rows: IntArray) -> FloatArray:
-        """Return how a fit to these rows alone moves the point, (3,)."""
+        """Return the shift of the point when fitted to these image points alone, (3,)."""
         N, b = self.N[rows].sum(axis=0), self.b[rows].sum(axis=0)
         return np.asarray(-np.linalg.lstsq(N, b, rcond=None)[0])
 
@@ -189,14 +193,19 @@ class PointNormals:
         return np.split(order, bounds)
 
 
-MAX_STEPS = 10  # of an intersection that begins at the adjusted point
+MAX_STEPS = 10  # most steps of an intersection, which starts at the adjusted point
 LAST_STEP_SIGMAS = 1e-3  # standard deviations
 
 
 def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, FloatArray, float]:
     """Return position (3,), cofactors (3, 3) and v'Pv over sigma0^2 of a point from some of its rays alone.
 
-    Where it lies far from the adjusted point, as where two points have one name, a single step would not do.
+    It iterates, because a position far from the adjusted point needs more than one step. This happens, for
+    example, if two points have the same name.
+
+    Args:
+        adjustment: finished adjustment.
+        rows: image points of one object point.
     """
     network = adjustment.network
     j = int(network.image_points.point[rows[0]])
@@ -239,11 +248,11 @@ def _residuals(alone: Adjustment, X: FloatArray) -> FloatArray:
 
 
 def point_normals(adjustment: Adjustment, sigma0: float | None = None) -> PointNormals:
-    """Return the normal equations of every image point, rejected ones included, (k,).
+    """Return the normal equations of all image points, including rejected ones.
 
     Args:
-        adjustment: finished, or with some of its image points.
-        sigma0: of the image points, that of the adjustment if not given.
+        adjustment: finished adjustment, or one reduced to some of its image points.
+        sigma0: standard deviation of unit weight of the image points; that of the adjustment if not given.
     """
     network, estimate = adjustment.network, adjustment.estimate
     seen = network.image_points

@@ -1,21 +1,21 @@
-"""Correlations of camera parameters and of neighbouring image points; uncertainty of projection.
+"""Correlations of camera parameters and of neighbouring image points; projection uncertainty.
 
-In a flat network with parallel views c is strongly correlated with Z0, x0 and y0 with X0, Y0 or with the
-angles: the standard deviations of both are then large together, while distances between points may be good.
+**Camera and orientation.** In a flat network with parallel views, c is strongly correlated with Z0, and x0
+and y0 with X0, Y0 or the angles. Both then have large standard deviations, while distances between points may
+be precise.
 
-How far the errors of neighbouring image points agree, from the residuals of an adjustment. A lens that
-breathes, a shutter that rolls and a surface that is curved inside of windows move neighbouring image points
-together. Sums of residuals over cells of a photograph, from single image points to half of it, show that: for
-independent errors their squares grow with the number of image points, for common ones with its square. Object
-points, orientations and cameras take a part of either, of long waves the most. How much is left is found by
-simulation: random fields of known length go through the linearised adjustment. A field moves precise image
-points by as many px as others.
+**Neighbouring image points.** Their errors agree if the lens breathes, the shutter rolls, or the surface is
+curved inside the matching windows. Sums of residuals over cells of a photograph, from single image points to
+half of it, show that. Their squares grow with the number of image points for independent errors, and with its
+square for common errors. Object points, orientations and cameras absorb a part of both, mostly of long waves.
+Simulation shows how much remains: random fields of known correlation length pass through the linearised
+adjustment. A field moves precise image points by as many px as others.
 
-Projection uncertainty: how well a calibrated camera knows where a direction is seen in the photograph. The
-covariance of the interior orientation moves the picture of a distant point. The part that equals a rotation
-of the camera is no error of the camera, since every use of it finds the rotation anew: it is taken out by the
-small rotation that fits best to the image points of the calibration. Between these the camera is known,
-beyond them the uncertainty grows.
+**Projection uncertainty.** It states how well a calibrated camera determines where a direction appears in the
+photograph. Errors of the interior orientation move the image of a distant point. The part that equals a
+rotation of the camera does not count, because every use of the camera determines the rotation again. It is
+removed by the small rotation that fits best at the image points of the calibration. Among these the camera is
+known; outside them the uncertainty grows.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlations in self-calibration);
 Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4); variance components by quadratic forms and their
@@ -46,11 +46,11 @@ from sfm.kernels.threads import own_threads
 from sfm.network import rows_of
 from sfm.observations.pose import exterior_jacobian
 
-CELLS = 24  # of the grid along the longer side of the photograph
-HALVINGS = 7  # of the longer side of the photographs, to the smallest cells and to the shortest correlation
-DRAWS = 16  # fields of each length
-WAVES = 64  # of a field in one photograph
-ROUNDS = 5  # of weighting by the expectations; the second hardly changes them
+CELLS = 24  # grid cells along the longer side of the photograph
+HALVINGS = 7  # halvings of the longer side down to the smallest cells and shortest correlation
+DRAWS = 16  # random fields of each length
+WAVES = 64  # waves in the field of one photograph
+ROUNDS = 5  # rounds of weighting by the expectations; the second round hardly changes them
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 
@@ -58,32 +58,32 @@ PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 class OrientationCorrelation:
     """A camera parameter that is strongly correlated with the exterior orientation of photographs."""
 
-    parameter: str  # and its camera, in words
-    largest: float  # correlation, -1 to 1
-    part: str  # X0, Y0, Z0, omega, phi or kappa that it is with
-    image: str  # of this photograph
-    counts: tuple[tuple[str, int], ...]  # parts beyond the limit, and in how many photographs each
+    parameter: str  # the parameter and its camera, in words
+    largest: float  # largest correlation, -1 to 1
+    part: str  # element of exterior orientation of this correlation: X0, Y0, Z0, omega, phi or kappa
+    image: str  # photograph of this correlation
+    counts: tuple[tuple[str, int], ...]  # elements beyond the limit, with the number of photographs
 
     @property
     def partners(self) -> str:
-        """All that it is strongly correlated with, in words."""
+        """All elements of exterior orientation with a strong correlation, in words."""
         return ", ".join(f"{part} of {counted(n, 'photograph')}" for part, n in self.counts)
 
 
 @dataclass(frozen=True)
 class ExteriorCorrelations:
-    """Correlations of all adjusted camera parameters with the orientation of every photograph."""
+    """Correlations of all adjusted camera parameters with the exterior orientation of every photograph."""
 
-    parameters: tuple[tuple[str, str], ...]  # name, and camera in words, of each interior unknown, (i,)
+    parameters: tuple[tuple[str, str], ...]  # name and camera of each interior unknown, in words, (i,)
     images: tuple[str, ...]  # photographs, (m,)
-    rho: FloatArray  # with X0, Y0, Z0, omega, phi, kappa; 0 where one of the two was held, (m, 6, i)
+    rho: FloatArray  # correlation with X0, Y0, Z0, omega, phi, kappa; 0 if one was held fixed, (m, 6, i)
 
 
 def exterior_correlations(adjustment: Adjustment) -> ExteriorCorrelations:
     """Return the correlations of camera parameters with exterior orientation, in the datum of an adjustment.
 
     Args:
-        adjustment: with its covariance.
+        adjustment: finished adjustment with its covariance.
 
     Raises:
         GeometryError: its normal equations cannot be solved.
@@ -99,8 +99,8 @@ def orientation_correlations(
     """Return the camera parameters correlated with exterior orientation beyond a limit, strongest first.
 
     Args:
-        adjustment: with its covariance; the correlations are those in its datum.
-        limit: absolute correlation from which a parameter is reported.
+        adjustment: finished adjustment with its covariance; the correlations are in its datum.
+        limit: absolute correlation above which a parameter is reported.
 
     Raises:
         GeometryError: its normal equations cannot be solved.
@@ -114,8 +114,8 @@ def strong_correlations(
     """Return the camera parameters with a correlation beyond a limit, strongest first.
 
     Args:
-        correlations: with the exterior orientation of every photograph.
-        limit: absolute correlation from which a parameter is reported.
+        correlations: correlations with the exterior orientation of every photograph.
+        limit: absolute correlation above which a parameter is reported.
     """
     if not correlations.rho.size:
         return ()
@@ -139,7 +139,7 @@ def strong_correlations(
 def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatArray]:
     """Return (parameter, camera) of each interior unknown, and its correlations by photograph, (m, 6, i).
 
-    0 where one of the two is fixed or was not adjusted.
+    A correlation is 0 if one of the two is fixed or was not adjusted.
     """
     if not any(camera.free.any() for camera in adjustment.estimate.cameras):
         return [], np.zeros((0, 6, 0))
@@ -149,13 +149,13 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
     first, i = layout.pose_free.size, len(names)
     inner = slice(first, first + i)
     H, F, G = optimum.motions.reduced, Q.F_reduced, Q.G
-    # S Q S' of the S-transformation, the block of exterior by interior unknowns
+    # S Q S' of the S-transformation, block of exterior x interior unknowns
     of_poses = np.concatenate([Q.mixed[:, :i], Q.border[:, :i]])
     C = of_poses - H @ F[:, inner] - (H[inner] @ F).T + H @ G @ H[inner].T
     columns, J = layout.photograph_terms(optimum.state, np.arange(len(optimum.state.M)))
     C = exterior_jacobian(optimum.state.M) @ J @ C[columns]
     exterior = np.einsum("mpp->mp", adjustment.cofactors.exterior)
-    half = H[inner] @ F[:, inner]  # 0 but for null vectors that are none of the motions of the network
+    half = H[inner] @ F[:, inner]  # 0 except for null vectors that are not motions of the network
     interior = np.diagonal(Q.border[:i, :i] - half - half.T + H[inner] @ G @ H[inner].T)
     square = exterior[:, :, None] * interior
     known = square > 0
@@ -166,13 +166,13 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
 def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | None:
     """Return the correlation of the errors of neighbouring image points that fits the residuals best.
 
-    Lengths from the longer side of the photographs down, halved in turn, are tried.
+    The correlation lengths tried are the longer side of the photographs, its half, its quarter, and so on.
 
     Args:
-        adjustment: the adjustment, with its covariance or without.
+        adjustment: finished adjustment, with or without its covariance.
 
     Returns:
-        None where the errors of neighbours do not agree.
+        The correlation; None if the errors of neighbours do not agree.
     """
     m = marginal_of(adjustment, cross=False)
     o = m.layout.observations
@@ -188,7 +188,7 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
     rng = np.random.default_rng(0)
 
     def left_of(errors: FloatArray) -> FloatArray:
-        """Return what the adjustment is expected to leave of errors with unit variance."""
+        """Return the expected squares that errors with unit variance leave in the residuals."""
         errors[~used] = 0.0
         return _squares(linear.residuals(errors.reshape(2 * len(used), -1)), cells)
 
@@ -199,7 +199,7 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
         common = left_of(relative @ _fields(o.image, o.xy, length, rng))
         expected = found
         for _ in range(ROUNDS):
-            sigma = expected / np.sqrt(count)  # of the sum of squares of so many pairs x, y
+            sigma = expected / np.sqrt(count)  # for the sum of squares of `count` pairs x, y
             parts, misfit = nnls(np.column_stack([alone, common]) / sigma[:, None], found / sigma)
             expected = parts[0] * alone + parts[1] * common
         if misfit < least:
@@ -212,20 +212,24 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
 
 @checked_arguments()
 def with_neighbours(adjustment: Adjustment) -> Adjustment:
-    """Return the adjustment with the covariance of errors that neighbours have in common by the residuals."""
+    """Return the adjustment with a covariance for the error correlation estimated from its residuals.
+
+    Args:
+        adjustment: finished adjustment.
+    """
     found = estimate_error_correlation(adjustment)
     return adjustment if found is None else with_error_correlation(adjustment, found)
 
 
 def _cells(image: IntArray, xy: FloatArray, used: BoolArray, side_px: float) -> csr_matrix:
-    """Return which image points are in each cell of the photographs that has some, (cells, k)."""
+    """Return which image points are in each nonempty cell of the photographs, sparse, (cells, k)."""
     of_cell = np.column_stack([image, np.floor(xy / side_px)])[used]
     cell = np.unique(of_cell, axis=0, return_inverse=True)[1].ravel()
     return csr_matrix((np.ones(len(cell)), (cell, np.flatnonzero(used))), shape=(cell.max() + 1, len(used)))
 
 
 def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:
-    """Return the sums of squares of residuals, and of their sums over cells of each size, of a draw."""
+    """Return the sums of squares of residuals, and of their sums over cells of each size, per draw."""
     v = v.reshape(cells[0].shape[1], -1)
     draws = v.shape[1] / 2
     return np.array([float((v**2).sum()), *(float(((one @ v) ** 2).sum()) for one in cells)]) / draws
@@ -234,7 +238,7 @@ def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:
 def _fields(image: IntArray, xy: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
     """Return random fields in each photograph with covariance exp(-d / length), (k, 2, DRAWS).
 
-    Wave numbers are drawn from its spectrum, that of a bivariate Cauchy distribution.
+    Wave numbers are drawn from its spectrum, a bivariate Cauchy distribution.
     """
     field = np.empty((len(xy), 2, DRAWS))
     for rows in rows_of(image, int(image.max()) + 1):
@@ -253,12 +257,12 @@ def projection_map(
 
     Args:
         camera: interior orientation.
-        covariance: of its free parameters, (f, f).
-        seen: image points that calibrated it, px, (k, 2).
+        covariance: covariance of its free parameters, (f, f).
+        seen: image points of its calibration, px, (k, 2).
 
     Returns:
-        Columns (c,) and rows (r,) of a grid, px, and the root mean square standard deviation of both
-        coordinates at its crossings, px, (r, c); NaN where the camera model folds over.
+        Columns (c,) and rows (r,) of a grid, px, and the root mean square of the standard deviations of both
+        coordinates at its nodes, px, (r, c); NaN where the camera model folds over.
     """
     width, height = camera.size_px
     cell = max(width, height) / CELLS
@@ -271,18 +275,18 @@ def projection_map(
 
 
 def observed_part(seen: FloatArray, xy: FloatArray) -> tuple[float, BoolArray]:
-    """Return the area that image points cover, their convex hull, px^2, and which places are in it.
+    """Return the area of the convex hull of image points, px^2, and which positions lie inside.
 
     Args:
         seen: image points, px, (k, 2).
-        xy: places, px, (n, 2).
+        xy: positions, px, (n, 2).
 
     Returns:
-        The area, 0 of image points on one line, and whether each place is inside, (n,).
+        The area, 0 for image points on a line, and whether each position is inside, (n,).
     """
     try:
         hull = ConvexHull(seen)
-    except (QhullError, ValueError):  # on one line, or fewer than three
+    except (QhullError, ValueError):  # on a line, or fewer than three
         return 0.0, np.zeros(len(xy), dtype=bool)
     inside = (xy @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)
     return float(hull.volume), np.asarray(inside)
@@ -291,17 +295,17 @@ def observed_part(seen: FloatArray, xy: FloatArray) -> tuple[float, BoolArray]:
 def projection_covariance(
     camera: Camera, covariance: FloatArray, seen: FloatArray, xy: FloatArray
 ) -> FloatArray:
-    """Return the covariance of the places at which directions are seen, rotations taken out.
+    """Return the covariance of the pixel positions of directions, with rotations removed.
 
     Args:
         camera: interior orientation.
-        covariance: of its free parameters, (f, f).
+        covariance: covariance of its free parameters, (f, f).
         seen: image points to which the rotation is fitted, px, (k, 2).
-        xy: where the directions are seen, px, (n, 2).
+        xy: pixel positions of the directions, px, (n, 2).
 
     Returns:
-        px^2, (n, 2, 2); NaN where the camera model cannot be inverted, infinite where a parameter is not
-        determined.
+        Covariance, px^2, (n, 2, 2); NaN where the camera model cannot be inverted, infinite if a parameter is
+        not determined.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     if np.isinf(sigma).any():
@@ -321,7 +325,7 @@ def projection_covariance(
 
 
 def _moved(camera: Camera, steps: FloatArray, xy: FloatArray) -> FloatArray:
-    """Return by how much steps of the parameters (s, p) move pictures of distant points, px, (n, 2, s)."""
+    """Return the shifts of images of distant points by steps of the parameters (s, p), px, (n, 2, s)."""
     uv = tangents_from_pixel(camera, xy)
     columns = []
     for step in steps:
@@ -331,8 +335,8 @@ def _moved(camera: Camera, steps: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 def _turned(camera: Camera, xy: FloatArray) -> FloatArray:
-    """Return how small rotations of the rays about the image axes move their pictures, px/rad, (n, 2, 3)."""
+    """Return the shifts of images of rays by small rotations about the image axes, px/rad, (n, 2, 3)."""
     u, v = tangents_from_pixel(camera, xy).T
-    # of rays (u, v, -1): w x ray, divided by its depth again
+    # for rays (u, v, -1): w x ray, divided by its depth again
     turned = np.array([[u * v, -1 - u**2, -v], [1 + v**2, -u * v, u]])
     return np.asarray(np.einsum("nij,jkn->nik", pixel_jacobian(camera, xy), turned))

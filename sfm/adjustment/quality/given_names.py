@@ -1,7 +1,7 @@
-"""Names of given points assigned otherwise, by the shape of the free network.
+"""Finds other assignments of names to given points, from the shape of the free network.
 
-A list of coordinates that is shifted by a row, or two names exchanged, is the same figure of points with
-other names. Triangles of the figure that are similar place it.
+A list of coordinates shifted by one row, or with two names exchanged, is the same figure of points with other
+names. Similar triangles in both figures give the similarity between them, and with it the assignment.
 """
 
 from __future__ import annotations
@@ -15,28 +15,31 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.similarity import Similarity, fit_similarities
 
-MIN_POINTS = 4  # three have a similar triangle by chance too easily: two degrees of freedom
-MAX_POINTS = 40  # 59,280 triangles with their orders; of more points those that disagree are assigned only
-TRIANGLES = 20  # of the network: with half of the points right, 14 of 15 lists have a right one among them
+MIN_POINTS = 4  # three points have a similar triangle by chance too easily: two degrees of freedom
+MAX_POINTS = 40  # 59,280 ordered triangles; with more points, only the agreed similarity is used
+TRIANGLES = 20  # with half of the points correct, 14 of 15 lists of triangles include a correct one
 MAX_SIMILAR = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
-MAX_ASSIGNMENTS = 8  # that are judged: the likeliest, and rivals of it
+MAX_ASSIGNMENTS = 8  # assignments that are judged: the likeliest and its rivals
 
 
 def assignments(
     free: FloatArray, given: FloatArray, variance: tuple[FloatArray, FloatArray], agreed: Similarity | None
 ) -> Iterator[tuple[int, ...]]:
-    """Yield other assignments of given coordinates to points of the free network, the likeliest first.
+    """Yield other assignments of given coordinates to points of the free network, likeliest first.
 
-    Each costs what its distances do as errors whose size is unknown, and its choice.
+    The cost of an assignment is that of its distances, as errors of unknown size, plus that of its choice.
 
     Args:
         free: points of the free network, (n, 3).
-        given: coordinates, of which those that are not complete keep their names, (n, 3).
-        variance: of a coordinate of the free points in their frame, and of the given ones, (n,) each.
-        agreed: similarity upon which more than half of the points agree by their names, if there is one;
-            three may agree by chance, so that it is not the only one that is tried.
+        given: given coordinates, (n, 3); incomplete points keep their names.
+        variance: variance of a coordinate of the free points in their frame, and of the given points, (n,)
+            each.
+        agreed: similarity on which more than half of the points agree with their own names, if any. Three
+            points may agree by chance, so other similarities are tried as well.
     """
-    from scipy.optimize import linear_sum_assignment  # takes half a second, which right surveys never need
+    from scipy.optimize import (
+        linear_sum_assignment,
+    )  # takes half a second; rarely needed
     from scipy.spatial.distance import cdist
 
     at = np.flatnonzero(np.isfinite(given).all(axis=1))
@@ -67,21 +70,24 @@ def assignments(
 
 
 def cost_of_choice(order: tuple[int, ...]) -> float:
-    """Return 2 ln of n! / (n - m)!, the number of ordered choices of m coordinates, where m names are moved.
+    """Return 2 ln of n! / (n - m)!, the number of ordered choices of m coordinates, if m names are moved.
 
-    About one in e of them moves all m.
+    About one in e of these choices moves all m.
+
+    Args:
+        order: index of the point whose coordinates each point gets, (n,).
     """
     n, moved = len(order), len(moved_by(order))
     return 2 * (lgamma(n + 1) - lgamma(n - moved + 1))
 
 
 def moved_by(order: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the points that have the coordinates of another."""
+    """Return the points that get the coordinates of another point."""
     return tuple(k for k, one in enumerate(order) if one != k)
 
 
 def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
-    """Return similarities that bring triangles of X onto similar ones of Y, their corners in any order."""
+    """Return similarities from triangles of X to similar triangles of Y, with corners in any order."""
     rng, n = np.random.default_rng(len(X)), len(X)
     of_y: IntArray = np.array(list(permutations(range(n), 3)))
     shape = _shape(Y[of_y])
@@ -96,7 +102,7 @@ def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
 
 
 def _shape(corners: FloatArray) -> FloatArray:
-    """Return two ratios of the sides of triangles, as logarithms, (..., 2)."""
+    """Return the logarithms of two ratios of the sides of triangles, (..., 2)."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=-2), axis=-1)
     sides = np.log(np.maximum(sides, np.finfo(float).tiny))
     return np.asarray(sides[..., :2] - sides[..., 2:])

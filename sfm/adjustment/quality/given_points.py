@@ -1,7 +1,7 @@
-"""Given points as differences from the free network.
+"""Given points: judges given coordinates by their differences from the free network.
 
-Points place the free network by a similarity, which most of them agree upon. Where points do not fit, they
-may also be stretched, left-handed or have one another's names.
+A similarity on which most points agree transforms the free network to the given points. If points do not
+fit, they may be wrong, stretched, left-handed or have exchanged names.
 
 Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984), J. Am. Stat. Assoc. 79(388).
 """
@@ -30,34 +30,32 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vecto
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity, similarity_motions
 
-MAX_TRIPLES = (
-    300  # similarities by three points that are tried: with half of them right, 37 are by three such
-)
-MAX_STEPS = 20  # of a similarity to the best one; those to one that fits are fewer than ten
-MAX_DECIMALS = 8  # of coordinates; more are those of computed ones
-SAME_DECIMAL = 1e-6  # by which a number in its last place may differ from a whole one, by its binary rounding
-STRAINS = (  # derivatives of coordinates by their parameters, along an axis or of an affinity, (u, 3, 3)
+MAX_TRIPLES = 300  # tried similarities from three points; with half of the points right, 37 are right
+MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten
+MAX_DECIMALS = 8  # most decimals of typed coordinates; computed ones have more
+SAME_DECIMAL = 1e-6  # deviation of a scaled number from a whole number that is due to binary rounding
+STRAINS = (  # derivatives of coordinates by the parameters, along an axis or of an affinity, (u, 3, 3)
     *(np.diag(e)[None] for e in np.eye(3)),
     np.array(
         [np.diag([1.0, -1, 0]), np.diag([0, 1.0, -1])]
         + [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
     ),
 )
-ROUNDING = 16 * np.finfo(float).eps  # of coordinates after a similarity, over the largest of them
+ROUNDING = 16 * np.finfo(float).eps  # rounding error of transformed coordinates, relative to the largest
 
 
 @dataclass(frozen=True, eq=False)
 class Strain:
-    """Stretched coordinates, but for their scale where it stretches all axes."""
+    """A strain of the given coordinates; if it involves all axes, the scale is left out."""
 
-    derivatives: FloatArray  # by its parameters, (u, 3, 3)
-    F: FloatArray  # stretched coordinates from those that are not, about their centre, (3, 3)
-    axis: str | None = None  # the only one that is stretched, where no other explains as much
-    chi2: float = 0.0  # of points that are not stretched
+    derivatives: FloatArray  # derivatives of coordinates by the parameters, (u, 3, 3)
+    F: FloatArray  # matrix from original to stretched coordinates about their centre, (3, 3)
+    axis: str | None = None  # stretched axis, if no other axis explains as much
+    chi2: float = 0.0  # chi-square with the strain
 
     @property
     def elongation(self) -> float:
-        """Relative elongation along the axis; of all axes that of the longest over the shortest."""
+        """Relative elongation along the axis; for all axes, that of the longest relative to the shortest."""
         d = np.linalg.svd(self.F, compute_uv=False)
         return float(np.trace(self.F) - 3 if len(self.derivatives) == 1 else d[0] / d[-1] - 1)
 
@@ -66,12 +64,12 @@ class Strain:
 class GivenPoints:
     """Points with given coordinates, and the same points of the free network."""
 
-    given: FloatArray  # NaN where not known, (n, 3)
-    stated: FloatArray  # covariance of the known ones, 0 where fixed, (n, 3, 3)
-    free: FloatArray  # in the frame of the free network, (n, 3)
-    joint: FloatArray  # covariance of the free ones, (3 n, 3 n)
-    redundancy: int  # of the free network
-    strain: Strain | None = None  # of the given coordinates
+    given: FloatArray  # given coordinates; NaN where unknown, (n, 3)
+    stated: FloatArray  # covariance of the given coordinates, 0 where fixed, (n, 3, 3)
+    free: FloatArray  # points in the frame of the free network, (n, 3)
+    joint: FloatArray  # covariance of the free points, (3 n, 3 n)
+    redundancy: int  # redundancy of the free network
+    strain: Strain | None = None  # strain of the given coordinates
 
     @property
     def known(self) -> FloatArray:
@@ -80,11 +78,11 @@ class GivenPoints:
 
     @property
     def complete(self) -> IntArray:
-        """Points of which all three coordinates are known."""
+        """Points with all three coordinates known."""
         return np.flatnonzero(self.known.all(axis=1))
 
     def select(self, some: IntArray) -> GivenPoints:
-        """Return some of the points."""
+        """Return the points of the given indices."""
         rows = (3 * np.asarray(some)[:, None] + np.arange(3)).ravel()
         return replace(
             self,
@@ -95,7 +93,7 @@ class GivenPoints:
         )
 
     def rounded(self) -> GivenPoints:
-        """Return them with the standard deviations that rounding to their last decimal place gives.
+        """Return the points with the standard deviations that follow from rounding to the last decimal place.
 
         Source: Foerstner and Wrobel (2016), sec. 2.3 (uniform distribution).
         """
@@ -109,18 +107,23 @@ class GivenPoints:
         return of_free, np.einsum("nii->n", self.stated) / 3
 
     def reordered(self, order: tuple[int, ...]) -> GivenPoints:
-        """Return them with the given coordinates of others."""
+        """Return the points with their given coordinates in another order."""
         return replace(self, given=self.given[list(order)], stated=self.stated[list(order)])
 
     def mirrored(self) -> GivenPoints:
-        """Return them with the free network mirrored."""
+        """Return the points with the free network mirrored."""
         flip = np.tile([-1.0, 1.0, 1.0], len(self.free))
         return replace(
             self, free=self.free * (-1.0, 1.0, 1.0), joint=self.joint * flip[:, None] * flip[None, :]
         )
 
     def model(self, placing: Similarity, *, estimated: bool) -> GivenModel:
-        """Return the differences from the free network as a similarity places it."""
+        """Return the differences from the free network after a similarity.
+
+        Args:
+            placing: similarity, given frame from free frame.
+            estimated: whether the standard deviations are unknown.
+        """
         rows = np.flatnonzero(self.known.ravel())
         X = placing.apply(self.free)
         centre, size = centre_and_size(X)
@@ -150,7 +153,12 @@ class GivenPoints:
         )
 
     def moved(self, placing: Similarity, model: GivenModel, without: tuple[int, ...]) -> Similarity:
-        """Return the similarity that fits the given values best, some left out, by generalised least squares.
+        """Return the similarity that best fits the given values, without some, by generalised least squares.
+
+        Args:
+            placing: approximate similarity.
+            model: differences after it.
+            without: points left out.
 
         Source: Mikhail (1976), Observations and Least Squares, ch. 8.
         """
@@ -165,7 +173,7 @@ class GivenPoints:
 
 
 def decimal_step(numbers: FloatArray) -> float:
-    """Return the unit of the last decimal place of numbers; 0 of whole ones and of computed ones."""
+    """Return the unit of the last decimal place of numbers; 0 for whole and for computed numbers."""
     known = numbers[np.isfinite(numbers)]
     if np.abs(known - np.rint(known)).max(initial=0.0) < SAME_DECIMAL:
         return 0.0  # whole numbers may be nominal ones
@@ -176,79 +184,79 @@ def decimal_step(numbers: FloatArray) -> float:
 
 
 def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
-    """Return the centre of points and their farthest coordinate from it."""
+    """Return the centre of points and the largest distance of a coordinate from it."""
     centre = X.mean(axis=0)
     return centre, max(float(np.abs(X - centre).max()), np.finfo(float).tiny)
 
 
 def parameters_of(model: GivenModel, kept: BoolArray) -> FloatArray:
-    """Return the parameters as a linear function of the kept differences, (u, m)."""
+    """Return the matrix that gives the parameters from the kept differences, (u, m)."""
     S = (model.network + model.stated)[np.ix_(kept, kept)]
     A = model.A[kept]
     unit = max(float(np.trace(S)), np.finfo(float).tiny)
     if model.estimated:
         return np.asarray(np.linalg.pinv(A, rcond=RANK))
-    # covariance along the parameters does not change them, and makes that of a free network regular
+    # additional covariance along the parameters does not change them, and makes a singular one regular
     P = np.linalg.inv(S + unit * A @ A.T + RANK**1.5 * unit * np.eye(len(S)))
     return np.asarray(np.linalg.pinv(A.T @ P @ A, rcond=RANK, hermitian=True) @ A.T @ P)
 
 
 @dataclass(frozen=True)
 class PlacedPoints:
-    """Given points judged, and how they place the free network."""
+    """Judged given points, and the similarity between them and the free network."""
 
     judgement: Judgement
-    placing: Similarity  # given frame from that of the free network
-    model: GivenModel  # at it
-    unmirrored: float | None = None  # chi-square as given, where only the mirrored network fits
-    order: tuple[int, ...] = ()  # whose coordinates each has, where they fit with other names
-    exchangeable: tuple[int, ...] = ()  # those whose names, if exchanged, explain the differences as well
-    strain: Strain | None = None  # that explains the differences
+    placing: Similarity  # given frame from the frame of the free network
+    model: GivenModel  # differences after the similarity
+    unmirrored: float | None = None  # chi-square without mirroring, if only the mirrored network fits
+    order: tuple[int, ...] = ()  # point whose coordinates each point has, if they fit with other names
+    exchangeable: tuple[int, ...] = ()  # points whose exchanged names would explain the differences as well
+    strain: Strain | None = None  # strain that explains the differences
     cost_of_strain: float = 0.0
 
     @property
     def mirrored(self) -> bool:
-        """Whether they fit the mirrored network and not the network."""
+        """Whether the points fit the mirrored network only."""
         return self.unmirrored is not None
 
     @property
     def misfit(self) -> float:
-        """Chi-square with what is wrong, and its cost."""
+        """Chi-square after accounting for the errors found, plus the cost of these errors."""
         return misfit_of(self.model, self.judgement)
 
     @property
     def cost(self) -> float:
-        """Their misfit, and what a strain and the choice of other names cost."""
+        """Misfit plus the cost of a strain and of the choice of other names."""
         return self.misfit + self.cost_of_strain + cost_of_choice(self.order)
 
     @property
     def agreeing(self) -> Similarity | None:
-        """The similarity, if more than half of the points agree upon it."""
+        """The similarity, if more than half of the points agree on it."""
         return self.placing if self.judgement.wrong else None
 
     @property
     def renamed(self) -> tuple[int, ...]:
-        """Those with the coordinates of another."""
+        """Points that have the coordinates of another point."""
         return tuple(k for k in moved_by(self.order) if k not in self.judgement.wrong)
 
 
 def judge_points(
     points: GivenPoints, level: float, *, start: Similarity | None = None, estimated: bool = False
 ) -> PlacedPoints | None:
-    """Return what is wrong of given points, and how the others place the free network.
+    """Return the errors of given points, and the similarity from the free network to the other points.
 
-    The most likely explanation counts: errors of single points, that all are mirrored, stretched, or have one
-    another's names. Where it is not more likely than others by the margin, they contradict one another, but
-    for what may be mirrored: that is no figure to be placed.
+    The most likely explanation is chosen: errors of single points, or all points mirrored, stretched or with
+    exchanged names. If it does not exceed the others by the margin, the points contradict one another. The
+    exception is a mirrored figure, which is reported as mirrored.
 
     Args:
-        points: given, and of the free network.
-        level: probability with which right points are reported as wrong.
+        points: given points, and the same points of the free network.
+        level: probability that correct points are reported as wrong.
         start: approximate similarity, used with fewer than three complete points.
-        estimated: whether their standard deviations are unknown.
+        estimated: whether the standard deviations are unknown.
 
     Returns:
-        None where they do not place the network.
+        The judged points; None if they do not determine a similarity.
     """
     found = _placed(points, level, start, estimated)
     if found is None or found.judgement.fits:
@@ -270,7 +278,7 @@ def judge_points(
         return _contradiction(found, [found, *like])
     either = next((one for one in like if one.mirrored), None)
     if either is not None:
-        # as a whole left and right may be exchanged, which is no choice among all orders
+        # names of left and right may be exchanged as a whole, which is not a choice among all orders
         like = [one for one in others if one.order and one.misfit < either.misfit + MARGIN]
         return replace(either, exchangeable=_points_of(like))
     if len(like) > 1:
@@ -279,15 +287,15 @@ def judge_points(
 
 
 def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
-    """Return whether points, those left out that are wrong, fit the network and not the mirrored one.
+    """Return whether points, without the wrong ones, fit the network but not the mirrored network.
 
-    Of n differences the mirror image is less likely by n ln of the ratio of chi-square over n, in -2 ln
-    likelihood with a variance factor that is not known, and at least 1: where some contradict one another,
-    both have their misfit.
+    With n differences the mirror image is less likely by n ln of the ratio of both chi-squares, in -2 ln
+    likelihood. This assumes an unknown variance factor of at least 1. Both chi-squares include the misfit of
+    points that contradict one another.
 
     Args:
-        points: given, and of the free network.
-        found: the same, judged and not mirrored.
+        points: given points, and the same points of the free network.
+        found: these points, judged and not mirrored.
 
     Source: Seber and Wild (1989), Nonlinear Regression, sec. 2.2.
     """
@@ -305,7 +313,7 @@ def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
 def _renamed(
     points: GivenPoints, level: float, agreed: Similarity | None, estimated: bool
 ) -> Iterator[PlacedPoints]:
-    """Yield points with other names, where these explain the differences."""
+    """Yield the points with other names that explain the differences."""
     for order in assignments(points.free, points.given, points.variances, agreed):
         one = _placed(points.reordered(order), level, None, estimated)
         if one is not None and one.judgement.explained:
@@ -313,12 +321,12 @@ def _renamed(
 
 
 def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:
-    """Return the points whose names explanations exchange."""
+    """Return the points whose names are exchanged in any of the explanations."""
     return tuple(sorted({k for one in explanations for k in one.renamed}))
 
 
 def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
-    """Return points as given, of which nothing shows which of several explanations is right."""
+    """Return points as given, marked as doubtful because several explanations are possible."""
     some = {k for one in like for k in (*moved_by(one.order), *one.judgement.wrong, *one.judgement.doubtful)}
     if not some or any(one.mirrored or one.strain for one in like):
         some = set(range(found.model.items))
@@ -328,9 +336,9 @@ def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoint
 
 
 def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated: bool) -> PlacedPoints | None:
-    """Return points that fit as stretched ones, along an axis or more, by the most likely strain.
+    """Return points that fit with the most likely strain, along one axis or more; None if no strain fits.
 
-    Nothing shows which axes are right, and whether the scale is.
+    Which axes are right, and whether the scale is, cannot be decided.
     """
     fitting: list[tuple[PlacedPoints, Strain]] = []
     for derivatives in _determined_strains(points.given[points.complete]):
@@ -362,15 +370,15 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
 
 
 def _determined_strains(xyz: FloatArray) -> list[FloatArray]:
-    """Return the strains that show in points: not those along the normal of a plane, or beside a line."""
+    """Return the strains that points determine: not along the normal of a plane, or across a line."""
     axes = extended_axes(xyz)[0]
-    if len(axes) < 2:  # along a line it is the scale
+    if len(axes) < 2:  # along a line a strain is the scale
         return []
     onto = axes.T @ axes
     shown = []
     for derivatives in STRAINS:
         inside = onto @ derivatives @ onto
-        if len(inside) > 1:  # beside the scale
+        if len(inside) > 1:  # without the scale
             inside = inside - np.trace(inside, axis1=1, axis2=2)[:, None, None] / len(axes) * onto
         shares, directions = np.linalg.svd(inside.reshape(len(inside), 9), full_matrices=False)[1:]
         rank = int((shares > RANK).sum()) if len(axes) < 3 else len(derivatives)
@@ -384,10 +392,10 @@ def _determined_strains(xyz: FloatArray) -> list[FloatArray]:
 def _placed(
     points: GivenPoints, level: float, start: Similarity | None, estimated: bool
 ) -> PlacedPoints | None:
-    """Judge points at the similarity of all, and where they do not fit, at that which most agree upon."""
+    """Judge points with the similarity of all points or, if they do not fit, with one on which most agree."""
     best: PlacedPoints | None = None
     for k, placing in enumerate(_starts(points, start)):
-        # at what most agree upon, the others are left out before they move it
+        # with the similarity on which most agree, the others are left out before they can change it
         at_start = judge_values(points.model(placing, estimated=estimated), level) if k else None
         found = _judged(points, placing, () if at_start is None else at_start.wrong, level, estimated)
         if found.judgement.fits:
@@ -400,7 +408,7 @@ def _placed(
 def _judged(
     points: GivenPoints, placing: Similarity, out: tuple[int, ...], level: float, estimated: bool
 ) -> PlacedPoints:
-    """Judge points at the similarity that fits them best, until it is without those that are wrong."""
+    """Judge points with the similarity that fits best, repeatedly, until it is free of wrong points."""
     tried: set[tuple[int, ...]] = set()
     while True:
         tried.add(out)
@@ -414,11 +422,11 @@ def _judged(
 def _converged(
     points: GivenPoints, placing: Similarity, without: tuple[int, ...], estimated: bool
 ) -> tuple[Similarity, GivenModel]:
-    """Return the similarity that fits points best, some left out, and the model at it.
+    """Return the similarity that fits points best, with some left out, and the model after it.
 
-    A step that changes no coordinate beyond their linear dependence or their rounding is the last one. Points
-    that do not fit at all need not converge, as a larger scale makes the covariance of the network larger:
-    they are judged where they started.
+    The iteration ends when a step changes no coordinate by more than RANK times the size, or rounding. Points
+    that do not fit at all may not converge, because a larger scale increases the covariance of the network.
+    They are judged at their start.
     """
     start = placing, points.model(placing, estimated=estimated)
     placing, model = start
@@ -426,7 +434,7 @@ def _converged(
         with np.errstate(over="ignore", invalid="ignore"):
             moved = points.moved(placing, model, without)
             X, Y = placing.apply(points.free), moved.apply(points.free)
-            if not np.isfinite((Y / ROUNDING) ** 2).all():  # nor would its weights be
+            if not np.isfinite((Y / ROUNDING) ** 2).all():  # its weights would not be finite either
                 break
         placing, model = moved, points.model(moved, estimated=estimated)
         if np.abs(Y - X).max() <= RANK * centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
@@ -435,10 +443,10 @@ def _converged(
 
 
 def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarity]:
-    """Yield the similarity by all points, then that by three of them which most agree upon; else as given.
+    """Yield the similarity from all points, then the one from three points on which most points agree.
 
-    Of the triples, that with the smallest median distance, h = [n / 2] + 1: a similarity does not meet three
-    points exactly.
+    Without a similarity from all points, yield the given start. The best triple has the smallest median
+    distance, with h = [n / 2] + 1, because a similarity does not fit three points exactly.
 
     Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares.
     """
@@ -468,7 +476,7 @@ def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarit
 
 @lru_cache(maxsize=64)
 def _triples(n: int, most: int) -> IntArray:
-    """Return all threes of n points, or `most` random ones where these are more, (t, 3)."""
+    """Return all triples of n points, or `most` random triples if there are more, (t, 3)."""
     if comb(n, 3) <= most:
         return np.array(list(combinations(range(n), 3)))
     rng = np.random.default_rng(n)

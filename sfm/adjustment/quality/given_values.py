@@ -1,11 +1,11 @@
-"""Given values against the free network: bars, control and projection centres, judged before they are used.
+"""Given values: judges bars, control and projection centres against the free network before they are used.
 
-An adjustment shares a contradiction among all observations, and weak photographs bend until nothing shows.
-The free network has the shape that the image points give by themselves, with its covariance. Given values
-differ from it by v with covariance network + stated, but for the parameters A that only they determine: a
-scale (bars), a similarity (points). In what A leaves of v every error of a given value is tested, and the
-errors compared: some values are wrong, or the standard deviations are too small, which an order of magnitude
-must explain. Names and handedness of points are compared with these in `given_points`.
+An adjustment distributes a contradiction over all observations, and weak photographs deform until nothing
+shows. The free network has the shape that the image points determine alone, with its covariance. Given values
+differ from it by v, with the covariance network + stated. The parameters A, which only given values
+determine, are removed from v: a scale for bars, a similarity for points. In the remainder every error of a
+given value is tested, and explanations are compared. Either some values are wrong, or all standard deviations
+are too small, by at most an order of magnitude. `given_points` adds explanations by names and handedness.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests, external
 reliability); Schwarz (1978), Ann. Stat. 6(2) (the cost of a parameter); Patterson and Thompson (1971),
@@ -25,42 +25,45 @@ import numpy as np
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
 from sfm.distributions import f_sf
 
-LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
-MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be distinguished from them
-NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
-MIN_LEAD = log(100)  # of ln likelihood, below which two alternatives cannot be separated
-# An order of magnitude, mm stated for cm or the precision of an instrument alone. Differences that it does
-# not explain are errors of the values; the factor that fits best may be larger by chance.
+LEVEL = 0.001  # probability that a test of a survey rejects correct given values; Baarda (1968)
+MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
+NONCENTRALITY = 4.13  # noncentrality of an error that a test at LEVEL finds with 80 %; Baarda (1968)
+MIN_LEAD = log(100)  # difference of ln likelihood below which two alternatives cannot be separated
+# An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
+# not explain are errors of the values. The best-fitting factor may be larger by chance.
 MAX_FACTOR = 10.0
-UNSTATED_FRACTION = SWELLING  # relative, of coordinates without standard deviations
-RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
+UNSTATED_FRACTION = SWELLING  # relative standard deviation of coordinates without a stated one
+RANK = 1e-9  # ratio of an eigenvalue to the largest below which a direction does not exist
 MIN_REDUNDANCY = RANK**0.5  # redundancy number below which nothing checks a direction
-MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value
-FACTORS = np.geomspace(1.0, 1e6, 241)  # on standard deviations
+MAX_SETS = 2000  # sets of wrong values that are tried; beyond, only sets that differ in one value
+FACTORS = np.geomspace(1.0, 1e6, 241)  # tried factors on standard deviations
 
 
 @dataclass(frozen=True)
 class Bias:
-    """Further parameters of the differences, and the test that they are 0."""
+    """Additional parameters of the differences, and the test that they are 0."""
 
     parameters: FloatArray  # (q,)
     statistic: float  # chi-square that they explain
     dof: int
-    probability: float  # of all or of one so large by chance; both tests share the level
+    probability: float  # chance probability of such values, all together or one; both tests share the level
 
 
 @dataclass(frozen=True)
 class Kept:
-    """Given values some of which are left out: what is left of the differences of the others."""
+    """Differences of given values after some values are left out."""
 
     model: GivenModel
-    precision: FloatArray  # inverse covariance of what the parameters and those left out leave, (m, m)
+    precision: FloatArray  # inverse covariance after removing parameters and values left out, (m, m)
     u: FloatArray  # precision times v, (m,)
     chi2: float
     dof: int
 
     def without(self, one: int) -> Kept:
-        """Leave out one more value, by the update of a partitioned inverse.
+        """Leave out one more value, by updating the partitioned inverse.
+
+        Args:
+            one: index of the value.
 
         Source: Foerstner and Wrobel (2016), sec. 4.6.2.
         """
@@ -75,7 +78,7 @@ class Kept:
         return Kept(self.model, M, u, max(self.chi2 - float(w @ w), 0.0), self.dof - int(on.sum()))
 
     def decreases(self) -> tuple[FloatArray, IntArray]:
-        """Return the fall of chi-square without each value too, and its degrees of freedom, (items,)."""
+        """Return the decrease of chi-square without each further value, and of its dof, (items,) each."""
         at, there = self.model.blocks
         s = np.where(there, self.model.size[at], 0.0)
         d, U = np.linalg.eigh(self.precision[at[:, :, None], at[:, None, :]] * s[:, :, None] * s[:, None, :])
@@ -84,22 +87,26 @@ class Kept:
         return np.where(on, w2 / np.where(on, d, 1.0), 0.0).sum(axis=1), on.sum(axis=1)
 
     def difference(self, one: int) -> tuple[FloatArray, FloatArray]:
-        """Return how far a value is from where the others have it, (k,), and its covariance, (k, k)."""
+        """Return the difference of a value from the prediction by the others, (k,), and its covariance.
+
+        Args:
+            one: index of the value.
+        """
         rows = np.flatnonzero(self.model.item == one)
         covariance = np.linalg.pinv(self.precision[np.ix_(rows, rows)], rcond=RANK, hermitian=True)
         return covariance @ self.u[rows], np.asarray(covariance, dtype=np.float64)
 
     def bias(self, columns: FloatArray) -> Bias:
-        """Return what parameters beside those of the model would explain, by the score test.
+        """Return the estimate and score test of parameters in addition to those of the model.
 
         Args:
-            columns: derivatives of the differences by them, none of them 0, (m, q). Columns that cannot
-                be distinguished from the parameters of the model explain nothing.
+            columns: derivatives of the differences by these parameters, none of them all 0, (m, q). Columns
+                that cannot be distinguished from the parameters of the model explain nothing.
 
         Source: Rao (1948), Math. Proc. Camb. Phil. Soc. 44(1) (score test).
         """
-        # in parts of what the differences would determine of each, were they independent and nothing else
-        # unknown
+        # scaled by the standard deviation of each parameter if the differences were independent and nothing
+        # else unknown
         scale = 1 / np.linalg.norm(columns / self.model.size[:, None], axis=0)
         g, H = scale * (columns.T @ self.u), scale[:, None] * (columns.T @ self.precision @ columns) * scale
         d, U = np.linalg.eigh((H + H.T) / 2)
@@ -114,15 +121,15 @@ class Kept:
         return Bias(scale * (U[:, on] @ (w / d[on])), fall, rank, probability)
 
     def probability(self) -> float:
-        """Return the probability of differences so large by chance: of all, of one value, of one coordinate.
+        """Return the probability of such differences by chance: of all, of one value, or of one coordinate.
 
-        The three tests share the level, as the single values and coordinates do.
+        The three tests share the level, and so do the single values and coordinates.
         """
         if self.dof <= 0:
             return 1.0
         fall, rank = self.decreases()
         of_rank = [self._sf_of_one(float(fall[rank == r].max()), int(r)) for r in np.unique(rank[rank > 0])]
-        single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked alone
+        single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked on its own
         if self.model.estimated:
             return min(1.0, single)
         of_one, u = np.diagonal(self.precision) * self.model.size**2, self.u * self.model.size
@@ -133,7 +140,7 @@ class Kept:
         return min(1.0, 3 * together, 3 * single, 3 * coordinate)
 
     def _sf(self, chi2: float, dof: int) -> float:
-        """Probability of a larger chi-square, its network part by a variance factor that is estimated.
+        """Return the probability of a larger chi-square, whose network part has an estimated variance factor.
 
         Source: Satterthwaite (1946), Biometrics 2(6).
         """
@@ -141,7 +148,7 @@ class Kept:
         return float(f_sf(chi2 / dof, dof, freedom))
 
     def _sf_of_one(self, fall: float, rank: int) -> float:
-        """Probability of one value so far from the others, whose scatter is no less than the network has."""
+        """Return the probability of such a value; others scatter at least as much as the network does."""
         rest = self.dof - rank
         if not self.model.estimated:
             return self._sf(fall, rank)
@@ -150,31 +157,31 @@ class Kept:
 
 @dataclass(frozen=True)
 class GivenModel:
-    """Differences between given values and the free network, and what they are known by."""
+    """Differences between given values and the free network, with their covariance."""
 
-    v: FloatArray  # given minus predicted by the free network, (m,)
-    network: FloatArray  # their covariance from the free network, (m, m)
-    stated: FloatArray  # their covariance as stated, (m, m)
-    A: FloatArray  # derivatives by what only the given values determine, (m, u)
-    item: IntArray  # which given value each row is of, (m,)
-    redundancy: int  # of the free network: how well its variance factor is known
-    estimated: bool = False  # whether the standard deviations are unknown and come from the differences
-    extent: float = 0.0  # of the given values, of which standard deviations that are not stated are a part
+    v: FloatArray  # given value minus prediction by the free network, (m,)
+    network: FloatArray  # covariance of the prediction, (m, m)
+    stated: FloatArray  # stated covariance of the given values, (m, m)
+    A: FloatArray  # derivatives by the parameters that only the given values determine, (m, u)
+    item: IntArray  # given value of each row, (m,)
+    redundancy: int  # redundancy of the variance factor of the free network
+    estimated: bool = False  # whether the standard deviations are unknown and follow from the differences
+    extent: float = 0.0  # extent of the given values, for standard deviations that are not stated
 
     @cached_property
     def items(self) -> int:
-        """How many values were given."""
+        """Number of given values."""
         return int(self.item.max(initial=-1)) + 1
 
     @cached_property
     def _left(self) -> FloatArray:
-        """Orthonormal base of what the parameters leave, (m, m - u)."""
+        """Orthonormal basis of the space orthogonal to the parameters, (m, m - u)."""
         U, d, _ = np.linalg.svd(self.A)
         return U[:, int((d > RANK * d.max(initial=0.0)).sum()) :]
 
     @cached_property
     def precision(self) -> FloatArray:
-        """Inverse covariance of what the parameters leave, back in the differences, (m, m)."""
+        """Inverse covariance after removing the parameters, in the space of the differences, (m, m)."""
         N = self._left
         if not N.shape[1]:
             return np.zeros((len(self.v), len(self.v)))
@@ -190,12 +197,12 @@ class GivenModel:
     @cached_property
     def size(self) -> FloatArray:
         """Standard deviations of the differences, (m,)."""
-        # rounding makes the variance of a point of an exact network negative
+        # rounding can make the variance of a point of an exact network negative
         return np.sqrt(np.maximum(np.diagonal(self.network + self.stated), np.finfo(float).tiny))
 
     @cached_property
     def blocks(self) -> tuple[IntArray, BoolArray]:
-        """Rows of each value side by side, and where there is one, (items, most)."""
+        """Rows of each value, and which of these entries exist, (items, most) each."""
         count = np.bincount(self.item, minlength=self.items)
         there = np.arange(count.max(initial=0)) < count[:, None]
         at = np.zeros(there.shape, dtype=np.int64)
@@ -204,12 +211,12 @@ class GivenModel:
 
     @cached_property
     def all_kept(self) -> Kept:
-        """All values."""
+        """The differences of all values."""
         u = self.precision @ self.v
         return Kept(self, self.precision, u, max(float(self.v @ u), 0.0), self._left.shape[1])
 
     def kept(self, without: tuple[int, ...] = ()) -> Kept:
-        """Return the values without some of them."""
+        """Return the differences without some values."""
         out = self.all_kept
         for one in without:
             out = out.without(one)
@@ -217,26 +224,35 @@ class GivenModel:
 
     @cached_property
     def at_worst(self) -> GivenModel:
-        """The model with the largest standard deviations that are believed."""
+        """The model with the largest plausible standard deviations."""
         stated = self.stated
         if self.estimated or not stated.any():
             stated = (UNSTATED_FRACTION * self.extent) ** 2 * np.eye(len(self.v))
         return replace(self, stated=MAX_FACTOR**2 * stated, estimated=False)
 
     def fits(self, level: float, without: tuple[int, ...] = ()) -> bool:
-        """Return whether values fit, some left out; the unknown standard deviations as far as believed."""
+        """Return whether values fit without some; unknown standard deviations must also be plausible.
+
+        Args:
+            level: probability that correct values are rejected.
+            without: values left out.
+        """
         fits = self.kept(without).probability() >= level
         return fits and (not self.estimated or self.at_worst.kept(without).probability() >= level)
 
     def confirms_rest(self, out: tuple[int, ...]) -> bool:
         """Return whether the values without some confirm one another.
 
-        They check each of themselves, and one in all its rows; fewer fit whatever they are.
+        Each value must be checked, and the degrees of freedom must suffice to check one in all its rows.
+        Fewer values would fit in any case.
+
+        Args:
+            out: values left out.
         """
         return self.kept(out).dof >= self.blocks[1].shape[1] and not np.isinf(self.external(out)).any()
 
     def part(self, kept: BoolArray) -> GivenModel:
-        """Return the model of some of the differences."""
+        """Return the model of the differences selected by a mask, (m,)."""
         return replace(
             self,
             v=self.v[kept],
@@ -247,13 +263,13 @@ class GivenModel:
         )
 
     def external(self, some: tuple[int, ...] = ()) -> FloatArray:
-        """Return the external reliability of each given value, infinite where nothing checks it, (items,).
+        """Return the external reliability of each given value, infinite if nothing checks it, (items,).
 
-        It is the largest shift that a just detectable error of the value causes in what only the given values
-        determine, in standard deviations of that.
+        It is the largest shift that a just detectable error of the value causes in the parameters that only
+        given values determine, in standard deviations of the parameters.
 
         Args:
-            some: values that are left out.
+            some: values left out.
         """
         out = np.full(self.items, np.nan)
         part = self.part(~np.isin(self.item, some))
@@ -271,10 +287,10 @@ class GivenModel:
         return out
 
     def factor(self) -> tuple[float, float]:
-        """Return the factor on the stated standard deviations that fits best, and what it gains.
+        """Return the best-fitting factor on the stated standard deviations, and its gain.
 
-        The gain is in -2 ln likelihood of what the parameters leave; of values without standard deviations
-        the factor is their standard deviation itself.
+        The gain is in -2 ln likelihood of the differences after removing the parameters. For values without
+        standard deviations, the factor is the standard deviation itself.
         """
         N = self._left
         S0, C0 = N.T @ self.network @ N, N.T @ self.stated @ N
@@ -283,7 +299,7 @@ class GivenModel:
             C0 = np.eye(len(C0))
         try:
             L = np.linalg.cholesky((C0 + C0.T) / 2)
-        except np.linalg.LinAlgError:  # some are fixed, some are not
+        except np.linalg.LinAlgError:  # only some are fixed
             return 1.0, 0.0
         half = np.linalg.solve(L, np.linalg.solve(L, S0).T)
         d, U = np.linalg.eigh((half + half.T) / 2)
@@ -301,34 +317,34 @@ class GivenModel:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Given values found wrong, if any."""
+    """The errors found in given values, if any."""
 
     statistic: float  # chi-square of all differences
     dof: int  # its degrees of freedom
-    probability: float  # of differences so large by chance
+    probability: float  # of such differences by chance
     wrong: tuple[int, ...] = ()  # given values without which the others fit
-    factor: float = 1.0  # on all standard deviations, with which all fit; of fixed values their sigma
-    doubtful: tuple[int, ...] = ()  # given values of which nothing shows which are wrong
-    one_wrong: bool = False  # whether one of the doubtful values is, and those that are not doubted are right
-    score: float = 0.0  # of what is wrong: change of -2 ln likelihood, and its cost
+    factor: float = 1.0  # factor on all standard deviations with which all fit; sigma itself of fixed values
+    doubtful: tuple[int, ...] = ()  # given values of which an unknown subset is wrong
+    one_wrong: bool = False  # whether exactly one of the doubtful values is wrong and all others are right
+    score: float = 0.0  # change of -2 ln likelihood by the errors found, plus their cost
 
     @property
     def fits(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether no error was found."""
         return not (self.wrong or self.doubtful or self.factor != 1.0)
 
     @property
     def explained(self) -> bool:
-        """Whether errors of some values or of all standard deviations explain the differences."""
+        """Whether errors of some values, or of all standard deviations, explain the differences."""
         return not self.doubtful or self.score < 0
 
     def contradicted(self, some: tuple[int, ...]) -> Judgement:
-        """Return it where nothing shows which of some values are wrong."""
+        """Return the judgement that an unknown subset of some values is wrong."""
         return replace(self, wrong=(), factor=1.0, score=0.0, doubtful=some, one_wrong=False)
 
     @property
     def misfit(self) -> float:
-        """Chi-square with what is wrong, and its cost."""
+        """Chi-square after accounting for the errors found, plus their cost."""
         return self.statistic + self.score
 
 
@@ -339,15 +355,15 @@ class GivenTest:
     what: str  # scale, control points or projection centres
     statistic: float  # chi-square
     dof: int
-    probability: float  # of differences so large by chance
+    probability: float  # of such differences by chance
 
 
 def judge_values(model: GivenModel, level: float) -> Judgement:
-    """Return what is wrong of given values.
+    """Return the errors of given values.
 
     Args:
-        model: their differences from the free network.
-        level: probability with which right values are reported as wrong.
+        model: differences of the values from the free network.
+        level: probability that correct values are reported as wrong.
     """
     every = model.kept()
     found = Judgement(every.chi2, every.dof, every.probability())
@@ -359,15 +375,15 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
     if gain <= 0 or not model.at_worst.fits(level):
         gain = -np.inf
     of_wrong, of_factor = np.inf, cost - gain
-    if removed is not None:  # of values without standard deviations, errors are scatter in any case
+    if removed is not None:  # errors of values without standard deviations count as scatter
         of_wrong = _score(model, removed.values, scatter=not model.stated.any())
     if min(of_wrong, of_factor) >= 0:
         some = _suspects(model, level)
         return replace(found, doubtful=some, one_wrong=_one_is_wrong(model, some))
     if removed is None or of_factor < of_wrong:
         sets = _sets(model, cost)
-        # one wrong value of so few would look like standard deviations that are too small, but for values of
-        # which each by itself is within what its test finds
+        # with few values, one wrong value would look like standard deviations that are too small, unless each
+        # single error is too small for its test to find
         unseen = float(np.sqrt(every.decreases()[0].max())) < NONCENTRALITY
         if sets and (unseen or of_factor + 2 * MIN_LEAD < min(one.score for one in sets)):
             return replace(found, factor=factor, score=of_factor)
@@ -381,9 +397,14 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
 
 
 def misfit_of(model: GivenModel, found: Judgement) -> float:
-    """Return chi-square with what is wrong, and its cost; by the largest sigmas believed of unknown ones.
+    """Return chi-square after accounting for the errors found, plus their cost.
 
-    Without wrong values it is that of the others: a difference of two of 1e29 has their rounding.
+    Unknown standard deviations take their largest plausible values. With wrong values, chi-square is computed
+    from the other values directly, because a difference of two values of 1e29 would be rounding only.
+
+    Args:
+        model: differences of the values from the free network.
+        found: errors found.
     """
     if not found.wrong:
         return model.at_worst.kept().chi2 if model.estimated else found.misfit
@@ -397,14 +418,14 @@ class WrongValues:
     """A set of given values that may be wrong."""
 
     values: tuple[int, ...]
-    score: float  # change of -2 ln likelihood without them, and their cost
-    rivals: tuple[int, ...] = ()  # other values that may be wrong in place of some of them
+    score: float  # change of -2 ln likelihood without them, plus their cost
+    rivals: tuple[int, ...] = ()  # other values that may be wrong instead of some of them
 
 
 def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
-    """Return the best set of wrong values of each size up to half, where the others check one another.
+    """Return the best set of wrong values of each size up to half, while the others check one another.
 
-    The scores are those of scatter, as a factor is.
+    The scores treat errors as scatter, to be comparable with a factor.
     """
     kept = model.kept()
     out: tuple[int, ...] = ()
@@ -425,18 +446,18 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
 
 
 def _score(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
-    """Return the change of -2 ln likelihood without values, and the cost of their errors and choice."""
+    """Return the change of -2 ln likelihood without some values, plus the cost of their errors and choice."""
     return _cost_of(model, out, scatter=scatter) - (model.kept().chi2 - model.kept(out).chi2)
 
 
 def _cost_of(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
-    """Return the cost of the errors of values, and of their choice.
+    """Return the cost of the errors of some values and of their choice.
 
     Args:
-        model: of all values.
-        out: those that are wrong.
-        scatter: whether their errors are of one distribution, as those of all are by a factor; else each is
-            a parameter by itself.
+        model: model of all values.
+        out: wrong values.
+        scatter: whether their errors have one distribution, as with a factor; otherwise each error is a
+            separate parameter.
     """
     every, kept, m = model.kept(), model.kept(out), len(model.v)
     q = every.dof - kept.dof
@@ -445,7 +466,7 @@ def _cost_of(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -
 
 
 def cost_of_parameter(m: int) -> float:
-    """Return the cost of a parameter of m differences, in -2 ln likelihood.
+    """Return the cost of a parameter with m differences, in -2 ln likelihood.
 
     Source: Schwarz (1978), Ann. Stat. 6(2).
     """
@@ -453,18 +474,18 @@ def cost_of_parameter(m: int) -> float:
 
 
 def cost_of_scatter(q: int, chi2: float, m: int) -> float:
-    """Return the cost of q of m differences that scatter more than stated, by this chi-square.
+    """Return the cost of q of m differences that scatter more than stated, given their chi-square.
 
-    Their standard deviation costs a parameter, and its size 1 + ln chi2 / q for each.
+    Their standard deviation costs a parameter, and each difference costs 1 + ln(chi2 / q).
     """
     return cost_of_parameter(m) + q * (1 + log(max(chi2 / max(q, 1), 1.0)))
 
 
 def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues | None:
-    """Return the fewest values without which the others fit; None without such.
+    """Return the smallest set of values without which the others fit; None if there is none.
 
-    The others must be more, and must confirm one another. Rivals are other sets of as many, and those others
-    themselves: where the larger part is not more likely by the margin, nothing shows which part is wrong.
+    The others must outnumber the set. Rivals are other sets of the same size, and also the other values: if
+    these are not more likely by the margin, either part may be wrong.
     """
     kept = model.kept()
     out: tuple[int, ...] = ()
@@ -481,7 +502,7 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     misfit = dict(_misfits_like(model, out))
     out = min(misfit, key=lambda some: misfit[some])
     like = {one for some, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for one in some}
-    # the others may be the wrong ones, and these right; errors of one cause do not scatter
+    # the others may be wrong and these right; errors with one cause do not scatter
     rest, others = model.kept(out), model.part(np.isin(model.item, out)).kept()
     if others.dof > 0 and others.chi2 - rest.chi2 < cost * (others.dof - rest.dof) + MARGIN:
         like = set(range(model.items))
@@ -489,9 +510,9 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
 
 
 def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Return sets of as many values, and chi-square without them, where that leaves degrees of freedom.
+    """Yield sets of the same size, with chi-square without them, if degrees of freedom remain.
 
-    All sets, or those that differ in one value where these are too many.
+    These are all sets, or, if there are too many, those that differ in one value.
     """
     k, items = len(out), range(model.items)
     every = comb(len(items), k) <= MAX_SETS
@@ -504,12 +525,12 @@ def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tup
 
 
 def _suspects(model: GivenModel, level: float) -> tuple[int, ...]:
-    """Return the values any of which may be wrong: those without which the others fit, else all."""
+    """Return the values that may be wrong: those without which the others fit, otherwise all."""
     each = [(one, model.kept((one,))) for one in range(model.items)]
     alone = [one for one, kept in each if kept.dof > 0 and model.fits(level, (one,))]
     return tuple(alone) if len(alone) > 1 else tuple(range(model.items))
 
 
 def _one_is_wrong(model: GivenModel, some: tuple[int, ...]) -> bool:
-    """Return whether, of values any of which may be wrong, one is: the others are right, and confirm that."""
+    """Return whether exactly one of the suspected values is wrong, which the other values must confirm."""
     return len(some) < model.items and all(model.confirms_rest((one,)) for one in some)

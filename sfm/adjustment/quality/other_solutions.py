@@ -1,10 +1,12 @@
-"""Other solutions of the same image points: principal distances tried from a fraction to a multiple.
+"""Other solutions of the same image points: tries principal distances from a fraction to a multiple.
 
-In weak networks the sum of squares has several minima: of few photographs with small angles c and the
-distance go together, and relief or tilt can be turned inside out as in a drawing of a cube. Each minimum has
-a small standard deviation, which does not show the others. The network is therefore followed
-along c in both directions, from the result and from its reflection in depth, with c held; where v'Pv is as
-small as that of the result, or at a minimum, c is freed and the network adjusted.
+In weak networks the sum of squares has several minima. With few photographs and small angles, c is coupled
+with the distance, and relief or tilt can be inverted as in a drawing of a cube. Each minimum has small
+standard deviations, which do not reveal the others.
+
+The network is therefore followed along c in both directions with c held, from the result and from its
+reflection in depth. If v'Pv is as small as that of the result, or at a minimum, c is freed and the network is
+adjusted.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8 (approximate values); Luhmann
 et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlated interior and exterior orientation); Szeliski
@@ -30,47 +32,47 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity, reverse_depth
 
-STEP = 1.3  # from one principal distance that is tried to the next
-STEPS = 6  # in each direction: c from a fifth to the fivefold
-ALPHA = 0.001  # chance of so much larger a v'Pv where the other solution is the true one
-STATED_FREEDOM = 10  # observations that the stated weights count as in the estimate of the variance
-WEAK_C = 5e-4  # relative standard deviation of c below which a network is not weak, and
-MIN_STRONG_PHOTOGRAPHS = 5  # from so many photographs on
-MIN_STRONG_IMAGE_POINTS = 4000  # image points from which on a network is not weak
-BARRIER = 3e3  # times v'Pv of the result: what lies beyond is not looked for
-MIN_APART_SIGMAS = 1.0  # root mean square between solutions that are not the same
-MAX_ITERATIONS = 60  # from planes, whose relief is to be found, some fifty
-FOLLOWING_TOLERANCE = 1e-3  # |A dx| / |v| at which the network is followed to the next c
+STEP = 1.3  # ratio of successive principal distances that are tried
+STEPS = 6  # steps in each direction, from a fifth of c to five times c
+ALPHA = 0.001  # probability of such a larger v'Pv if the other solution is true
+STATED_FREEDOM = 10  # number of observations that the stated weights count for in the estimated variance
+WEAK_C = 5e-4  # relative standard deviation of c; a network is not weak below it,
+MIN_STRONG_PHOTOGRAPHS = 5  # if it has at least this number of photographs
+MIN_STRONG_IMAGE_POINTS = 4000  # number of image points from which a network is not weak
+BARRIER = 3e3  # multiple of v'Pv of the result beyond which the search ends
+MIN_APART_SIGMAS = 1.0  # smallest root mean square difference between different solutions
+MAX_ITERATIONS = 60  # finding the relief from a plane takes about fifty
+FOLLOWING_TOLERANCE = 1e-3  # |A dx| / |v| at which the search continues to the next c
 
 
 @dataclass(frozen=True)
 class OtherSolution:
-    """A solution that the image points allow as well as the result, or better."""
+    """A solution that fits the image points as well as the result, or better."""
 
-    camera: str  # the first one whose c is free
-    c: float  # its principal distance there, mm or px
-    unit: str  # of c
-    reflected: bool  # whether it is another one than the result in depth rather than in c
-    moved: float  # by how much points differ, over their standard deviations in the result, RMS
-    c_moved: float  # by how much c differs, over its standard deviation in the result; 0 of a c that is held
-    vPv: float  # over that of the result
+    camera: str  # first camera with free c
+    c: float  # its principal distance in this solution, mm or px
+    unit: str  # unit of c
+    reflected: bool  # whether it differs from the result in depth rather than in c
+    moved: float  # difference of points over their standard deviations in the result, RMS
+    c_moved: float  # difference of c over its standard deviation in the result; 0 if c is held
+    vPv: float  # v'Pv over that of the result
     estimate: Estimate
-    converges: bool  # whether an adjustment of all observations from there ends
+    converges: bool  # whether an adjustment of all observations converges from there
 
 
 def other_solutions(
     adjustment: Adjustment, *, starts: tuple[Estimate, ...] = (), had_to_be_held: tuple[str, ...] = ()
 ) -> tuple[OtherSolution, ...]:
-    """Return other solutions of about the same v'Pv, and better ones, the smallest v'Pv first.
+    """Return other solutions with a similar or smaller v'Pv, smallest v'Pv first.
 
     Args:
         adjustment: the result, with its covariance.
-        starts: approximate values of other solutions that are looked for besides.
-        had_to_be_held: cameras whose c is held because the adjustment does not converge with it; it is tried
-            at other values, and freed again from a better one.
+        starts: approximate values of further solutions to try.
+        had_to_be_held: cameras with c held because the adjustment does not converge if it is free. Other
+            values of c are tried, and it is freed again from a better one.
 
     Returns:
-        None of them where the network is strong, the result did not converge, or nothing is redundant.
+        The solutions; empty if the network is strong, the result did not converge, or there is no redundancy.
     """
     a = adjustment
     if (
@@ -107,10 +109,10 @@ def other_solutions(
 
 
 def _allowed(base: Adjustment) -> float:
-    """Return by how much v'Pv of another solution may be larger.
+    """Return the largest excess of v'Pv of another solution.
 
-    With hardly any redundancy v'Pv shows little of the weights, and any other solution would pass; they are
-    believed as stated, with the weight of some observations.
+    With little redundancy v'Pv hardly tests the stated weights, and any other solution would pass. So the
+    stated weights count like STATED_FREEDOM observations.
     """
     freedom = base.redundancy + STATED_FREEDOM
     variance = (base.vPv + STATED_FREEDOM) / freedom
@@ -118,7 +120,7 @@ def _allowed(base: Adjustment) -> float:
 
 
 def _weak(a: Adjustment) -> bool:
-    """Return whether there are few photographs, or a principal distance is not well determined."""
+    """Return whether there are few photographs, or a principal distance is poorly determined."""
     if len(a.network.images) < MIN_STRONG_PHOTOGRAPHS:
         return True
     for number in set(a.network.camera.tolist()):
@@ -129,9 +131,9 @@ def _weak(a: Adjustment) -> bool:
 
 
 def _impossible(other: Estimate, result: Estimate) -> bool:
-    """Return whether a solution has a principal point beyond its photograph, where no lens draws a picture.
+    """Return whether a solution has a principal point outside the photograph, which no lens produces.
 
-    Of photographs that were cropped the result has it there too, or it is given.
+    Cropped photographs are an exception: there the result has it outside too, or it is given.
     """
     pairs = zip(other.cameras, result.cameras, strict=True)
     return any(
@@ -156,15 +158,15 @@ class _Search:
 
     network: Network
     datum: Datum
-    factor: FloatArray  # on the standard deviations of the image points, (k,)
+    factor: FloatArray  # factor on the standard deviations of the image points, (k,)
 
     def adjusted(
         self, start: Estimate, *, held: bool = False, tolerance: float = FOLLOWING_TOLERANCE
     ) -> Adjustment | None:
-        """Return the adjustment, with c free or held; None where it has no solution.
+        """Return the adjustment with c free or held; None if it has no solution.
 
-        By Gauss-Newton, which in the bent valleys of weak networks takes a few steps where damping takes
-        fifty; damped where that does not converge.
+        Gauss-Newton comes first: in the bent valleys of weak networks it takes a few steps, damping fifty.
+        The damped method follows if it does not converge.
         """
         cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
         found: list[Adjustment] = []
@@ -193,7 +195,7 @@ class _Search:
     def candidates(
         self, result: Estimate, others: tuple[Estimate, ...], vPv: float, limit: float, *, follow_c: bool
     ) -> Iterator[_Candidate]:
-        """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
+        """Yield solutions of similar v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
         steps = STEPS if follow_c or any(one[0] for one in free) else 0
         starts = [result, *others]
@@ -213,10 +215,10 @@ class _Search:
                             yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
 
     def _along(self, start: Estimate, factor: float, steps: int, vPv: float) -> list[_Candidate]:
-        """Follow the network with c held at multiples of the start's, while v'Pv is not too large.
+        """Follow the network with c held at multiples of its start value, while v'Pv is not too large.
 
-        Each is adjusted from the one before it, which stays in one valley, and from the start, which finds
-        others; the smaller v'Pv is taken.
+        Each step starts from the previous one, which stays in one valley, and also from the start, which
+        finds other valleys. The result with the smaller v'Pv is used.
         """
         track: list[_Candidate] = []
         estimate = start
@@ -249,13 +251,18 @@ def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
 
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
-    """Return the estimate with these parameters of its cameras free."""
+    """Return the estimate with the given parameters of its cameras free."""
     cameras = tuple(replace(one, free=freed) for one, freed in zip(estimate.cameras, free, strict=True))
     return replace(estimate, cameras=cameras)
 
 
 def scaled(estimate: Estimate, factor: float) -> Estimate:
-    """Return the estimate with multiples of c, and photographs as many times as far from the object."""
+    """Return the estimate with c and the distances of photographs from the object multiplied.
+
+    Args:
+        estimate: the estimate.
+        factor: factor on c and the distances.
+    """
     cameras = []
     for camera in estimate.cameras:
         p = camera.parameters.copy()
@@ -267,12 +274,12 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
 
 @dataclass(frozen=True)
 class _Place:
-    """The result, from which others are so many standard deviations away."""
+    """The result that other solutions are compared with, in its standard deviations."""
 
     adjustment: Adjustment
 
     def describe(self, other: Estimate, vPv: float) -> OtherSolution:
-        """Return another solution as it differs from the result."""
+        """Return the description of another solution by its differences from the result."""
         result, number = self.adjustment.estimate, self._number
         camera = other.cameras[number]
         c, sigma = float(camera.parameters[0]), float(self.adjustment.interior_sigma(number)[0])
@@ -289,7 +296,7 @@ class _Place:
         )
 
     def distance(self, one: Estimate, other: Estimate) -> float:
-        """Return by how many standard deviations of the result the points of two solutions differ, RMS."""
+        """Return the RMS difference of the points of two solutions, in standard deviations of the result."""
         return _apart(one.points, other.points, self._sigma)
 
     @cached_property
@@ -299,13 +306,13 @@ class _Place:
 
     @cached_property
     def _number(self) -> int:
-        """The first camera whose c is free, else the first."""
+        """The first camera with free c, otherwise the first camera."""
         cameras = self.adjustment.estimate.cameras
         return next((k for k, one in enumerate(cameras) if one.free[one.parts[0]].any()), 0)
 
 
 def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:
-    """Return the difference of two sets of points after a similarity over their sigmas (n,), RMS."""
+    """Return the RMS difference of two sets of points after a similarity, divided by their sigmas (n,)."""
     known = np.isfinite(sigma) & (sigma > 0)
     if known.sum() < 3:
         return 0.0

@@ -1,4 +1,9 @@
-"""Rank defect of the normal equations, found numerically, and what it leaves undetermined, in words."""
+"""Rank defect of the normal equations, determined numerically, and a description of what is undetermined.
+
+A null vector is a direction of the unknowns that the normal matrix maps to zero. The defect counts motions of
+the whole network, further null vectors, open directions of points, and unknowns that were held. The
+description names points, photographs, motions and parameters.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +19,8 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.network import Estimate, Network
 
-MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
-AXIS = 1e-3  # of length 1 that a direction may lack to be called that of a coordinate axis
+MAPPED_TO_ZERO = 1e-6  # largest |N h| of a null vector, |h| = 1, unit diagonal of N; rounding leaves 1e-13
+AXIS = 1e-3  # largest deviation from 1 of a component for a direction to be called that of an axis
 AXES = ("X", "Y", "Z")
 EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
 
@@ -23,17 +28,26 @@ EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
 def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     """Return the rank defect of the normal equations without datum.
 
-    It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
-    object points that their rays leave open, and the unknowns held for want of image points.
+    It counts the motions that the normal matrix maps to zero, its further null vectors, directions of object
+    points that their rays leave open, and unknowns held because of missing image points.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
     """
     found = null_motions(optimum, layout) + optimum.motions.further
     return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
 
 
 def null_motions(optimum: Optimum, layout: Unknowns) -> int:
-    """Return how many of the motions that the datum has to fix the normal matrix maps to zero.
+    """Return the number of motions that the datum fixes and that the normal matrix maps to zero.
 
-    All do if their sum does, which is tried first; otherwise they are counted one by one.
+    If it maps their sum to zero, it maps all of them to zero. This is tested first; otherwise they are
+    counted one by one.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
     """
     d = optimum.motions.defect
     if d == 0:
@@ -47,7 +61,7 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
 
 
 def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolArray:
-    """Return which columns of H, of scaled length 1, the reduced normal matrix maps to zero, (d,)."""
+    """Return which columns of H, with scaled length 1, the reduced normal matrix maps to zero, (d,)."""
     scale = optimum.equations.parts.scale[:, None]
     NH = times_schur(optimum.equations, layout, H)
     return np.asarray(np.linalg.norm(scale * NH, axis=0) < MAPPED_TO_ZERO)
@@ -62,15 +76,15 @@ def undetermined_of(
     *,
     allowed_motions: int,
 ) -> tuple[str, ...]:
-    """Return what cannot be determined, in words; empty if everything can.
+    """Return a description of what is undetermined, in words; empty if everything is determined.
 
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
-        network: for the names of photographs and points.
-        estimate: for the names of cameras.
+        network: network with the names of photographs and points.
+        estimate: estimate with the names of cameras.
         weight: factor on the weight of each image point, 0 where rejected, (k,).
-        allowed_motions: defect that the kind of datum is meant to fix.
+        allowed_motions: defect that this kind of datum is expected to fix.
     """
     words = list(layout.held)
     open_points = np.flatnonzero(optimum.equations.blocks.held)
@@ -92,17 +106,21 @@ def undetermined_of(
 def describe_motions(optimum: Optimum, layout: Unknowns) -> str:
     """Return the motions that the observations leave open: "shift along X and Y, rotation about Z, scale".
 
-    A rotation about an axis that does not run through the centre of the points is a rotation here, the shift
-    that goes with it is not reported.
+    A rotation about an axis that misses the centre of the points is reported as a rotation, without the
+    accompanying shift.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
     """
-    sound = optimum.equations.blocks.held == 0  # other points do not move as the motions do
+    sound = optimum.equations.blocks.held == 0  # other points do not follow the motions
     d = optimum.motions.defect
     generators = free_motions(layout, optimum.state)[2][sound].reshape(-1, 7)
     opened = optimum.motions.points[sound, :, :d].reshape(-1, d)
     V = np.linalg.qr(np.linalg.lstsq(generators, opened, rcond=None)[0])[0]  # (7, d)
-    turns = _null_space(V[3:])  # those combinations that only shift
+    turns = _null_space(V[3:])  # combinations that only shift
     rest = _complement(turns, V.shape[1])
-    scales = rest @ _null_space(V[6:] @ rest)  # of the others those that do not scale
+    scales = rest @ _null_space(V[6:] @ rest)  # other combinations, without a change of scale
     parts = []
     if turns.shape[1]:
         parts.append(f"shift along {_axes(V[:3] @ turns)}")
@@ -114,18 +132,18 @@ def describe_motions(optimum: Optimum, layout: Unknowns) -> str:
 
 
 def _null_space(A: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what a matrix maps to zero."""
+    """Return an orthonormal basis of the null space of a matrix."""
     _, singular, Vt = np.linalg.svd(A, full_matrices=True)
     return np.asarray(Vt[int((singular > MAPPED_TO_ZERO).sum()) :].T)
 
 
 def _complement(basis: FloatArray, size: int) -> FloatArray:
-    """Return an orthonormal basis of what is perpendicular to another one."""
+    """Return an orthonormal basis of the orthogonal complement of another basis."""
     return _null_space(basis.T) if basis.shape[1] else np.eye(size)
 
 
 def _axes(directions: FloatArray) -> str:
-    """Return the directions that some vectors in space span: axes by name, else by components."""
+    """Return the directions that vectors span, in words: axes by name, other directions by components."""
     U = np.linalg.svd(directions, full_matrices=False)[0][:, : directions.shape[1]]
     if U.shape[1] >= len(AXES):
         return "X, Y and Z"
@@ -139,7 +157,13 @@ def _axes(directions: FloatArray) -> str:
 
 
 def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> list[tuple[str, str]]:
-    """Return (parameter, of what) of each reduced unknown."""
+    """Return (parameter, owner) of each reduced unknown.
+
+    Args:
+        layout: order of the unknowns.
+        network: network with the names of photographs and points.
+        estimate: estimate with the names of cameras.
+    """
     first = np.unique(layout.observations.pose_of, return_index=True)[1]
     what = "rig at photograph" if layout.rigged else "photograph"
     names = [(part, f"{what} {network.images[i]}") for i in first for part in EXTERIOR]
@@ -149,7 +173,7 @@ def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> lis
 
 
 def _name(vector: FloatArray, layout: Unknowns, network: Network, estimate: Estimate) -> str:
-    """Return the leading parameters of a null vector: "c, y0 of camera A with Z0 of 12 photographs"."""
+    """Return the leading parameters of a null vector, such as "c of camera A with Z0 of 12 photographs"."""
     names, named = reduced_names(layout, network, estimate), leading(vector[:, None])[:, 0]
     open_ones = [names[r] for r in np.argsort(-np.abs(vector)) if named[r]]
     interior = [f"{part} of {owner}" for part, owner in open_ones if owner.startswith("camera")]

@@ -1,13 +1,14 @@
-"""Statistics of a finished adjustment: redundancy numbers, tests, minimal detectable bias.
+"""Statistics of a finished adjustment: redundancy numbers, tests, reliability, significance, correlations.
 
-Global test of the model, tests of the image coordinates, their minimal detectable bias and external
-reliability, significance of parameters, strong correlations.
-
-Redundancy numbers, standardised residuals and the tests of Baarda and Pope.
+The global test compares v'Pv with the redundancy. The tests of single image coordinates by Baarda and Pope
+use
 
     R = Q_vv P (redundancy numbers on its diagonal; their sum is the redundancy),
     w = (P v)_i / sqrt(sigma0'^2 (P Q_vv P)_ii)     with sigma0' a priori: Baarda's w ~ N(0, 1),
     tau = the same with sigma0 a posteriori:         Pope's tau ~ tau(r).
+
+Reliability states the minimal detectable bias of an image coordinate and its effect on the unknowns. Interior
+parameters are tested for significance, and strong correlations between parameters are listed.
 
 Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65 NGS 1;
 Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4; Foerstner and Wrobel (2016), sec. 4.6.
@@ -34,44 +35,44 @@ from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, 
 from sfm.errors import GeometryError
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
-MIN_EXCESS_RATIO = 2.0  # coordinates beyond the critical value over those expected by chance
-GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
-POWER = 0.8  # and of finding a gross error of the minimal detectable size
-MIN_REPORTED_CORRELATION = 0.9  # correlation from which two parameters are reported
-Untested = Literal["redundancy", "reweighted"]  # too small; the weights come from the residuals
+MIN_EXCESS_RATIO = 2.0  # coordinates beyond the critical value, relative to the number expected by chance
+GLOBAL_ALPHA = 0.05  # level of the global test and of the significance of parameters
+POWER = 0.8  # probability of finding a gross error of the minimal detectable size
+MIN_REPORTED_CORRELATION = 0.9  # absolute correlation from which two parameters are reported
+Untested = Literal["redundancy", "reweighted"]  # redundancy too small; weights computed from the residuals
 
 
 @dataclass(frozen=True)
 class GlobalTest:
     """Test of stated standard deviations against the residuals by the chi-square distribution."""
 
-    of: str  # all observations, or a kind of them
-    statistic: float  # v'Pv with the standard deviations stated
+    of: str  # all observations, or one kind
+    statistic: float  # v'Pv with the stated standard deviations
     redundancy: float
     lower: float  # acceptance region of v'Pv
     upper: float
-    passed: bool | None  # None where it was not tested
-    untested: Untested | None = None  # why it was not tested
+    passed: bool | None  # None if not tested
+    untested: Untested | None = None  # reason why it was not tested
 
 
 @dataclass(frozen=True)
 class CoordinateTest:
     """Test of every accepted image coordinate for a gross error."""
 
-    alpha: float  # probability of rejecting a good one
+    alpha: float  # probability of rejecting a good coordinate
     critical: float
     statistic: FloatArray  # w or tau of each coordinate; NaN where rejected, (k, 2)
-    tested: int  # coordinates that have a check
-    beyond: int  # of them, those beyond the critical value
+    tested: int  # number of checked coordinates
+    beyond: int  # number of these beyond the critical value
 
     @property
     def expected(self) -> float:
-        """How many would be beyond the critical value by chance."""
+        """Number expected beyond the critical value by chance."""
         return self.alpha * self.tested
 
     @property
     def far_more(self) -> bool:
-        """Whether far more are beyond it: MIN_EXCESS_RATIO times as many, by chance once in 1 / ALPHA."""
+        """Whether more than MIN_EXCESS_RATIO times as many are beyond it, which chance makes unlikely."""
         return bool(
             self.beyond > MIN_EXCESS_RATIO * self.expected
             and poisson_sf(self.beyond - 1, self.expected) < ALPHA
@@ -80,14 +81,13 @@ class CoordinateTest:
 
 @dataclass(frozen=True)
 class Reliability:
-    """How well gross errors of image coordinates can be found, and what the others do."""
+    """Detectability of gross errors in image coordinates, and the effect of undetected ones."""
 
     delta0: float  # non-centrality of the test for alpha and power
-    critical: float  # value of that test
-    minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none is
-    external: (
-        FloatArray  # largest effect that error can have on a function of the unknowns, over its sigma, (k, 2)
-    )
+    critical: float  # critical value of the test
+    minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none found
+    # largest effect of that error on a function of the unknowns, over the sigma of the function, (k, 2)
+    external: FloatArray
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ class Significance:
     value: float
     sigma: float
     t: float
-    probability: float  # of a t at least so large by chance
+    probability: float  # chance probability of such a large t
     significant: bool
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Two parameters whose estimates are strongly correlated."""
+    """Two parameters with strongly correlated estimates."""
 
     first: str
     second: str
@@ -116,8 +116,8 @@ def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> Globa
     """Return the two-sided chi-square test of v'Pv of all observations.
 
     Args:
-        adjustment: the adjustment.
-        alpha: probability of rejecting a right model.
+        adjustment: finished adjustment.
+        alpha: probability of rejecting a correct model.
     """
     test = _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
     return replace(test, passed=None, untested="reweighted") if adjustment.reweighted else test
@@ -128,15 +128,15 @@ def component_tests(
 ) -> tuple[GlobalTest, ...]:
     """Return the two-sided chi-square test of the variance component of each group against 1.
 
-    The v'Pv of a group is nearly chi-square distributed with the sum of its redundancy numbers, exactly
-    where the other groups take no part in its residuals. Where that sum is a small part of the observations,
-    as of two bars that give the scale to the photographs, the test is on the safe side: with one residual in
-    common and r = 0.4, v'Pv is 0.4 times chi-square of 1, beyond the limits for 95 % in 1 of 160 cases.
+    The v'Pv of a group is approximately chi-square distributed with the sum of its redundancy numbers. This
+    is exact if the other groups do not affect its residuals. The test is conservative if the sum is a small
+    part of the observations, as for two bars that give the photographs their scale. With one common residual
+    and r = 0.4, v'Pv is 0.4 times chi-square of 1, which is beyond the limits for 95 % in 1 of 160 cases.
 
     Args:
-        components: of groups, over the standard deviations stated for them.
-        alpha: probability of rejecting a group whose standard deviations are right.
-        reweighted: whether the weights of the image points come from their residuals: they have no test then.
+        components: components of groups relative to their stated standard deviations.
+        alpha: probability of rejecting a group with correct standard deviations.
+        reweighted: whether the weights of the image points come from their residuals; then they have no test.
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
@@ -160,22 +160,37 @@ def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> Glob
 
 @checked_arguments()
 def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
-    """Return Baarda's test of each image coordinate: w is standard normal where sigma0 is as stated."""
+    """Return Baarda's test of each image coordinate; w is standard normal if the stated sigma0 is correct.
+
+    Args:
+        adjustment: finished adjustment.
+        alpha: probability of rejecting a good image coordinate.
+    """
     return _coordinate_test(adjustment, adjustment.standardised, float(normal_ppf(1 - alpha / 2)), alpha)
 
 
 @checked_arguments()
 def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
-    """Return Pope's test of each image coordinate, which takes sigma0 from the adjustment."""
+    """Return Pope's test of each image coordinate, which uses sigma0 of the adjustment.
+
+    Args:
+        adjustment: finished adjustment.
+        alpha: probability of rejecting a good image coordinate.
+    """
     critical = tau_critical(alpha, adjustment.redundancy)
     return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
 
 
 def robust_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
-    """Return the test of w over its standard deviation by its median, which half of the coordinates make.
+    """Return the test of w over its standard deviation from the median, which half of the coordinates fix.
 
-    It finds gross errors that were not rejected: tau is blind where they are so many that they make sigma0, w
-    where the standard deviation is not as stated. Residuals that are rounding are not tested.
+    It finds gross errors that were not rejected. Tau misses them if they are so many that they determine
+    sigma0, and w misses them if the stated standard deviations are wrong. Residuals that are mere rounding
+    are not tested.
+
+    Args:
+        adjustment: finished adjustment.
+        alpha: probability of rejecting a good image coordinate.
 
     Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2.
     """
@@ -186,12 +201,12 @@ def robust_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTe
 
 
 def more_than_chance(events: IntArray, trials: IntArray, level: float) -> BoolArray:
-    """Return which groups have more events than chance makes, by the share of them in all other groups, (n,).
+    """Return which groups have more events than chance explains, given the share in all other groups, (n,).
 
     Args:
-        events: of each group, such as its rejected image points, (n,).
-        trials: of each group, (n,).
-        level: probability that any group is called so where none is.
+        events: number of events in each group, such as rejected image points, (n,).
+        trials: number of trials in each group, (n,).
+        level: probability that any group is reported if chance explains all.
 
     Source: the share by Laplace's rule of succession; the binomial distribution; Bonferroni.
     """
@@ -214,16 +229,16 @@ def _coordinate_test(
 
 
 def non_centrality(alpha: float = ALPHA, power: float = POWER, redundancy: int | None = None) -> float:
-    """Return delta0, by which the test of an observation finds an error with the given power.
+    """Return delta0, the non-centrality with which the test of an observation finds an error.
 
     Args:
-        alpha: probability with which the test rejects a good observation.
-        power: probability with which it finds the error.
-        redundancy: r of an adjustment whose sigma0 the test takes (Pope's tau); None where sigma0 is known
-            (Baarda's w). With the observation left out, tau is Student's t of r - 1 degrees of freedom.
+        alpha: probability that the test rejects a good observation.
+        power: probability that it finds the error.
+        redundancy: r of the adjustment if the test uses its sigma0 (Pope's tau); None if sigma0 is known
+            (Baarda's w). With the observation left out, tau is Student's t with r - 1 degrees of freedom.
 
     Returns:
-        Infinite where r is less than 2.
+        delta0; infinite if r is less than 2.
 
     Source: Baarda (1968), sec. 3; Pope (1976), sec. 3, for t; Johnson, Kotz and Balakrishnan (1995),
     Continuous Univariate Distributions 2, ch. 31, for the non-central t.
@@ -239,11 +254,11 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     """Return internal and external reliability of each image coordinate; NaN where rejected.
 
     Args:
-        adjustment: the adjustment.
-        alpha: probability with which the test that is to find the error rejects a good observation; that of
-            the test by which the adjustment rejected, if not given. The test is Pope's, which takes sigma0
-            from the adjustment, for errors in the standard deviations that it gives.
-        power: probability with which it finds an error of the minimal size.
+        adjustment: finished adjustment.
+        alpha: probability that the test rejects a good observation; if not given, that of the test used for
+            rejection in the adjustment. It is Pope's test, which uses sigma0 of the adjustment; errors are in
+            terms of the standard deviations that the adjustment gives.
+        power: probability that the test finds an error of the minimal size.
 
     Source: Baarda (1968): with C = P Qvv P, delta0 sigma0 / sqrt(C_ii), which is delta0 sigma / sqrt(r) for
     uncorrelated coordinates; effect bounded by delta0 sqrt(P_ii / C_ii - 1).
@@ -272,11 +287,11 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
 def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tuple[Significance, ...]:
     """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
 
-    A parameter that several cameras share is tested once, under the name of their group.
+    A parameter shared by several cameras is tested once, under the name of their group.
 
     Args:
-        adjustment: the adjustment.
-        alpha: probability of calling a parameter significant that is 0.
+        adjustment: finished adjustment.
+        alpha: probability that a parameter is called significant although it is 0.
     """
     tests: dict[tuple[str, str], Significance] = {}
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
@@ -297,8 +312,8 @@ def correlations(
     """Return the pairs of parameters of one camera, or of one photograph, correlated beyond a limit.
 
     Args:
-        adjustment: the adjustment.
-        limit: absolute correlation from which a pair is reported.
+        adjustment: finished adjustment.
+        limit: absolute correlation above which a pair is reported.
     """
     found = []
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
@@ -308,12 +323,12 @@ def correlations(
     parts = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
     for image, Q in zip(adjustment.network.images, adjustment.covariance.exterior, strict=True):
         found += _strong(Q, [f"{part} of photograph {image}" for part in parts], limit)
-    once = {(pair.first, pair.second): pair for pair in found}  # of shared parameters every camera has it
+    once = {(pair.first, pair.second): pair for pair in found}  # every camera repeats shared parameters
     return tuple(sorted(once.values(), key=lambda pair: -abs(pair.value)))
 
 
 def _free(camera: Camera, Q: FloatArray) -> IntArray:
-    """Indices of the parameters that a covariance belongs to; none for a camera that took no part."""
+    """Return the indices of the parameters of a covariance; none for a camera that took no part."""
     return np.flatnonzero(camera.free)[: len(Q)]
 
 
@@ -340,7 +355,7 @@ def redundancy_numbers(complement: FloatArray, whitening: FloatArray) -> FloatAr
 def standardised_residuals(
     residuals: FloatArray, complement: FloatArray, whitening: FloatArray
 ) -> FloatArray:
-    """Return Baarda's w of each image coordinate for sigma0 = 1, (k, 2); 0 where it is not controlled.
+    """Return Baarda's w of each image coordinate for sigma0 = 1, (k, 2); 0 where it is not checked.
 
     Args:
         residuals: v, px, shape (k, 2).
@@ -374,13 +389,13 @@ MIN_CHECKED_REDUNDANCY = 1e-6  # redundancy number below which an observation ha
 def standardised_of_given(
     difference: FloatArray, weight: FloatArray, cofactor: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Baarda's w for sigma0 = 1, and the redundancy number, of unknowns that were observed, (n, d).
+    """Return Baarda's w for sigma0 = 1 and the redundancy number of observed unknowns, (n, d) each.
 
-    w is NaN where the observation has no check, both are where a component was not observed.
+    w is NaN if the observation is not checked. Both are NaN for components that were not observed.
 
     Args:
         difference: v, adjusted minus given, shape (n, d).
-        weight: P, inverse covariance of what was given, 0 where it was not, shape (n, d, d).
+        weight: P, inverse covariance of the given values, 0 where not given, shape (n, d, d).
         cofactor: Q of the adjusted unknowns, shape (n, d, d).
     """
     PQP = np.diagonal(weight - weight @ cofactor @ weight, axis1=1, axis2=2)
@@ -397,10 +412,10 @@ def residuals_of_observed(
     """Return the residuals of observations of a kind, with their redundancy numbers and tests.
 
     Args:
-        one: observations of a kind.
+        one: observations of one kind.
         layout: order of the unknowns.
         optimum: undamped normal equations and their factor.
-        cofactors: of the same; None where they are not wanted, and numbers are NaN.
+        cofactors: cofactors at the optimum; without them redundancy numbers and tests are NaN.
     """
     linear = one.kind.linearise(optimum.state)
     shape = linear.difference.shape
@@ -420,7 +435,7 @@ def residuals_of_observed(
 
 
 def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> FloatArray:
-    """Return J Q J' of observations by the reduced unknowns, (n, d, d); estimable, so in any datum."""
+    """Return J Q J' of observations, (n, d, d), from Q in any datum, because they are estimable."""
     (columns, J, _), poses = rows, len(cofactors.exterior)
     n, d, u = J.shape
     outer = columns < 6 * poses
@@ -448,15 +463,15 @@ def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> Floa
     return np.asarray(J @ Q @ np.swapaxes(J, 1, 2))
 
 
-FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
+FALSE_ALARM = 0.05  # probability that a survey without gross errors loses an image coordinate; Pope (1976)
 
 
 def level_of_single(family: float, tests: int) -> float:
-    """Return the level of each of some tests, so that any of them rejects what is good with a probability.
+    """Return the level of each single test for a given probability that any of several tests rejects wrongly.
 
     Args:
-        family: that probability, of all tests together.
-        tests: how many there are.
+        family: probability of a wrong rejection in all tests together.
+        tests: number of tests.
 
     Source: Sidak (1967), J. Am. Stat. Assoc. 62.
     """
@@ -468,7 +483,7 @@ def tau_critical(alpha: float, redundancy: float) -> float:
 
     Args:
         alpha: probability of rejecting a good observation.
-        redundancy: r of the adjustment; infinite if not positive at least 2.
+        redundancy: r of the adjustment; the critical value is infinite if r is below 2.
 
     Source: Pope (1976), eq. 21: tau = t sqrt(r) / sqrt(r - 1 + t^2), t of r - 1 degrees of freedom.
     """
@@ -479,7 +494,7 @@ def tau_critical(alpha: float, redundancy: float) -> float:
 
 
 def whitening_matrix(whitening: FloatArray) -> FloatArray:
-    """Return F = (a 0; b c), (k, 2, 2)."""
+    """Return F = (a 0; b c), (k, 2, 2), from a, b, c, (k, 3)."""
     F = np.zeros((len(whitening), 2, 2))
     F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = whitening.T
     return F

@@ -1,8 +1,8 @@
-"""Variance components: how well groups of observations were measured, from their residuals.
+"""Variance components: the precision of groups of observations, from their residuals.
 
-Groups are photographs, cameras, and kinds of observation. The variance factor of a group is its v'Pv over
-its redundancy, the sum of its redundancy numbers; that of a kind is its count less tr(P Q) of what it
-observes.
+Groups are photographs, cameras, and kinds of observations. The variance factor of a group is its v'Pv over
+its redundancy. The redundancy of image points is the sum of their redundancy numbers. The redundancy of
+another kind is its count minus tr(P Q), with the cofactors Q of the observed functions.
 
 Source: Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten; Luhmann et
 al., Close-Range Photogrammetry (2020), sec. 2.4.
@@ -19,14 +19,14 @@ from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
-LAST_CHANGE = 1e-3  # relative change of a variance component at which its estimation ends
-LAST_CHANGE_OF_PARTS = 0.01  # the same of the covariance of two parts, and change of the share of one
+LAST_CHANGE = 1e-3  # relative change of a variance component at which the estimation ends
+LAST_CHANGE_OF_PARTS = 0.01  # the same for a covariance of two parts, and for the share of one part
 MAX_ROUNDS = 20
 # Redundancy of a group of image points below which its variance component is not estimated.
 MIN_REDUNDANCY = 1.0
 IMAGE_POINTS = "image points"
 INTERIOR = "interior orientation"
-FEW_OF_A_KIND = 0.1  # the same of a kind, of which a few scale bars may be all there is
+FEW_OF_A_KIND = 0.1  # the same for another kind, which may consist of a few scale bars only
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class VarianceComponents:
 
     names: tuple[str, ...]
     sigma0: FloatArray  # a posteriori over stated standard deviation, (g,); NaN with too little redundancy
-    redundancy: FloatArray  # of each group, (g,)
-    count: IntArray  # scalar observations of each group, (g,)
+    redundancy: FloatArray  # redundancy of each group, (g,)
+    count: IntArray  # number of scalar observations in each group, (g,)
 
 
 def variance_components(
@@ -44,10 +44,10 @@ def variance_components(
 ) -> VarianceComponents:
     """Return the variance factor of each group of image points, v'Pv over the group's redundancy.
 
-    P is of the standard deviations stated, whatever factor they were given in the adjustment.
+    P belongs to the stated standard deviations, without the factor that the adjustment applied to them.
 
     Args:
-        adjustment: the adjustment.
+        adjustment: finished adjustment.
         group: group of each image point, shape (k,).
         names: names of the groups, g of them.
     """
@@ -58,7 +58,7 @@ def variance_components(
 def _components(
     adjustment: Adjustment, covariance: FloatArray, group: IntArray, names: tuple[str, ...], *, few: float
 ) -> VarianceComponents:
-    """Return the variance factor of each group of image points over these covariances, (k, 2, 2)."""
+    """Return the variance factor of each group of image points relative to given covariances, (k, 2, 2)."""
     g = len(names)
     used = ~adjustment.rejected
     v = adjustment.residuals[used]
@@ -71,19 +71,27 @@ def _components(
 
 
 def _root_ratio(vPv: FloatArray, redundancy: FloatArray, few: float) -> FloatArray:
-    """Return sqrt(v'Pv / r) of groups, NaN where the redundancy is too little."""
+    """Return sqrt(v'Pv / r) of groups, NaN where the redundancy is too small."""
     enough = redundancy > few
     return np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, redundancy, 1.0)), np.nan)
 
 
 def by_photograph(adjustment: Adjustment) -> VarianceComponents:
-    """Return the variance factor of each photograph."""
+    """Return the variance factor of each photograph.
+
+    Args:
+        adjustment: finished adjustment.
+    """
     network = adjustment.network
     return variance_components(adjustment, network.image_points.image, network.images)
 
 
 def by_camera(adjustment: Adjustment) -> VarianceComponents:
-    """Return the variance factor of the photographs of each camera; those that share parameters are one."""
+    """Return the variance factor of each camera; cameras that share parameters form one group.
+
+    Args:
+        adjustment: finished adjustment.
+    """
     network = adjustment.network
     names, family = camera_families(adjustment.estimate.cameras, network.camera)
     return variance_components(adjustment, family[network.camera[network.image_points.image]], names)
@@ -92,8 +100,11 @@ def by_camera(adjustment: Adjustment) -> VarianceComponents:
 def by_kind(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each kind of observation.
 
-    Kinds are image points and those of `Network.kinds` that took part. Redundancy numbers of all kinds add
-    up to the redundancy.
+    Kinds are image points and those of `Network.kinds` that took part. The redundancies of all kinds add up
+    to that of the adjustment.
+
+    Args:
+        adjustment: finished adjustment.
     """
     a, network = adjustment, adjustment.network
     whole = np.zeros(len(a.rejected), dtype=np.int64)
@@ -112,7 +123,11 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
 
 
 def least_factor(stated_px: float) -> float:
-    """Return the least factor on the stated standard deviation of image points: to MIN_SIGMA_PX, or 1."""
+    """Return the smallest factor on a stated standard deviation, which gives MIN_SIGMA_PX, but at most 1.
+
+    Args:
+        stated_px: stated standard deviation of image points, px.
+    """
     return min(MIN_SIGMA_PX / stated_px, 1.0)
 
 
@@ -125,21 +140,21 @@ def estimate_components(
 ) -> tuple[Adjustment, FloatArray, bool]:
     """Return the adjustment with the weights of groups of image points estimated from the data.
 
-    The standard deviations of each group are multiplied by the root of its variance factor and the network
-    adjusted again, until the factors of the image points that the last adjustment accepted are 1. They do not
-    fall below MIN_SIGMA_PX; where they end there, the result has the standard deviations of sigma0 = 1.
+    The standard deviations of each group are multiplied by the root of its variance factor, and the network
+    is adjusted again, until the factors of the accepted image points are 1. Standard deviations do not fall
+    below MIN_SIGMA_PX. If they reach that limit, the result has the standard deviations of sigma0 = 1.
 
     Args:
         adjust_with: adjusts a network from fixed start values with the factor on the stated standard
             deviations of each image point, (k,), and returns the adjustment.
         group: group of each image point, shape (k,).
         names: names of the groups, g of them.
-        start: factor to begin with.
+        start: first factor.
 
     Returns:
-        Last adjustment, standard deviation of each group over that stated, shape (g,), and whether the
-        factors converged. Where factors come back because every weighting rejects other image points, the
-        adjustment of that cycle which rejects fewest.
+        Last adjustment, standard deviation of each group over the stated one, shape (g,), and whether the
+        factors converged. Factors may recur in a cycle because each weighting rejects other image points;
+        then it is the adjustment of the cycle that rejects fewest.
     """
     factor = np.full(len(names), start)
     adjustment = adjust_with(factor[group])
@@ -170,20 +185,20 @@ def estimate_components(
 def estimate_common_part(
     adjust_with: Callable[[FloatArray], Adjustment], covariance: FloatArray, common_px: float
 ) -> tuple[float, float]:
-    """Return the factor on stated standard deviations of image points, and the sigma of what is not stated.
+    """Return the factor on stated standard deviations of image points, and the sigma of a common part.
 
-    The covariance of an image point is f^2 C + s^2 I: C is stated for each, as by matching, f states how far
-    these are from the truth, and s is what they do not contain, as the shape of a surface inside a window or
-    an unsteady lens. The squares of both are estimated from the residuals by Fisher scoring; the redundancy
-    of an image point is taken alike in all directions.
+    The covariance of an image point is f^2 C + s^2 I. C is stated for each image point, for example by
+    matching, and f is a common factor on it. The common part s covers effects that C does not contain, such
+    as the shape of a surface inside a window or an unsteady lens. The squares of both are estimated from the
+    residuals by Fisher scoring. The redundancy of an image point is assumed equal in all directions.
 
     Args:
         adjust_with: adjusts a network with covariances of its image points, px^2, (k, 2, 2).
-        covariance: stated, px^2, (k, 2, 2).
-        common_px: s to begin with, px.
+        covariance: stated covariances C, px^2, (k, 2, 2).
+        common_px: start value of s, px.
 
     Returns:
-        f, which may be 0, and s, at least MIN_SIGMA_PX; after MAX_ROUNDS as they are.
+        f, which may be 0, and s, at least MIN_SIGMA_PX; after MAX_ROUNDS the last values.
 
     Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.6 (iterated best
     invariant quadratic unbiased estimation).
@@ -210,7 +225,7 @@ def estimate_common_part(
 
 
 def _not_negative(S: FloatArray, found: FloatArray) -> FloatArray:
-    """Return the solution of two normal equations, of one alone where the other would be negative, (2,)."""
+    """Return the solution of two normal equations, (2,), with 0 instead of a negative value."""
     squares = np.linalg.solve(S, found)
     for one, other in ((0, 1), (1, 0)):
         if squares[one] < 0:
@@ -225,9 +240,10 @@ def _median_trace(squares: FloatArray, parts: FloatArray) -> float:
 
 
 def _as_weighted(adjustment: Adjustment) -> Adjustment:
-    """Return an adjustment with the standard deviations by which it was weighted: sigma0 = 1.
+    """Return an adjustment with the standard deviations of its weights, that is sigma0 = 1.
 
-    Sigma0 a posteriori of image points that are better than their weights would scale those of control, too.
+    If image points are better than their weights, the a posteriori sigma0 would also scale the standard
+    deviations of control.
     """
     if not adjustment.sigma0 > 0:
         return adjustment
@@ -235,9 +251,9 @@ def _as_weighted(adjustment: Adjustment) -> Adjustment:
 
 
 def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:
-    """Return the round that had these factors and after which other image points were rejected.
+    """Return the round with the same factors, after which other image points were rejected; None if none.
 
-    All rounds start from the same values, so that the same factors lead to the same adjustments again.
+    All rounds start from the same values, so the same factors lead to the same adjustments again.
     """
     for at in reversed(range(len(tried))):
         others = any(not np.array_equal(rejected[at], one) for one in rejected[at + 1 :])

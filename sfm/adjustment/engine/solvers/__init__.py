@@ -1,1 +1,1 @@
-"""Solvers of the reduced normal equations behind one protocol; begin with `protocol`, then `choice`."""
+"""Solvers of the reduced normal equations, with one protocol; start with `protocol`, then `choice`."""

@@ -1,9 +1,9 @@
-"""Which photographs share object points, and which solver of their normal equations takes the least work.
+"""Chooses the solver of the normal equations that takes the least work.
 
-The reduced normal matrix has a block wherever two photographs share a point. In a block of photographs every
-one shares points with its neighbours only, and nested dissection eliminates them with little fill: fronts. A
-full matrix is summed as a product of full rows where most photographs see most points, else pair by pair of
-rays. Which is the least work is found by counting operations, among those that fit in memory.
+The reduced normal matrix has a nonzero block for each pair of photographs that share a point. In an aerial
+block each photograph shares points with its neighbours only. There nested dissection eliminates photographs
+with little fill, in fronts. A full matrix is summed as a product of full rows if most photographs see most
+points, otherwise pair by pair of rays. The choice counts operations among the solvers that fit in memory.
 
 Source: George and Liu (1981), Computer Solution of Large Sparse Positive Definite Systems, ch. 8;
 operations: Golub and Van Loan (2013), sec. 4.2.
@@ -15,8 +15,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.adjustment.engine.solvers.dense import BYTES, DenseSolver
-from sfm.adjustment.engine.solvers.fronts import fronts_of, pairs_of
+from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.fronts import BYTES, fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.protocol import Solver, available_bytes, refuse_what_does_not_fit
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -25,22 +25,22 @@ from sfm.display import counted
 from sfm.kernels.compiling import compiled
 from sfm.network import Network
 
-# Operations in a second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
-PRODUCT_RATE = 80e9  # symmetric product of full rows, most of them in single precision
-FACTOR_RATE = 25e9  # Cholesky factor of a full matrix, which has one thread where the sums have two
-FRONT_RATE = 20e9  # the same of many smaller ones, which are added to one another
+# Operations per second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
+PRODUCT_RATE = 80e9  # symmetric product of full rows, mostly in single precision
+FACTOR_RATE = 25e9  # Cholesky factor of a full matrix, which uses one thread where the sums use two
+FRONT_RATE = 20e9  # Cholesky factors of many smaller matrices, which are added to one another
 PAIR_RATE = 25e9  # product of two rays of a point, compiled
-PAIR_OPERATIONS = 216  # of a 6 x 6 x 3 product
-SMALL = 64  # photographs up to which the product of full rows costs so little that nothing else is sought
-SAMPLED = 2  # pairs of rays for each pair of photographs, which show whether most share points
-TRIED_PAIRS = 1000  # of photographs; a share of 0.5 is then known to 0.016
-MOSTLY = 0.5  # share of the pairs of photographs with a common point above which fronts save nothing
+PAIR_OPERATIONS = 216  # operations of a 6 x 6 x 3 product
+SMALL = 64  # number of photographs up to which the product of full rows is always cheap enough
+SAMPLED = 2  # pairs of rays for each pair of photographs in the sample that shows whether most share points
+TRIED_PAIRS = 1000  # sampled pairs of photographs; a share of 0.5 then has the standard deviation 0.016
+MOSTLY = 0.5  # share of pairs of photographs with a common point above which fronts save nothing
 
 
 def choose_solver(layout: Unknowns) -> Solver:
     """Return the solver that takes the least work for a network.
 
-    Fronts, or a full matrix that is summed pair by pair of rays or as a product of full rows.
+    The choices are fronts, or a full matrix summed pair by pair of rays or as a product of full rows.
 
     Args:
         layout: order of the unknowns and the image points.
@@ -76,13 +76,13 @@ def choose_solver(layout: Unknowns) -> Solver:
 
 
 def refuse_too_large(network: Network) -> None:
-    """Refuse a network that no solver could adjust, before hours go into its orientation.
+    """Refuse a network that no solver could adjust, before hours are spent on its orientation.
 
     Args:
-        network: most of whose photographs share points, by a sample of pairs.
+        network: the network; a sample of pairs shows whether most of its photographs share points.
 
     Raises:
-        GeometryError: it is so, and the unknowns of so many photographs do not fit in memory.
+        GeometryError: most photographs share points, and their normal equations do not fit in memory.
     """
     m = len(network.images)
     size, limit = 3 * BYTES * (6.0 * m) ** 2, available_bytes()  # factor, its inverse, their product
@@ -91,14 +91,14 @@ def refuse_too_large(network: Network) -> None:
     sees = network.incidence(np.ones(len(network.image_points), dtype=bool))
     step = np.arange(TRIED_PAIRS)
     first = step * m // TRIED_PAIRS
-    second = (first + 1 + step * 7919 % (m - 1)) % m  # from next to it to far off in the sequence
+    second = (first + 1 + step * 7919 % (m - 1)) % m  # from neighbours to far apart in the sequence
     if (sees[first].multiply(sees[second]).sum(axis=1) > 0).mean() > MOSTLY:
         refuse_what_does_not_fit(size, f"{counted(6 * m, 'unknown')} that are all connected", limit=limit)
 
 
 @compiled
 def _join(observations: Observations, points: IntArray, joined: AnyArray) -> None:
-    """Set 1 where two photographs share one of some object points, (m, m)."""
+    """Set 1 where two poses share one of the given object points, (m, m)."""
     for j in points:
         for s in range(observations.start[j], observations.start[j + 1]):
             for t in range(observations.start[j], observations.start[j + 1]):

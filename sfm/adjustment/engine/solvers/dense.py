@@ -1,12 +1,13 @@
-"""The reduced normal matrix in full and factored: scaled, with the open motions of the datum held, undamped.
+"""Dense solver: factors the full reduced normal matrix, scaled, with the open motions of the datum held.
 
-With scaled S and an orthonormal basis Q of its null space, S + QQ' is positive definite and its
-solution is the one with Q'dx = 0: an inner constraint, not damping. Directions that the observations
-cannot determine although the datum does not explain them are found as further null vectors and held in
-the same way, so that everything else is still estimated; they are reported.
+With scaled S and an orthonormal basis Q of its null space, S + QQ' is positive definite. Its solution has
+Q'dx = 0, which is an inner constraint and not damping. Directions that neither the observations nor the datum
+determine are found as further null vectors and held in the same way. Everything else is still estimated, and
+the null vectors are reported.
 
-Y Y' is summed as a product of full rows Y' of the object points, where most photographs see most points, or
-pair by pair of rays (`fronts.Pairs`), and so are the elements of S^-1 that marginal covariances are made of.
+Y Y' is summed as a product of full rows Y' of the object points if most photographs see most points,
+otherwise pair by pair of rays (`fronts.Pairs`). The elements of S^-1 for marginal covariances are computed in
+the same way.
 
 Source: Foerstner and Wrobel (2016), sec. 4.5, 15.2 and 15.2.5; Luhmann et al. (2020), sec. 4.4.3; Golub and
 Van Loan (2013), sec. 1.3 (products by blocks).
@@ -28,7 +29,7 @@ from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.normals import Equations, times_reduced
 from sfm.adjustment.engine.solvers import protocol
-from sfm.adjustment.engine.solvers.fronts import Pairs, subtract_squares, times_inverse
+from sfm.adjustment.engine.solvers.fronts import BYTES, Pairs, subtract_squares, times_inverse
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
@@ -36,52 +37,51 @@ from sfm.display import counted
 from sfm.kernels.compiling import compiled, kernel
 from sfm.kernels.threads import at_once
 
-CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time, at least
-LEAST = 500  # and rows; fewer would slow down a product
-ROWS = 2  # rows for each unknown, if they are summed: that would take longer than forming products otherwise
-HALVED = 200**2  # elements of the matrix from which its halves are formed by themselves
-TRIANGLE_PARTS = 4  # stretches of columns of a triangular matrix; 5/8 of the work of a full one
+CHUNK = 1_000_000  # smallest number of elements of Y' multiplied at a time
+LEAST = 500  # smallest number of rows of Y' multiplied at a time; fewer would slow down a product
+ROWS = 2  # rows per unknown if products are summed; with fewer, summing would take longer than multiplying
+HALVED = 200**2  # number of matrix elements from which the halves are formed separately
+TRIANGLE_PARTS = 4  # groups of columns of a triangular matrix; they take 5/8 of the work of a full one
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
-WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
-WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
-BYTES = 8.0  # of a number in double precision
-SINGLE_FROM = 100  # reduced unknowns from which the product in single precision saves time
+WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are computed
+WEAK_SINGLE = 1e-5  # the same in single precision, where rounding leaves 1e-6
+SINGLE_FROM = 100  # number of reduced unknowns from which the product in single precision saves time
 
 
 @dataclass(frozen=True)
 class DenseSolver:
-    """The reduced normal matrix in full."""
+    """Solver with a full reduced normal matrix."""
 
     layout: Unknowns
-    pairs: Pairs | None = None  # places of the rays where it is summed pair by pair; else a product of rows
+    pairs: Pairs | None = None  # positions of the rays to sum pair by pair; None for a product of full rows
 
     @property
     def has_coarse(self) -> bool:
-        """Whether a step on the way takes less time in single precision."""
+        """Whether an intermediate step takes less time in single precision."""
         return self.pairs is None and self.layout.reduced >= SINGLE_FROM
 
     @property
     def bytes(self) -> float:
-        """Memory of the factor and its inverse at the peak."""
+        """Peak memory of the factor and its inverse, bytes."""
         width = self.layout.reduced
         matrix, points = width**2, len(self.layout.point_free)
         if self.pairs is not None:  # factor, its inverse, their product, and rows Y'Q
             return BYTES * (3 * matrix + 18 * len(self.layout.order))
         rows = rows_at_a_time(points, width, summed=True) * width
         half = rows_at_a_time(points // 2, width) * width
-        # S, a product and rows; or factor, its inverse, their product, and of either half rows and products
+        # S, a product and rows; or factor, its inverse, their product, and rows and products of both halves
         return BYTES * max(2 * matrix + rows, 3 * matrix + 4 * half)
 
     @cached_property
     def limit(self) -> float:
-        """Memory that may be taken, bytes, asked for once in an adjustment: files state it."""
+        """Memory that may be used, bytes; determined once in an adjustment because it is read from files."""
         return protocol.available_bytes()
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> DenseFactor | None:
-        """Return the factored reduced normal equations; Args: as `Solver.factor`.
+        """Return the factored reduced normal equations; arguments as in `Solver.factor`.
 
         Raises:
             GeometryError: the matrix would not fit in memory.
@@ -115,26 +115,26 @@ class DenseFactor:
     """Cholesky factor of the scaled reduced normal matrix with its null space filled."""
 
     layout: Unknowns
-    pairs: Pairs | None  # where it was summed pair by pair
+    pairs: Pairs | None  # positions of the rays if summed pair by pair
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
-    cholesky: FloatArray  # upper factor of S + QQ' scaled, (reduced, reduced)
+    cholesky: FloatArray  # upper factor of scaled S + QQ', (reduced, reduced)
     further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return S^+ right for one or several right sides, (reduced,) or (reduced, r)."""
+        """Return S^+ right for one or several right-hand sides, (reduced,) or (reduced, r)."""
         s = self.scale if right.ndim == 1 else self.scale[:, None]
         solved = dpotrs if self.cholesky.dtype == np.float64 else spotrs
         x, _ = solved(self.cholesky, s * right)
         return np.asarray(s * x)
 
     def inverse_root(self) -> FloatArray:
-        """Return W with S^+ = W W', upper triangle, in the units of the unknowns, (reduced, reduced)."""
+        """Return the upper triangular W with S^+ = W W', in the units of the unknowns, (reduced, reduced)."""
         W, _ = dtrtri(self.cholesky)
         W *= self.scale[:, None]
         return np.asarray(W)
 
     def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
-        """Return the elements of the inverse; Args: as `Factor.inverse`."""
+        """Return the elements of the inverse; arguments as in `Factor.inverse`."""
         b, layout = blocks, self.layout
         m, n = len(b.U), len(b.y)
         W = self.inverse_root()
@@ -178,13 +178,13 @@ class DenseFactor:
 def schur_complement(
     equations: Equations, layout: Unknowns, pairs: Pairs | None = None, *, single: bool = False
 ) -> FloatArray:
-    """Return S = U - Y Y' scaled, upper triangle, column-major, (reduced, reduced).
+    """Return the scaled S = U - Y Y', upper triangle, column-major, (reduced, reduced).
 
     Args:
         equations: normal equations with object points eliminated.
         layout: order of the unknowns.
-        pairs: places of the rays where it is summed pair by pair, None: as a product of full rows.
-        single: whether it is wanted in single precision.
+        pairs: positions of the rays to sum Y Y' pair by pair; None for a product of full rows.
+        single: whether to compute in single precision.
     """
     b, parts = equations.blocks, equations.parts
     dtype = np.float32 if single else np.float64
@@ -206,7 +206,7 @@ def schur_complement(
 
 
 def _null_vectors(S: FloatArray) -> FloatArray:
-    """Return the eigenvectors of eigenvalue 0, (reduced, e); S is its upper triangle."""
+    """Return the eigenvectors with eigenvalue 0, (reduced, e); S contains the upper triangle."""
     values, vectors = eigh(S, lower=False)
     return np.asfortranarray(vectors[:, values < NULL])
 
@@ -232,7 +232,7 @@ def _add_blocks(
 
 @compiled
 def _mirror(matrix: FloatArray) -> None:
-    """Copy the upper triangle to the lower one."""
+    """Copy the upper triangle to the lower triangle."""
     for row in range(len(matrix)):
         for column in range(row):
             matrix[row, column] = matrix[column, row]
@@ -272,10 +272,18 @@ def rows_of(
     *,
     summed: bool = False,
 ) -> Iterator[tuple[int, FloatArray]]:
-    """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced).
+    """Yield scaled rows Y', some object points at a time: the first point, and rows (3 points, reduced).
 
-    The next rows take the place of the last ones. Begins and ends with object points begin and end, if given.
-    Of those whose products are summed there are more at a time.
+    Each set of rows overwrites the previous one.
+
+    Args:
+        blocks: filled blocks.
+        layout: order of the unknowns.
+        scale: scale of each reduced unknown, (reduced,).
+        dtype: type of the numbers.
+        begin: first object point.
+        end: object point after the last; all if not given.
+        summed: whether products of the rows are summed, for which more rows at a time are faster.
     """
     end, width = len(blocks.y) if end is None else end, layout.reduced
     space: FloatArray = np.empty((rows_at_a_time(end - begin, width, summed=summed), width), dtype=dtype)
@@ -287,21 +295,27 @@ def rows_of(
 
 
 def rows_at_a_time(points: int, width: int, *, summed: bool = False) -> int:
-    """Return how many of the rows Y' of some object points are formed at a time; width is their length."""
+    """Return the number of rows Y' that are formed at a time.
+
+    Args:
+        points: number of object points.
+        width: length of a row.
+        summed: whether products of the rows are summed.
+    """
     least = ROWS * width if summed else LEAST
     return 3 * max(min(points, max(least, CHUNK // width) // 3 + 1), 1)
 
 
 def subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> None:
-    """Take rows' rows off the lower triangle of S.
+    """Subtract rows' rows from the lower triangle of S.
 
-    Both triangles of its halves are formed in one thread, the square between them, which is as many
-    operations, in another: numpy's product lets other threads run.
+    One thread forms the triangles of both halves, another the square between them, which takes as many
+    operations. Numpy's product lets other threads run.
 
     Args:
         rows: some rows Y' of object points, (3 points, reduced).
-        product: space for the product, (reduced, reduced).
-        S: what it is taken off, row-major, (reduced, reduced).
+        product: work space for the product, (reduced, reduced).
+        S: matrix to subtract from, row-major, (reduced, reduced).
     """
     half = S.shape[0] // 2
     left, right = rows[:, :half], rows[:, half:]
@@ -322,7 +336,7 @@ def subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> Non
 
 
 def times_triangle(rows: FloatArray, W: FloatArray) -> FloatArray:
-    """Return rows W, W upper triangular, some columns at a time to leave out most of the zeros.
+    """Return rows W, computed some columns at a time to skip most of the zeros of W.
 
     Args:
         rows: some rows Y' of object points, (3 points, reduced).
@@ -337,7 +351,13 @@ def times_triangle(rows: FloatArray, W: FloatArray) -> FloatArray:
 
 
 def multiply_rows(left: FloatArray, right: FloatArray, core: FloatArray) -> None:
-    """Fill the product of the three rows of each object point by themselves, (points, 3, 3)."""
+    """Fill `core` with the products of the three left and the three right rows of each object point.
+
+    Args:
+        left: three rows of each point, (3 points, reduced).
+        right: three rows of each point, (3 points, reduced).
+        core: receives the products, (points, 3, 3).
+    """
     shape = (-1, 3, left.shape[1])
     np.matmul(left.reshape(shape), np.swapaxes(right.reshape(shape), 1, 2), out=core)
 
@@ -346,7 +366,15 @@ def multiply_rows(left: FloatArray, right: FloatArray, core: FloatArray) -> None
 def pick_columns(
     observations: Observations, products: FloatArray, start: int, YQ: FloatArray, YQ_border: FloatArray
 ) -> None:
-    """Take the columns of the photographs that see each point, and those of the border."""
+    """Copy from each point's rows the columns of the photographs that see the point, and the border columns.
+
+    Args:
+        observations: image points.
+        products: rows Y'Q of some object points, (3 points, reduced).
+        start: first of these points.
+        YQ: receives the columns of poses, (k, 3, 6).
+        YQ_border: receives the columns of the border, (n, 3, i + 3 s).
+    """
     first = 6 * observations.poses
     for h in range(len(products) // 3):
         j = start + h

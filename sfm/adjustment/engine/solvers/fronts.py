@@ -1,22 +1,23 @@
 """Fronts of a multifrontal factorisation: their order, their sizes, and sums over pairs of rays.
 
-A front is the full matrix of the photographs of a group of nested dissection and of those, eliminated later,
-that share object points with the group or with what was eliminated before it. All photographs that see an
-object point are in one front, that of the first of them to be eliminated, so an object point adds to one
-full matrix only, and takes all it needs of the inverse from one.
+Nested dissection orders the photographs so that elimination causes little fill. In its graph, photographs
+that share object points are neighbours. A few of them, the separator, split the others into two halves
+without a common point. The halves are eliminated first, each split again in the same way, and the separator
+last. For a block of m photographs the factor has about m log m elements and takes m^1.5 operations; a band
+matrix takes m^1.5 and m^2.
 
-In what order photographs are eliminated so that little is filled in: nested dissection of their graph.
-Photographs that share object points are neighbours. A few of them, the separator, split the others into two
-halves without a common point; the halves are eliminated first, each split again in the same way, and the
-separator last. For a block of m photographs the factor has of the order of m log m elements and takes m^1.5
-operations, where a band takes m^1.5 and m^2.
+The separator follows from distances in the graph, measured from four photographs at its far ends. Photographs
+are ordered by the difference of two distances, or of two sums of two, which splits a block across its
+diagonals or along its sides.
 
-Where to split is found by distances in the graph from four photographs at its far ends: by the difference of
-two of them, or of two sums of two, as a block is split across its diagonals or along its sides.
+A front is the full matrix of a group of photographs from this dissection, with all later photographs that are
+connected to the group or to groups eliminated before it. All photographs that see an object point are in the
+front of the first of them to be eliminated. So an object point adds to one full matrix only, and one front
+contains all elements of the inverse that it needs.
 
-Sums over the pairs of rays of each object point, where a product of full rows would mostly multiply zeros. Y
-Y' and Y' Q need only the blocks of photographs that share a point. They are summed tile by tile: TILE
-photographs by as many others, which stay in the cache while all object points add to them.
+`Pairs` is for sums over the pairs of rays of each object point, where a product of full rows would mostly
+multiply zeros. Y Y' and Y' Q need only the blocks of photographs that share a point. These are summed in
+tiles of TILE x TILE photographs, which stay in the cache while all object points add to them.
 
 Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1); George (1973), SIAM
 J. Numer. Anal. 10(2); George and Liu (1981), Computer Solution of Large Sparse Positive Definite Systems, ch.
@@ -38,22 +39,22 @@ from sfm.kernels.compiling import compiled, kernel
 from sfm.kernels.small_algebra import add_product, subtract_pair
 from sfm.kernels.threads import at_once
 
-TILE = 48  # photographs; 6 x 6 numbers for each pair of a tile fill most of a cache of 1 MB
-LEAF = 32  # photographs that are not split any further
-SMOOTHED = 4  # times that a photograph takes the mean of its neighbours, since steps are coarse
-MAX_SEPARATOR = 0.5  # share of the photographs; a separator with more of them saves nothing
-BYTES = 8.0  # of a number in double precision
+TILE = 48  # photographs; 6 x 6 numbers for each pair in a tile fill most of a 1 MB cache
+LEAF = 32  # number of photographs that are not split further
+SMOOTHED = 4  # rounds in which each photograph takes the mean of its neighbours, since distances are coarse
+MAX_SEPARATOR = 0.5  # share of the photographs above which a separator saves nothing
+BYTES = 8.0  # size of a number in double precision
 
 
 @dataclass(frozen=True)
 class Front:
     """A group of photographs that are eliminated together."""
 
-    photographs: IntArray  # pivots, then those joined with them that are eliminated later
-    pivots: int  # how many of them it eliminates
-    children: tuple[int, ...]  # fronts that leave something to it
-    parent: int  # front that takes what is left of it; -1: nothing is left
-    into: IntArray  # places among the photographs of the parent of those that it does not eliminate
+    photographs: IntArray  # pivots, then connected photographs that are eliminated later
+    pivots: int  # number of photographs that it eliminates
+    children: tuple[int, ...]  # fronts that pass their remainder to it
+    parent: int  # front that receives its remainder; -1: nothing remains
+    into: IntArray  # positions of its remaining photographs among those of the parent
     points: IntArray  # object points that add to it
     rows: IntArray  # exterior unknowns of its photographs
 
@@ -63,20 +64,22 @@ class Fronts:
     """The fronts of a network in the order of elimination."""
 
     fronts: tuple[Front, ...]
-    halves: tuple[int, int]  # fronts before the first, and between both, need nothing of one another
-    local: AnyArray  # place of the photograph of each image point in the front of its object point, (k,)
+    halves: tuple[int, int]  # ends of two ranges of fronts, from 0 on, that do not depend on each other
+    local: AnyArray  # position of each image point's photograph in the front of its object point, (k,)
 
     @property
     def operations(self) -> float:
-        """Operations of the factorisation, products and sums counted each."""
+        """Number of operations of the factorisation, counting products and sums."""
         return float(sum(_operations(6.0 * f.pivots, 6.0 * len(f.photographs)) for f in self.fronts))
 
     def bytes(self, border: int, vectors: float) -> float:
-        """Memory of factor and inverse at the peak: what is kept, what waits for a parent, the front at work.
+        """Return the peak memory of factor and inverse, bytes.
+
+        It includes the factor, remainders that wait for a parent, and the current front.
 
         Args:
-            border: unknowns beside the exterior orientation.
-            vectors: bytes of the vectors with which null vectors are sought.
+            border: number of unknowns other than exterior orientation.
+            vectors: bytes of the vectors used to find null vectors.
         """
         half, end = self.halves
         first, second = self._eliminating(range(half), {}), self._eliminating(range(half, end), {})
@@ -87,7 +90,7 @@ class Fronts:
         return max(factoring, factor + vectors, factor + self._inverting() + 2 * columns) + 2 * columns
 
     def _eliminating(self, some: range, waiting: dict[int, float]) -> _Memory:
-        """Return the memory that takes the elimination of some fronts; waiting is what others have left."""
+        """Return the memory for eliminating some fronts; `waiting` are remainders of other fronts, bytes."""
         waiting = dict(waiting)
         kept = peak = 0.0
         space = max((_bytes(self.fronts[g])[0] for g in some), default=0.0)
@@ -102,13 +105,13 @@ class Fronts:
         return _Memory(kept, peak, waiting)
 
     def _inverting(self) -> float:
-        """Return the memory of the inverse of all fronts, from the last on, at its peak."""
+        """Return the peak memory of the inverse of all fronts, computed from the last to the first, bytes."""
         kept: dict[int, float] = {}
         needed = [len(front.children) for front in self.fronts]
         peak = before = 0.0
         for g in range(len(self.fronts) - 1, -1, -1):
             matrix, factor, _ = _bytes(self.fronts[g])
-            # the front, as it is and scaled, and what is left of the one before
+            # the front, unscaled and scaled, and the previous front
             peak = max(peak, sum(kept.values()) + 2 * matrix + factor + before)
             before = matrix
             parent = self.fronts[g].parent
@@ -122,15 +125,15 @@ class Fronts:
 
 
 class _Memory(NamedTuple):
-    """Memory, bytes, that the elimination of some fronts takes."""
+    """Memory for eliminating some fronts, bytes."""
 
-    kept: float  # by the factor
+    kept: float  # the factor
     peak: float
-    waiting: dict[int, float]  # what fronts leave to parents that are not among them
+    waiting: dict[int, float]  # remainders for parents that are not among these fronts
 
 
 def _bytes(front: Front) -> tuple[float, float, float]:
-    """Return the memory of the matrix of a front, of its part of the factor and of what it leaves."""
+    """Return the memory of the matrix of a front, of its part of the factor and of its remainder, bytes."""
     pivots, size = 6 * front.pivots, 6 * len(front.photographs)
     return BYTES * size**2, BYTES * pivots * size, BYTES * (size - pivots) ** 2
 
@@ -140,7 +143,7 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
 
     Args:
         observations: image points.
-        graph: an element wherever two photographs share an object point, symmetric, (m, m).
+        graph: nonzero where two photographs share an object point, symmetric, (m, m).
     """
     m, n = graph.shape[0], len(observations.start) - 1
     order = dissect(graph)
@@ -152,7 +155,7 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
     np.minimum.at(earliest, observations.point, place[observations.pose])
     points = np.argsort(earliest, kind="stable")
     cuts = np.searchsorted(earliest[points], begins)
-    later: list[list[IntArray]] = [[] for _ in order.groups]  # places that children bring
+    later: list[list[IntArray]] = [[] for _ in order.groups]  # places from children
     children: list[list[int]] = [[] for _ in order.groups]
     members = []
     for g, group in enumerate(order.groups):
@@ -178,7 +181,7 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
 
 
 def _halves(parents: list[int]) -> tuple[int, int]:
-    """Return where two parts end of which neither needs the other; fronts behind them need both."""
+    """Return the ends of two ranges of fronts that do not depend on each other; later fronts need both."""
     last = len(parents) - 1
     tops = [g for g, parent in enumerate(parents) if parent == -1]
     if len(tops) > 1:
@@ -188,7 +191,7 @@ def _halves(parents: list[int]) -> tuple[int, int]:
 
 
 def _operations(pivots: float, size: float) -> float:
-    """Operations that eliminate some of the unknowns of a symmetric matrix."""
+    """Return the number of operations that eliminate some unknowns of a symmetric matrix."""
     rest = size - pivots
     return pivots**3 / 3 + pivots**2 * rest + pivots * rest**2
 
@@ -201,17 +204,17 @@ def _place(observations: Observations, points: IntArray, where: AnyArray, local:
 
 
 class Dissection(NamedTuple):
-    """Groups of photographs in the order of their elimination: halves before the separator between them."""
+    """Groups of photographs in the order of elimination: two halves before the separator between them."""
 
     groups: list[IntArray]  # photographs of each group
-    parents: list[int]  # group of the separator next behind each one; -1: none
+    parents: list[int]  # group of the next separator after each group; -1: none
 
 
 def dissect(graph: csr_matrix) -> Dissection:
     """Return the groups into which nested dissection splits photographs.
 
     Args:
-        graph: an element wherever two photographs share an object point, symmetric, (m, m).
+        graph: nonzero where two photographs share an object point, symmetric, (m, m).
     """
     order = Dissection([], [])
     _eliminate(graph, np.arange(graph.shape[0]), order)
@@ -219,7 +222,7 @@ def dissect(graph: csr_matrix) -> Dissection:
 
 
 def _eliminate(graph: csr_matrix, photographs: IntArray, order: Dissection) -> list[int]:
-    """Append the groups of some photographs, and return those without a parent; graph is theirs alone."""
+    """Append the groups of some photographs to `order`, given their graph; return groups without a parent."""
     halves = _split(graph) if len(photographs) > LEAF else None
     if halves is None:
         order.groups.append(photographs)
@@ -240,7 +243,7 @@ def _eliminate(graph: csr_matrix, photographs: IntArray, order: Dissection) -> l
 
 
 def _split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
-    """Return two halves and the separator between them; None where no small one is found."""
+    """Return two halves and the separator between them; None if no small separator is found."""
     m = graph.shape[0]
     rows, columns = np.repeat(np.arange(m), np.diff(graph.indptr)), graph.indices
     best: tuple[BoolArray, BoolArray, BoolArray] | None = None
@@ -259,7 +262,7 @@ def _split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
 
 
 def _directions(graph: csr_matrix) -> FloatArray:
-    """Return four ways to order photographs, (m, 4)."""
+    """Return four coordinates by which photographs can be ordered, (m, 4)."""
     indptr, indices = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
     a = distances(indptr, indices, int(distances(indptr, indices, 0).argmax()))
     b = distances(indptr, indices, int(a.argmax()))
@@ -274,12 +277,12 @@ def _directions(graph: csr_matrix) -> FloatArray:
 
 @compiled
 def distances(indptr: IntArray, indices: IntArray, start: int) -> IntArray:
-    """Return how many steps each node is from one of them, the number of nodes where none leads there.
+    """Return the number of steps from one node to each node, (m,); m for nodes that cannot be reached.
 
     Args:
-        indptr: where the neighbours of each node begin, and the end, (m + 1,).
-        indices: neighbours.
-        start: the node.
+        indptr: index of the first neighbour of each node, and the end, (m + 1,).
+        indices: neighbours of all nodes.
+        start: node where the steps begin.
     """
     m = len(indptr) - 1
     found = np.full(m, m)
@@ -300,9 +303,9 @@ def distances(indptr: IntArray, indices: IntArray, start: int) -> IntArray:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Where the rays of each object point lie among the tiles of photographs."""
+    """Positions of the rays of each object point among the tiles of photographs."""
 
-    cut: IntArray  # image point of object point j that is the first in tile i or behind it, (n, tiles + 1)
+    cut: IntArray  # first image point of object point j in tile i or a later tile, (n, tiles + 1)
 
     @property
     def tiles(self) -> int:
@@ -311,7 +314,11 @@ class Pairs:
 
 
 def pairs_of(observations: Observations) -> Pairs:
-    """Return where the rays of each object point lie among the tiles of photographs."""
+    """Return the positions of the rays of each object point among the tiles of photographs.
+
+    Args:
+        observations: image points.
+    """
     tiles = -(-observations.poses // TILE)
     cut = np.empty((len(observations.start) - 1, tiles + 1), dtype=np.int64)
     _cut(observations, cut)
@@ -321,14 +328,14 @@ def pairs_of(observations: Observations) -> Pairs:
 def subtract_squares(
     pairs: Pairs, observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
 ) -> None:
-    """Take Y Y' and Y_interior Y_interior' off the lower triangle of S, row-major.
+    """Subtract Y Y' from the lower triangle of S, including the rows of interior unknowns.
 
     Args:
-        pairs: places of the rays.
+        pairs: positions of the rays.
         observations: image points.
-        Y: rows Y' of each image point by X0, w of its photograph, (k, 3, 6).
-        Y_interior: rows Y' of each object point by the interior unknowns, (n, 3, i).
-        S: at least 6 m + i rows and columns.
+        Y: rows Y' of each image point, for X0, w of its pose, (k, 3, 6).
+        Y_interior: rows Y' of each object point, for the interior unknowns, (n, 3, i).
+        S: matrix to subtract from, row-major, with at least 6 m + i rows and columns.
     """
     flat = S.reshape(-1)
     first, inner = 6 * observations.poses, Y_interior.shape[2]
@@ -345,15 +352,15 @@ def subtract_squares(
 def times_inverse(
     pairs: Pairs, observations: Observations, Y: FloatArray, Q: FloatArray, border: FloatArray, YQ: FloatArray
 ) -> None:
-    """Fill YQ with the rows Y'Q of each image point by X0, w of its photograph, (k, 3, 6).
+    """Fill YQ with the rows Y'Q of each image point, for X0, w of its pose.
 
     Args:
-        pairs: places of the rays.
+        pairs: positions of the rays.
         observations: image points.
-        Y: rows Y' of each image point by X0, w of its photograph, (k, 3, 6).
+        Y: rows Y' of each image point, for X0, w of its pose, (k, 3, 6).
         Q: symmetric matrix, row-major, (reduced, reduced).
-        border: rows Y' of each object point by the interior unknowns, (n, 3, i).
-        YQ: what is filled.
+        border: rows Y' of each object point, for the interior unknowns, (n, 3, i).
+        YQ: array to fill, (k, 3, 6).
     """
     _border_times(observations, border, Q[6 * observations.poses :], YQ)
 
@@ -365,7 +372,7 @@ def times_inverse(
 
 
 def _in_two_threads(work: Callable[[int, int], None], tiles: list[tuple[int, int]]) -> None:
-    """Work on every other tile in one thread, on the rest in another."""
+    """Process every other tile in one thread and the rest in another."""
 
     def on(part: list[tuple[int, int]]) -> None:
         for tile in part:
@@ -394,21 +401,27 @@ def _subtract_tile(
     flat: FloatArray,
     stride: int,
 ) -> None:
-    """Take Y Y' off the blocks of the photographs of one tile by those of another that is not behind it."""
+    """Subtract Y Y' from the blocks between photographs of one tile and of the same or an earlier tile."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
             at = 6 * observations.pose[s] * stride
             for t in range(cut[j, column], min(cut[j, column + 1], s + 1)):
                 subtract_pair(flat, at + 6 * observations.pose[t], stride, Y, s, t)
-                if (
-                    observations.pose[s] == observations.pose[t] and s != t
-                ):  # a point measured twice in a photograph
+                # a point measured twice in a photograph
+                if observations.pose[s] == observations.pose[t] and s != t:
                     subtract_pair(flat, at + 6 * observations.pose[t], stride, Y, t, s)
 
 
 @kernel
 def subtract_border(observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray) -> None:
-    """Take Y_interior Y' off the rows S of the interior unknowns."""
+    """Subtract Y_interior Y' from the rows of the interior unknowns.
+
+    Args:
+        observations: image points.
+        Y: rows Y' of each image point, (k, 3, 6).
+        Y_interior: rows Y' of each object point, (n, 3, i).
+        S: rows to subtract from, (i, reduced).
+    """
     for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
             column = 6 * observations.pose[o]
@@ -429,7 +442,7 @@ def _add_tile(
     stride: int,
     YQ: FloatArray,
 ) -> None:
-    """Add to Y'Q of the image points of one tile of photographs what those of another bring."""
+    """Add the contribution of the image points of one tile of photographs to Y'Q of those of another."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
             for t in range(cut[j, column], cut[j, column + 1]):
@@ -439,7 +452,7 @@ def _add_tile(
 
 @kernel
 def _border_times(observations: Observations, Y_interior: FloatArray, Q: FloatArray, YQ: FloatArray) -> None:
-    """Fill YQ with what the rows Y_interior of the interior unknowns bring; Q their rows, (i, reduced)."""
+    """Fill YQ with the contribution of the interior unknowns; Q has their rows, (i, reduced)."""
     for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
             column = 6 * observations.pose[o]

@@ -1,18 +1,20 @@
-"""The reduced normal matrix factored front by front, where photographs share points with a few others only.
+"""Multifrontal solver: factors the reduced normal matrix front by front, for photographs with few neighbours.
+
+The matrix
 
     S = (A C; C' D)     A: exterior orientation, block by block; D: interior unknowns and kept points
 
-is factored as A = L L' and D - C' A^-1 C. A is never put together: every front (`fronts`) sums what its
-object points add, takes what the fronts before it have left, eliminates its pivots and leaves the
-rest to the next. The motions that the datum leaves open, and any further null vectors, are held by adding 1
-to one diagonal element for each: with g free of the null space these unknowns get dx = 0 and nothing else
-changes, a minimal constraint.
+is factored as A = L L' and D - C' A^-1 C. A is never assembled. Each front (`fronts`) sums the terms of its
+object points, adds the remainders of its children, eliminates its pivots and passes the remainder to its
+parent. The motions that the datum leaves open, and any further null vectors, are held by adding 1 to one
+diagonal element for each. Since g is free of the null space, these unknowns get dx = 0 and nothing else
+changes: a minimal constraint.
 
-Null vectors of a reduced normal matrix that is never put together, by subspace iteration. The matrix with a
-small shift of its diagonal is factored; solving with it again and again brings forward the directions that
-the observations leave open, of which Rayleigh and Ritz's method then takes those with eigenvalue 0. They
-carry the rounding of a factor that is all but singular; one step with the factor in which they are held takes
-them to the rounding of the matrix itself, as its eigenvalue decomposition would.
+Null vectors of a matrix that is never assembled are found by subspace iteration. The matrix is factored with
+a small shift of its diagonal. Repeated solutions amplify the directions that the observations leave open, and
+the Rayleigh-Ritz method selects those with eigenvalue 0. They carry the rounding of an almost singular
+factor. One step with the factor in which they are held reduces it to the rounding of the matrix itself, like
+that of an eigenvalue decomposition.
 
 Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1); Foerstner and
 Wrobel (2016), sec. 15.2.4 and 4.5; Golub and Van Loan (2013), Matrix Computations, sec. 8.2.4 and 8.1;
@@ -35,7 +37,7 @@ from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.normals import Equations, times_schur
 from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
-from sfm.adjustment.engine.solvers.fronts import Front, Fronts, subtract_border
+from sfm.adjustment.engine.solvers.fronts import BYTES, Front, Fronts, subtract_border
 from sfm.adjustment.engine.solvers.multifrontal_factor import EliminatedFront, MultifrontalFactor
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -44,14 +46,14 @@ from sfm.kernels.compiling import kernel
 from sfm.kernels.small_algebra import subtract_pair
 from sfm.kernels.threads import at_once
 
-SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
-STEPS = 12  # of the iteration; each brings null vectors forward by eigenvalue / SHIFT
-FIRST_SOUGHT = 8  # null vectors looked for at first; as often twice as many as all of them are null
-COPIES = 6  # of them at a time: before and after a product or a solution, scaled, orthonormal
+SHIFT = 1e-10  # share of the diagonal added to find null vectors; far above rounding, far below weak ones
+STEPS = 12  # steps of the iteration; each amplifies null vectors by eigenvalue / SHIFT
+FIRST_SOUGHT = 8  # vectors in the first search; their number is doubled while all of them are null
+COPIES = 6  # copies of these vectors at a time: before and after a product or solution, scaled, orthonormal
 
 
 class Border(NamedTuple):
-    """Scaled parts of the reduced normal matrix beside the exterior orientation."""
+    """Scaled parts of the reduced normal matrix outside the exterior orientation."""
 
     C: FloatArray  # (6 m, i + 3 s)
     D: FloatArray  # (i + 3 s, i + 3 s)
@@ -59,31 +61,31 @@ class Border(NamedTuple):
 
 @dataclass(frozen=True)
 class MultifrontalSolver:
-    """The reduced normal matrix as a tree of fronts."""
+    """Solver with the reduced normal matrix as a tree of fronts."""
 
     layout: Unknowns
     fronts: Fronts
 
     @property
     def has_coarse(self) -> bool:
-        """Whether a step on the way takes less time in single precision: never."""
+        """Whether an intermediate step takes less time in single precision: never."""
         return False
 
     @property
     def bytes(self) -> float:
-        """Memory of the factor and its inverse at the peak."""
+        """Peak memory of the factor and its inverse, bytes."""
         layout = self.layout
         return self.fronts.bytes(layout.reduced - layout.pose_free.size, search_bytes(layout))
 
     @cached_property
     def limit(self) -> float:
-        """Memory that may be taken, bytes, asked for once in an adjustment: files state it."""
+        """Memory that may be used, bytes; determined once in an adjustment because it is read from files."""
         return protocol.available_bytes()
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> MultifrontalFactor | None:
-        """Return the factored reduced normal equations; Args: as `Solver.factor`.
+        """Return the factored reduced normal equations; arguments as in `Solver.factor`.
 
         Raises:
             GeometryError: the factor would not fit in memory.
@@ -98,7 +100,7 @@ class MultifrontalSolver:
         factor = self._factored(equations, border, fixed)
         if damped or not (factor is None or factor.weak):
             return factor
-        del factor  # one at a time in memory
+        del factor  # only one factor at a time fits in memory
         shifted = self._factored(equations, border, fixed, shift=SHIFT)
         if shifted is None:
             return self._factored(equations, border, fixed)
@@ -157,10 +159,10 @@ class MultifrontalSolver:
         return factor.with_border(X, corner, weak=weak)
 
     def _eliminate(self, equations: Equations, added: FloatArray) -> list[EliminatedFront] | None:
-        """Return all fronts eliminated, added to the diagonal; None if one is not positive definite."""
+        """Eliminate all fronts, with `added` on the diagonal; None if one is not positive definite."""
         fronts = self.fronts.fronts
         found: list[EliminatedFront | None] = [None] * len(fronts)
-        left: dict[int, FloatArray] = {}  # what fronts leave to their parents
+        left: dict[int, FloatArray] = {}  # remainders for the parents
 
         def eliminate(begin: int, end: int) -> bool:
             space = np.empty(
@@ -169,7 +171,7 @@ class MultifrontalSolver:
             for g in range(begin, end):
                 front = fronts[g]
                 F = self._front(equations, front, added, space)
-                for child in front.children:  # in this order however many threads there are
+                for child in front.children:  # in this order for any number of threads
                     _extend(left.pop(child), fronts[child].into, F)
                 done = _eliminated(F, 6 * front.pivots)
                 if done is None:
@@ -184,7 +186,7 @@ class MultifrontalSolver:
         return [front for front in found if front is not None]
 
     def _front(self, equations: Equations, front: Front, added: FloatArray, space: FloatArray) -> FloatArray:
-        """Return the scaled matrix of a front without what others leave to it, lower triangle, in a space."""
+        """Return the scaled lower triangle of a front without remainders of children, stored in `space`."""
         b, size = equations.blocks, 6 * len(front.photographs)
         F = space[: size**2].reshape(size, size)
         F.fill(0.0)
@@ -194,12 +196,12 @@ class MultifrontalSolver:
             self.fronts.local, scale, F.reshape(-1),
         )  # fmt: skip
         each = np.arange(6 * front.pivots)
-        F[each, each] += equations.damping + added[front.rows[each]]  # the diagonal of U is 1 by its scale
+        F[each, each] += equations.damping + added[front.rows[each]]  # the scaled diagonal of U is 1
         return F
 
 
 def _eliminated(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray] | None:
-    """Return the factor of the first unknowns of a front, and what they leave of the rest."""
+    """Return the factor of the first unknowns of a front, and the remainder of the front."""
     U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
     if info != 0:
         return None
@@ -212,7 +214,7 @@ def _eliminated(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray
 
 
 def _largest(vectors: FloatArray) -> IntArray:
-    """Return as many rows as there are vectors, in which these are as independent as can be."""
+    """Return as many rows as there are vectors, chosen so that the vectors are well separated there."""
     if vectors.shape[1] == 0:
         return np.zeros(0, dtype=np.int64)
     _, _, pivots = qr(vectors.T, mode="economic", pivoting=True)
@@ -230,7 +232,7 @@ def _sum_front(
     scale: FloatArray,
     flat: FloatArray,
 ) -> None:
-    """Fill the lower triangle with U of the pivots less Y Y' of the object points, scaled."""
+    """Fill the lower triangle with U of the pivots minus Y Y' of the object points, scaled."""
     size = len(scale)
     for i in range(len(pivots)):
         for q in range(6):
@@ -249,7 +251,7 @@ def _sum_front(
 
 @kernel
 def _extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
-    """Add the lower triangle of what a front leaves to the front that takes it."""
+    """Add the lower triangle of the remainder of a front to its parent."""
     for i in range(len(into)):
         for k in range(i + 1):
             for q in range(6):
@@ -259,13 +261,13 @@ def _extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
 
 
 def null_vectors(shifted: Factor, equations: Equations, layout: Unknowns, Q: FloatArray) -> FloatArray:
-    """Return null vectors of the scaled matrix that are none of the motions, orthonormal, (reduced, e).
+    """Return null vectors of the scaled matrix other than the motions, orthonormal, (reduced, e).
 
     Args:
-        shifted: its factor with SHIFT added and the motions held.
+        shifted: factor of the matrix with SHIFT added and the motions held.
         equations: normal equations.
         layout: order of the unknowns.
-        Q: the motions, scaled, orthonormal, (reduced, d).
+        Q: motions, scaled and orthonormal, (reduced, d).
     """
     scale = equations.parts.scale[:, None]
     sought = min(FIRST_SOUGHT, len(Q))
@@ -282,32 +284,36 @@ def null_vectors(shifted: Factor, equations: Equations, layout: Unknowns, Q: Flo
 
 
 def search_bytes(layout: Unknowns) -> float:
-    """Return the memory of the null vectors looked for at first, and of the points that they move."""
-    return 8.0 * FIRST_SOUGHT * (3 * len(layout.point_free) + COPIES * layout.reduced)
+    """Return the memory of the first search for null vectors, and of the points that they move, bytes.
+
+    Args:
+        layout: order of the unknowns.
+    """
+    return BYTES * FIRST_SOUGHT * (3 * len(layout.point_free) + COPIES * layout.reduced)
 
 
 def refined(
     vectors: FloatArray, held: Factor, equations: Equations, layout: Unknowns, Q: FloatArray
 ) -> FloatArray:
-    """Return null vectors without what is left of others in them.
+    """Return null vectors after removing remnants of other eigenvectors.
 
     Args:
-        vectors: scaled, orthonormal, (reduced, e).
+        vectors: null vectors, scaled and orthonormal, (reduced, e).
         held: factor of the matrix in which they and the motions are held.
         equations: normal equations.
         layout: order of the unknowns.
-        Q: the motions, scaled, orthonormal, (reduced, d).
+        Q: motions, scaled and orthonormal, (reduced, d).
     """
     scale = equations.parts.scale[:, None]
     return _across(vectors - held.solve(_times(equations, layout, vectors) / scale) / scale, Q)
 
 
 def _across(V: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what is left of V without Q."""
+    """Return an orthonormal basis of the part of V orthogonal to Q."""
     return np.asarray(np.linalg.qr(V - Q @ (Q.T @ V))[0])
 
 
 def _times(equations: Equations, layout: Unknowns, V: FloatArray) -> FloatArray:
-    """Return S V of the scaled, undamped matrix, (reduced, e)."""
+    """Return S V with the scaled, undamped matrix S, (reduced, e)."""
     scale = equations.parts.scale[:, None]
     return scale * times_schur(equations, layout, scale * V)

@@ -1,10 +1,10 @@
-"""The factor of a reduced normal matrix in fronts: solutions, and elements of its inverse.
+"""Factor of a reduced normal matrix in fronts: solutions, and elements of its inverse.
 
-From A = L L' and Z = A^-1 follows, front by front from the last,
+With A = L L', the elements of Z = A^-1 follow front by front, from the last to the first:
 
     Z_RJ = -Z_RR G,   Z_JJ = L_JJ^-T L_JJ^-1 - G' Z_RJ,   G = L_RJ L_JJ^-1
 
-where J are the pivots of a front and R the others, whose Z_RR the front behind it has already.
+J are the pivots of a front and R its other unknowns; Z_RR is already known from the parent.
 
 Source: Takahashi, Fagan and Chin (1973), Formation of a sparse bus impedance matrix; Erisman and Tinney
 (1975), Comm. ACM 18(3); Liu (1992), SIAM Review 34(1); Foerstner and Wrobel (2016), sec. 15.2.5.
@@ -32,16 +32,16 @@ from sfm.kernels.small_algebra import add_product
 
 
 class EliminatedFront(NamedTuple):
-    """Part of the factor left by eliminating the photographs of a front."""
+    """Part of the factor from eliminating the photographs of a front."""
 
-    L: FloatArray  # of the unknowns of the pivots, lower triangle, (j, j)
+    L: FloatArray  # rows of the pivots, lower triangle, (j, j)
     K: FloatArray  # rows of the other unknowns of the front, (r, j)
     weakest: float  # smallest pivot
 
 
 @dataclass(frozen=True)
 class MultifrontalFactor:
-    """Factors of a reduced normal matrix with its null space held."""
+    """Factor of a reduced normal matrix with its null space held."""
 
     layout: Unknowns
     fronts: Fronts
@@ -54,11 +54,17 @@ class MultifrontalFactor:
     weak: bool = False  # whether a pivot is near 0
 
     def with_border(self, X: FloatArray, corner: FloatArray, *, weak: bool) -> MultifrontalFactor:
-        """Return it with what belongs to the unknowns beside the exterior orientation."""
+        """Return the factor completed for the unknowns other than exterior orientation.
+
+        Args:
+            X: A^-1 C, (6 m, i + 3 s).
+            corner: upper factor of D - C' A^-1 C.
+            weak: whether a pivot is near 0.
+        """
         return replace(self, X=X, corner=corner, weak=weak)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""
+        """Return a solution of S x = right for right-hand sides (reduced,) or (reduced, r)."""
         first = len(self.C)
         columns = right if right.ndim == 2 else right[:, None]
         s = self.scale[:, None]
@@ -86,9 +92,9 @@ class MultifrontalFactor:
         return x
 
     def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
-        """Return the elements of the inverse; Args: as `Factor.inverse`.
+        """Return the elements of the inverse; arguments as in `Factor.inverse`.
 
-        With Z = A^-1 within the fronts, X = A^-1 C and Q = (D - C' A^-1 C)^-1 they are those of
+        With Z = A^-1 within the fronts, X = A^-1 C and Q = (D - C' A^-1 C)^-1, the inverse is
         S^-1 = (Z + X Q X'   -X Q; -Q X'   Q).
         """
         b, observations = blocks, self.layout.observations
@@ -97,7 +103,7 @@ class MultifrontalFactor:
         s, sb = scales[:first], scales[first:]
         X = self.X * s[:, None] / self.scale[first:]
         Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
-        Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # as a matrix without elements is, for the kernel
+        Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # the kernel expects this layout
         XQ = X @ Q
         n, most = len(b.y), int(np.diff(observations.start).max())
         core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
@@ -121,7 +127,7 @@ class MultifrontalFactor:
         return Inverse(exterior, -XQ, Q, core, YQ, YQ_border)
 
     def _inverse_fronts(self) -> Iterator[tuple[Front, FloatArray]]:
-        """Yield the fronts from the last on, with their elements of A^-1, scaled."""
+        """Yield the fronts from the last to the first, with their elements of scaled A^-1."""
         fronts = self.fronts.fronts
         waiting = np.bincount([front.parent + 1 for front in fronts], minlength=len(fronts) + 1)[1:]
         kept: dict[int, FloatArray] = {}
@@ -148,7 +154,7 @@ class MultifrontalFactor:
 
 @kernel
 def _pick(Z: FloatArray, into: IntArray, part: AnyArray) -> None:
-    """Copy the elements of some photographs of a front."""
+    """Copy the elements of some photographs of a front to `part`."""
     for i in range(len(into)):
         for q in range(6):
             row, other = Z[6 * into[i] + q], part[6 * i + q]
@@ -175,7 +181,7 @@ def _sum_pairs(
     YQ: FloatArray,
     YQ_border: FloatArray,
 ) -> None:
-    """Fill Y'S^-1 and Y'S^-1 Y of the object points of a front; Z of its photographs, row by row."""
+    """Fill Y'S^-1 and Y'S^-1 Y of the object points of a front; Z of its photographs is row-major."""
     inner = Y_interior.shape[2]
     for j in points:
         begin, end = observations.start[j], observations.start[j + 1]

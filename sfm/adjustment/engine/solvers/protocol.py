@@ -1,7 +1,7 @@
-"""Interface of the solvers of the reduced normal equations, and the memory they may use.
+"""Protocol of the solvers of the reduced normal equations, and the memory that they may use.
 
-The reduced normal matrix S of orientations and kept points is factored once for each step; its factor
-solves for the step and, at the optimum, gives the elements of S^-1 that covariances are made of.
+The reduced normal matrix S of orientations and kept points is factored once for each step. Its factor gives
+the step and, at the optimum, the elements of S^-1 that covariances need.
 """
 
 from __future__ import annotations
@@ -17,35 +17,44 @@ from sfm.adjustment.engine.normals import Equations
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+SHARE = 0.75  # share of the memory; the network, its blocks and other programs need the rest
+UNKNOWN = 8e9  # bytes assumed if the system does not state its memory
+# Memory limits of containers, in bytes (control groups of versions 2 and 1); processes above them are ended
+LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+
 
 @dataclass(frozen=True)
 class Inverse:
-    """Elements of S^-1, in the units of the unknowns, 0 where they are fixed."""
+    """Elements of S^-1 in the units of the unknowns, 0 for fixed unknowns."""
 
-    exterior: FloatArray  # of X0, w of each pose, (poses, 6, 6)
-    mixed: FloatArray  # of poses by border unknowns, (6 poses, i + 3 s)
-    border: FloatArray  # of interior unknowns, mounts and kept points, (i + 3 s, i + 3 s)
+    exterior: FloatArray  # X0, w of each pose, (poses, 6, 6)
+    mixed: FloatArray  # poses x border unknowns, (6 poses, i + 3 s)
+    border: FloatArray  # interior unknowns, mounts and kept points, (i + 3 s, i + 3 s)
     core: FloatArray  # Y'S^-1 Y of each object point, (n, 3, 3)
-    YQ: FloatArray  # Y'S^-1 of the object point by the pose of each image point, (k, 3, 6)
-    YQ_border: FloatArray  # Y'S^-1 of each object point by the border, (n, 3, i + 3 s)
+    YQ: FloatArray  # Y'S^-1 of the object point x the pose of each image point, (k, 3, 6)
+    YQ_border: FloatArray  # Y'S^-1 of each object point x the border, (n, 3, i + 3 s)
 
 
 class Factor(Protocol):
-    """The factored reduced normal matrix, its null space held."""
+    """The factored reduced normal matrix, with its null space held."""
 
     @property
     def further(self) -> FloatArray:
         """Null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)."""
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""
+        """Return a solution of S x = right for right-hand sides (reduced,) or (reduced, r)."""
 
     def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
         """Return the elements of the inverse.
 
         Args:
-            blocks: of the undamped normal equations.
-            cross: whether Y'S^-1 is wanted; empty otherwise.
+            blocks: blocks of the undamped normal equations.
+            cross: whether to compute Y'S^-1; it is empty otherwise.
         """
 
 
@@ -54,11 +63,11 @@ class Solver(Protocol):
 
     @property
     def has_coarse(self) -> bool:
-        """Whether a step on the way takes less time in single precision."""
+        """Whether an intermediate step takes less time in single precision."""
 
     @property
     def bytes(self) -> float:
-        """Memory of the factor and its inverse at the peak, results apart; a second thread takes 0.05 GB."""
+        """Peak memory of factor and inverse without the results, bytes; a second thread takes 0.05 GB."""
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
@@ -67,31 +76,22 @@ class Solver(Protocol):
 
         Args:
             equations: normal equations with object points eliminated.
-            motions: null vectors that the datum explains.
-            damped: whether the equations carry damping, so that no further null vectors are sought.
-            coarse: whether single precision will do, for a step on the way; None if that is too weak.
+            motions: null vectors that are motions, with their datum constraints.
+            damped: whether the equations are damped; then no further null vectors are sought.
+            coarse: whether to use single precision, for an intermediate step; the result is None if a pivot
+                is too weak for it.
         """
 
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
-SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
-UNKNOWN = 8e9  # bytes where the system does not state what it has
-# Limits of containers, in bytes, of control groups of version 2 and 1: beyond it processes are ended
-LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-
-
 def available_bytes() -> float:
-    """Return how much memory normal equations may take."""
+    """Return the memory that normal equations may use, bytes."""
     known = UNKNOWN
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         known = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for file in LIMITS:
         try:
             known = min(known, float(file.read_text(encoding="ascii")))
-        except (OSError, ValueError):  # there is no such file, or it contains "max"
+        except (OSError, ValueError):  # the file does not exist, or contains "max"
             continue
     if resource is not None:  # ulimit -v
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -101,15 +101,15 @@ def available_bytes() -> float:
 
 
 def refuse_what_does_not_fit(size: float, unknowns: str, *, limit: float) -> None:
-    """Refuse normal equations that need more memory than there is.
+    """Refuse normal equations that need more memory than is available.
 
     Args:
-        size: bytes that they, their factor and its inverse take.
-        unknowns: which unknowns need them, in words.
-        limit: what they may take, bytes, see `available_bytes`.
+        size: memory of the equations, their factor and its inverse, bytes.
+        unknowns: description of the unknowns, for the message.
+        limit: memory that may be used, bytes, see `available_bytes`.
 
     Raises:
-        GeometryError: it is more than that.
+        GeometryError: they need more.
     """
     if size > limit:
         raise GeometryError(

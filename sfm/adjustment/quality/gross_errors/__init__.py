@@ -1,1 +1,1 @@
-"""Gross errors among the observations: robust estimation, rejection, and rays that may be wrong."""
+"""Gross errors in the observations: robust estimation and rejection."""

@@ -1,7 +1,8 @@
-"""Rounds of an adjustment with gross errors: which image points take part, and with what weight.
+"""Rounds of an adjustment with gross errors: decides which image points take part, and with what weight.
 
-The optimum of all image points, or of those that a robust start leaves where gross errors bend the network;
-then data snooping or an M-estimator, each round from the optimum of the last one.
+The first optimum is that of all image points. If gross errors distort the network, it is that of the image
+points that a robust start retains. Then data snooping or an M-estimator follows, and each round starts from
+the optimum of the last one.
 
 Source: Pope (1976), NOAA TR NOS 65 NGS 1; Huber and Ronchetti (2009), Robust Statistics, ch. 7.
 """
@@ -34,17 +35,17 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, remark
 
-MAX_ROUNDS = 200  # of data snooping
-MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum show no gross errors
+MAX_ROUNDS = 200  # most rounds of data snooping
+MAX_VAGUE = 5  # rounds without convergence; only residuals at an optimum show gross errors
 ROUND_TOLERANCE = 1e-2  # |A dx| / |v| of a last step after which gross errors can be judged
-# Spread of residuals over that with the start values, above which gross errors bend the network.
+# Ratio of the spread of residuals to that with the start values above which gross errors distort the network.
 MIN_BENT_RATIO = 2.0
-MIN_BENT_RATIO_OF_ONE = 10.0  # the same of one photograph, over the median of all photographs
-FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
-MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they determine no depth
+MIN_BENT_RATIO_OF_ONE = 10.0  # the same for one photograph, relative to the median of all photographs
+FAR_OFF = 100.0  # median residuals; an image point beyond has no influence with any estimator
+MIN_ANGLE_DEG = 0.1  # between two rays of a point: a few pixels of parallax, needed to determine depth
 REWEIGHTINGS = 30
-MAX_VAGUE_WEIGHTS = 2  # reweightings without convergence one after another: more helped none of the 400
-# networks with gross errors of tests.adjustment.test_studies
+MAX_VAGUE_WEIGHTS = 2  # successive reweightings without convergence; more helped in none of the 400 networks
+# with gross errors of tests.adjustment.test_studies
 WEIGHT_TOLERANCE = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
@@ -55,21 +56,21 @@ def find_optimum(
     """Return the optimum and the factor on the weight of each image point, 0 where rejected, (k,).
 
     Args:
-        run: what is adjusted, and how.
-        state: where to start.
+        run: problem and method of the adjustment.
+        state: start values.
         reject: tau | huber | tukey | none.
-        alpha: probability with which the test of one image coordinate rejects a good one.
-        without: image points that data snooping begins without, (k,).
+        alpha: probability that the test of one image coordinate rejects a good one.
+        without: image points that data snooping leaves out at the start, (k,).
 
     Raises:
-        GeometryError: start values whose normal equations cannot be solved.
+        GeometryError: the normal equations of the start values cannot be solved.
     """
     weight = start_weights(run.problem.layout, state)
     if reject == "none":
         return _plain(run, state, weight, without)
     wanted, run.tolerance = run.tolerance, max(run.tolerance, ROUND_TOLERANCE)
     optimum, weight = _sound(run, state, weight, without)
-    run.remarks = ()  # on estimators that only gave a start
+    run.remarks = ()  # remarks on estimators that only provided a start are dropped
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
@@ -85,14 +86,14 @@ def find_optimum(
     if run.tolerance > wanted:
         run.tolerance = wanted
         optimum = run.again(optimum, weight)
-        if not optimum.converged:  # near it undamped steps may go to and fro across a valley
+        if not optimum.converged:  # near the optimum undamped steps may oscillate across a valley
             optimum = run.start(optimum.state, weight)
     return optimum, weight
 
 
 @dataclass
 class Run:
-    """Constants of the rounds of one adjustment, and the steps taken so far."""
+    """Constants of the rounds of one adjustment, and the number of steps so far."""
 
     problem: Problem
     method: str
@@ -100,17 +101,28 @@ class Run:
     tolerance: float
     exact: bool  # whether the factor must belong to the last normal equations
     iterations: int = 0
-    start_vPv: float = float("nan")  # with the first weights at the start values
+    start_vPv: float = float("nan")  # v'Pv at the start values with the first weights
     remarks: tuple[Remark, ...] = ()
 
     def start(self, state: State, weight: FloatArray) -> Optimum:
-        """Return the optimum from start values by the method asked for."""
+        """Return the optimum from start values by the chosen method.
+
+        Args:
+            state: start values.
+            weight: factor on the weight of each image point, (k,).
+        """
         return self._iterate(state, weight, self.method)
 
-    def minimise(
+    def reinstate(
         self, optimum: Optimum, weight: FloatArray, without: BoolArray
     ) -> tuple[Optimum, FloatArray]:
-        """Return the optimum with image points that were behind their camera at the start back in."""
+        """Return the optimum with image points reinstated that were behind the camera only at the start.
+
+        Args:
+            optimum: optimum without them.
+            weight: factor on the weight of each image point there, (k,).
+            without: image points that stay out, (k,).
+        """
         ready = self.problem.layout.active & ~without
         ready &= ~behind_camera(self.problem.layout.observations, optimum.state)
         if (ready & (weight == 0)).any():
@@ -119,11 +131,21 @@ class Run:
         return optimum, weight
 
     def again(self, optimum: Optimum, weight: FloatArray) -> Optimum:
-        """Return the optimum with other weights, from a near one."""
+        """Return the optimum with other weights, starting from a near optimum.
+
+        Args:
+            optimum: near optimum.
+            weight: factor on the weight of each image point, (k,).
+        """
         return self._iterate(optimum.state, weight, "gauss-newton", near=True)
 
     def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
-        """Observations and constraints minus unknowns."""
+        """Return the number of observations and constraints minus unknowns.
+
+        Args:
+            optimum: optimum.
+            weight: factor on the weight of each image point, (k,).
+        """
         held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
         observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
@@ -147,21 +169,21 @@ class Run:
 
 
 def _plain(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
-    """Return the optimum of all image points but those that it is to be without."""
+    """Return the optimum of all image points except those in `without`."""
     weight = np.where(without, 0.0, weight)
-    return run.minimise(run.start(state, weight), weight, without)
+    return run.reinstate(run.start(state, weight), weight, without)
 
 
 def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
-    """Return the optimum from which gross errors are judged: of all image points, unless they bend it.
+    """Return the optimum from which gross errors are judged: of all image points, unless they distort it.
 
-    An error of hundreds of pixels can turn a photograph over or let the principal distance collapse. Then
-    the adjustment does not converge, or most image points, of all or of one photograph, fit worse than with
-    the start values; it is begun again there by Huber's and Tukey's weights, and what Tukey's weigh 0 is left
-    out.
+    An error of hundreds of pixels can turn a photograph over or make the principal distance collapse. Then
+    the adjustment does not converge, or most image points, of all photographs or of one, fit worse than with
+    the start values. In this case the adjustment restarts there with Huber's and Tukey's weights, and image
+    points with a Tukey weight of 0 are left out.
 
     Raises:
-        GeometryError: neither can be solved.
+        GeometryError: neither adjustment can be solved.
     """
     layout = run.problem.layout
 
@@ -187,8 +209,8 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
     begun = begun or optimum_at(run.problem, state, weight)
     if begun is None:
         return optimum, plain
-    # Huber's weights leave an error a bounded influence, which may still turn over a photograph of a few
-    # image points; Tukey's leave none where the start values are good
+    # With Huber's weights an error keeps a bounded influence, which may still turn over a photograph with few
+    # image points. With Tukey's weights it has none if the start values are good.
     for estimators in ((tukey_weights,), (huber_weights, tukey_weights)):
         robust, factor = begun, weight
         try:
@@ -205,10 +227,10 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
 
 
 def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
-    """Return the photographs most of whose image points fit far worse at the end than at the start, (m,).
+    """Return the photographs with most image points fitting far worse at the end than at the start, (m,).
 
-    Worse than before, and than the others: an error in one of six image points bends its photograph alone,
-    and the median over all others does not show it.
+    They must fit worse than before and worse than the others. An error in one of six image points distorts
+    its photograph only, which the median over all photographs does not show.
     """
     observations, active = run.problem.layout.observations, run.problem.layout.active
     before, after = (_median_lengths(observations, at, active) for at in (start, end))
@@ -221,7 +243,7 @@ def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
 def _median_lengths(observations: Observations, state: State, active: BoolArray) -> FloatArray:
     """Return the median length of the residuals of each photograph, in standard deviations, (m,).
 
-    The upper one of two: three of six image points fit any resection.
+    For an even number it is the upper median, because three of six image points fit any resection.
     """
     length = residual_lengths(observations, residuals(observations, state))
     length = np.where(active & np.isfinite(length), length, np.inf)
@@ -237,7 +259,7 @@ def _median_lengths(observations: Observations, state: State, active: BoolArray)
 def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:
     """Return the optimum without the image points that fail Pope's test.
 
-    Ends with the last round that could be solved where the next one cannot.
+    If a round cannot be solved, the previous round is the result.
     """
     layout = run.problem.layout
     returned, vague = np.zeros(len(weight), dtype=bool), 0
@@ -268,7 +290,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             break
         if out.any():
             changed = np.where(out, 0.0, weight)
-        else:  # take back only once nothing large is left
+        else:  # reinstate only when no large residual remains
             changed = np.where(back, 1.0, weight)
             returned |= back
         loose |= _without_angle(run.problem, optimum.state, changed > 0, out | back)
@@ -283,16 +305,16 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
 
 
 def _without_angle(problem: Problem, state: State, used: BoolArray, changed: BoolArray) -> BoolArray:
-    """Return all image points of points whose rays have changed and are almost one, (k,).
+    """Return all image points of points with almost parallel rays after a change, (k,).
 
-    Two photographs from the same place determine no depth: the point would go to infinity, and no step of the
-    others would be taken whole. Known points stay, and so do single rays, which ask for nothing.
+    Two photographs from the same position determine no depth. The point would move to infinity, and the steps
+    of all others would be shortened. Known points stay, and so do single rays, which have no effect.
 
     Args:
-        problem: what is adjusted.
-        state: the unknowns.
+        problem: constants of the adjustment.
+        state: values of all unknowns.
         used: image points that take part, (k,).
-        changed: those that have gone or come back, (k,).
+        changed: image points that were rejected or reinstated, (k,).
     """
     o, count = problem.layout.observations, len(state.points)
     suspect = np.bincount(o.point[changed], minlength=count) > 0
@@ -304,16 +326,16 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     ray = state.points[o.point[rows]] - state.position[o.image[rows]]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     first = np.zeros((count, 3))
-    first[o.point[rows]] = ray  # one of them
+    first[o.point[rows]] = ray  # one ray of each point
     apart, rays = np.zeros(count), np.bincount(o.point[rows], minlength=count)
     np.maximum.at(apart, o.point[rows], np.linalg.norm(ray - first[o.point[rows]], axis=1))
     return np.asarray((suspect & (rays > 1) & (apart < np.radians(MIN_ANGLE_DEG)))[o.point])
 
 
 def _bending(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
-    """Return the image points that a robust start has left out and that lie far off, (k,).
+    """Return the image points that a robust start left out and that have very large residuals, (k,).
 
-    They bend their photograph even with the bounded influence that Huber's weights leave them.
+    They distort their photograph even with the bounded influence of Huber's weights.
     """
     layout = run.problem.layout
     length = residual_lengths(layout.observations, residuals(layout.observations, optimum.state))
@@ -328,13 +350,13 @@ def _reweight(
     *,
     out: BoolArray | None = None,
 ) -> tuple[Optimum, FloatArray]:
-    """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round.
+    """Return the optimum of an M-estimator by reweighting, with a new scale from the median in each round.
 
     Args:
-        run: what is adjusted, and how.
-        optimum: where to start.
+        run: problem and method of the adjustment.
+        optimum: optimum to start from.
         weight: factor on the weight of each image point there, (k,).
-        weights: of the estimator.
+        weights: weight function of the estimator.
         out: image points that take no part, (k,).
     """
     layout = run.problem.layout

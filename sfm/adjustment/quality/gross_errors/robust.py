@@ -1,20 +1,20 @@
 """Gross errors: iterative data snooping by Pope's tau with reinstatement, Huber's and Tukey's M-estimators.
 
-Data snooping takes out, round by round, the image points of the largest tau above the critical value:
-the largest of all, and with it others whose photograph and object point hold no larger one, so that
-none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
-the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
-largest, and further rays of an object point that has lost one go one after another in the same round
-(`rays_of_points`). A rejected point is taken back when it would clearly pass the test in the adjustment.
+**Data snooping** (`snoop`) rejects, round by round, the image points with the largest tau above the critical
+value. It rejects the largest of all, and others whose photograph and object point contain no larger one. So
+no image point is judged beside a larger error. In a photograph with many image points, an error affects the
+residuals of the others only by its leverage, a few hundredths of it. There all image points are rejected
+whose tau is not much smaller than the largest. A rejected image point is reinstated (`would_pass`) when it
+would clearly pass the test in the adjustment.
 
-Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
-beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
-has many minima, and both take their scale from the median of the residuals.
+**Several wrong rays of one object point** (`further_rays`) are rejected one after another in the same round.
+A rejected ray changes the residuals of the other rays of its point strongly. It changes all other residuals
+only by its leverage on a photograph. With fixed cameras, the cofactors of the residuals of a point's rays are
+I - B V^-1 B'. Residuals and cofactors after a rejection follow from those before, without an adjustment.
 
-Several wrong rays of one object point, taken out one after another from one adjustment. A ray that leaves
-moves the residuals of the other rays of its point much, and those of all else by its leverage on a photograph
-only. With the cameras fixed the cofactors of the residuals of a point's rays are I - B V^-1 B', and residuals
-and cofactors after a ray has left follow from those before, without another adjustment.
+**M-estimators.** Huber's estimator bounds the influence of an image point. Tukey's biweight reduces it to
+nothing: beyond TUKEY standard deviations an image point has weight 0. Tukey's starts from Huber's, because
+its sum has many minima. Both take their scale from the median of the residuals.
 
 Source: Pope (1976), NOAA TR NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier testing; Huber
 and Ronchetti (2009), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for the
@@ -34,24 +34,24 @@ from sfm.adjustment.quality.statistics import standardised_residuals, tau_critic
 from sfm.adjustment.result import MIN_SIGMA_PX, ROUNDING
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
-MIN_RAYS = 3  # of a point, of which residuals show the wrong one
-# Over the image points of a photograph: share by which the photograph may change a standardised residual,
-# about three times its six unknowns over two coordinates each
+MIN_RAYS = 3  # fewest rays of a point whose residuals can show the wrong ray
+# Divided by the number of image points of a photograph: the share by which the photograph may change a
+# standardised residual, about three times its six unknowns over two coordinates per image point
 INFLUENCE = 8.0
-MIN_REDUNDANCY = 1e-6  # of a ray in the direction that the others check less, over the other
+MIN_REDUNDANCY = 1e-6  # smallest redundancy of a ray in its less checked direction, relative to the other
 
-# In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
-# in the plane (for a single coordinate they would be 1.345 and 4.685).
+# In sigmas of a coordinate, for the length of a residual vector. Both are 95 % efficient with normal errors
+# in the plane; for a single coordinate they would be 1.345 and 4.685.
 HUBER = 1.501
 TUKEY = 5.123
-# In a photograph of n image points an error moves the residual of another by about 6 / (2 n) of itself, at
-# most some times that: beside MIN_CROWDED_POINTS points one of BESIDE_FRACTION of the largest tau is a
-# separate error.
+# In a photograph with n image points an error changes the residual of another image point by about 6 / (2 n)
+# of itself, or at most a few times that. So from MIN_CROWDED_POINTS image points on, one with BESIDE_FRACTION
+# of the largest tau is a separate error.
 MIN_CROWDED_POINTS = 60
 BESIDE_FRACTION = 0.4
-# Of the critical value: a rejected one returns below, since at it rounds turn in circles.
+# Share of the critical value below which an image point is reinstated; with 1 the rounds would never end.
 RETURN_FRACTION = 0.99
-MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
+MIN_FREEDOM = 0.05  # redundancy over observations, at least, so that there is a scale without redundancy
 
 
 def snoop(
@@ -65,17 +65,17 @@ def snoop(
     sigma0: float,
     critical: float,
 ) -> BoolArray:
-    """Return which image points to take out in one round, (k,).
+    """Return which image points to reject in one round, (k,).
 
     Args:
         observations: image points.
-        state: the unknowns.
-        residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
+        state: values of all unknowns.
+        residuals: v of all image points, predicted for rejected ones, px, shape (k, 2).
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
-        limiting: cofactors of each object point with the cameras fixed, shape (n, 3, 3).
+        limiting: cofactors of each object point with fixed cameras, shape (n, 3, 3).
         used: image points in the adjustment, shape (k,).
-        sigma0: of the adjustment, at least the rounding of image points.
-        critical: value of tau that the test of one image coordinate does not let pass.
+        sigma0: sigma0 of the adjustment, at least the rounding of image points.
+        critical: critical value of tau in the test of one image coordinate.
     """
     w = np.abs(standardised_residuals(residuals, complement, observations.whitening)).max(axis=1)
     w = np.where(np.isfinite(w), w, np.inf)
@@ -95,9 +95,10 @@ def snoop(
 def sum_of_squares(
     observations: Observations, residuals: FloatArray, complement: FloatArray, used: BoolArray
 ) -> tuple[float, float]:
-    """Return v'Pv and redundancy of the image points in an adjustment, by themselves.
+    """Return v'Pv and redundancy of the image points alone in an adjustment.
 
-    Other observations, whose standard deviations are stated by a person, say nothing of their noise.
+    Other observations have standard deviations stated by the user, which say nothing about the noise of image
+    points.
 
     Args:
         observations: image points.
@@ -106,7 +107,7 @@ def sum_of_squares(
         used: image points in the adjustment, (k,).
     """
     v = np.einsum("kab,kb->ka", whitening_matrix(observations.whitening[used]), residuals[used])
-    of_each = np.einsum("kaa->k", complement[used])  # between 0 and 2, but for what rounding leaves of it
+    of_each = np.einsum("kaa->k", complement[used])  # between 0 and 2 except for rounding
     return float((v**2).sum()), float(np.clip(of_each, 0.0, 2.0).sum())
 
 
@@ -122,17 +123,18 @@ def would_pass(
 ) -> BoolArray:
     """Return which rejected image points would clearly pass the test if each were in the adjustment, (k,).
 
-    Whitened, with H = A Q A' without the image point: its residual (I + H)^-1 l from the predicted one l, the
-    cofactor (I + H)^-1 of that, and l' (I + H)^-1 l more in the sum of squares.
+    In whitened form, H = A Q A' without the image point, and l is its predicted residual. In the adjustment
+    its residual would be (I + H)^-1 l with the cofactor (I + H)^-1. The sum of squares would grow by
+    l' (I + H)^-1 l.
 
     Args:
         observations: image points.
-        residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
-        complement: whitened cofactors of the residuals, I + H of rejected ones, shape (k, 2, 2).
+        residuals: v of all image points, predicted for rejected ones, px, shape (k, 2).
+        complement: whitened cofactors of the residuals, I + H for rejected ones, shape (k, 2, 2).
         used: image points in the adjustment, shape (k,).
         vPv: weighted sum of squares of the image points in the adjustment, see `sum_of_squares`.
-        redundancy: of the same.
-        alpha: probability with which the test of one image coordinate rejects a good one.
+        redundancy: redundancy of these image points.
+        alpha: probability that the test of one image coordinate rejects a good one.
 
     Source: Cook and Weisberg (1982), Residuals and Influence in Regression, sec. 2.2.3.
     """
@@ -140,8 +142,8 @@ def would_pass(
         ~used & np.isfinite(residuals).all(axis=1) & np.isfinite(complement).all(axis=(1, 2))
     )
     F = whitening_matrix(observations.whitening[rows])
-    # No eigenvalue of I + H is below 1, but rounding leaves nothing of one beside that of a ray without which
-    # its point has no place along the other.
+    # No eigenvalue of I + H is below 1. But next to the huge eigenvalue of a ray that its point needs,
+    # rounding destroys the other one.
     values, vectors = np.linalg.eigh(complement[rows])
     cofactor = np.asarray(vectors / np.maximum(values, 1.0)[:, None] @ vectors.transpose(0, 2, 1))
     predicted = np.einsum("kab,kb->ka", F, residuals[rows])
@@ -156,13 +158,13 @@ def would_pass(
 
 
 def rounding_of(observations: Observations) -> float:
-    """Return what rounding makes of a residual, in standard deviations: below it nothing can be tested."""
+    """Return the effect of rounding on a residual, in standard deviations; below it nothing can be tested."""
     size = float(np.abs(observations.xy).max(initial=0.0))
     return max(ROUNDING * size * float(observations.whitening[:, 0].max(initial=0.0)), np.finfo(float).tiny)
 
 
 def least_sigma(observations: Observations) -> float:
-    """Return MIN_SIGMA_PX in stated standard deviations; residuals below it show no gross error."""
+    """Return MIN_SIGMA_PX in stated standard deviations; residuals below it do not reveal gross errors."""
     return MIN_SIGMA_PX * float(observations.whitening[:, 0].max(initial=0.0))
 
 
@@ -191,12 +193,12 @@ def tukey_weights(observations: Observations, residuals: FloatArray, *, sigma0: 
 
 
 def huber_slopes(weight: FloatArray) -> FloatArray:
-    """Return the derivatives of psi(v) = w(|v|) v along v and across it, from Huber's weights, (k, 2)."""
+    """Return the derivatives of psi(v) = w(|v|) v along and across v, from Huber's weights, (k, 2)."""
     return np.stack([np.where(weight < 1.0, 0.0, 1.0), weight], axis=1)
 
 
 def tukey_slopes(weight: FloatArray) -> FloatArray:
-    """Return the derivatives of psi(v) = w(|v|) v along v and across it, from Tukey's weights, (k, 2)."""
+    """Return the derivatives of psi(v) = w(|v|) v along and across v, from Tukey's weights, (k, 2)."""
     root = np.sqrt(weight)  # 1 - (|v| / TUKEY)^2
     return np.stack([root * (5.0 * root - 4.0), weight], axis=1)
 
@@ -211,20 +213,20 @@ def inflation(
     count: int,
     redundancy: float,
 ) -> float:
-    """Return by what to multiply sqrt(v'Pv / r) for the standard deviations of an M-estimator.
+    """Return the factor on sqrt(v'Pv / r) that gives the standard deviations of an M-estimator.
 
-    Its covariance is K^2 [sum psi^2 / r] / [mean psi']^2 (X'X)^-1, K = 1 + (u / n) var psi' / [mean psi']^2,
-    while v'Pv / r belongs to the cofactors (X'WX)^-1, which are (X'X)^-1 over the mean weight. It is
-    asymptotic: standard deviations are about 2 % too small where the redundancy is 3/4 of the observations,
-    and 3 % (Huber) to 8 % (Tukey) where it is 0.4 to 0.6 of them.
+    Its covariance is K^2 [sum psi^2 / r] / [mean psi']^2 (X'X)^-1, K = 1 + (u / n) var psi' / [mean psi']^2.
+    In contrast, v'Pv / r belongs to the cofactors (X'WX)^-1, which are (X'X)^-1 over the mean weight. The
+    formula is asymptotic. Standard deviations are about 2 % too small if the redundancy is 3/4 of the
+    observations, and 3 % (Huber) to 8 % (Tukey) if it is 0.4 to 0.6 of them.
 
     Args:
         observations: image points.
         residuals: v, px, shape (k, 2).
-        weight: of the estimator at its end, shape (k,).
+        weight: final weights of the estimator, shape (k,).
         slopes: psi' along and across the residual, shape (k, 2).
-        vPv: sum of squares of all observations with these weights; those that are no image points have 1.
-        count: n, scalar observations of weight above 0.
+        vPv: sum of squares of all observations with these weights; other observations have weight 1.
+        count: n, number of scalar observations with a weight above 0.
         redundancy: r = n - u.
 
     Source: Huber and Ronchetti (2009), Robust Statistics, sec. 7.6, here for vectors in the plane.
@@ -245,13 +247,13 @@ def robust_scale(
 ) -> float:
     """Return the standard deviation of unit weight from the median of the residuals.
 
-    Half of the image points may be wrong before it is.
+    It tolerates gross errors in up to half of the image points.
 
     Args:
         observations: image points.
         residuals: v, px, shape (k, 2).
         used: image points that can take part, shape (k,).
-        freedom: redundancy over observations, by which residuals are smaller than errors.
+        freedom: redundancy over observations; residuals are smaller than errors by its square root.
 
     Source: Hampel (1974), J. Am. Stat. Assoc. 69, for the median absolute deviation.
     """
@@ -263,7 +265,12 @@ def robust_scale(
 
 
 def residual_lengths(observations: Observations, residuals: FloatArray) -> FloatArray:
-    """Return the lengths of the residuals in their standard deviations, infinite behind the camera, (k,)."""
+    """Return the lengths of the residuals in standard deviations, infinite behind the camera, (k,).
+
+    Args:
+        observations: image points.
+        residuals: v, px, shape (k, 2).
+    """
     a, b, c = observations.whitening.T
     length = np.hypot(a * residuals[:, 0], b * residuals[:, 0] + c * residuals[:, 1])
     return np.where(np.isfinite(length), length, np.inf)
@@ -280,19 +287,19 @@ def further_rays(
     *,
     least: FloatArray,
 ) -> BoolArray:
-    """Return the rays of points that lose one to take out with it, as if one left after another, (k,).
+    """Return further rays to reject from object points that lose a ray, one after another, (k,).
 
-    A point ends with a ray that is its worst and may not leave, or not plainly the worst.
+    For a point this ends when its worst ray may not be rejected, or is not clearly the worst.
 
     Args:
         observations: image points, ordered by object point.
-        state: the unknowns.
+        state: values of all unknowns.
         v: residuals of all image points, px, shape (k, 2).
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
-        limiting: cofactors of each object point with the cameras fixed, shape (n, 3, 3).
+        limiting: cofactors of each object point with fixed cameras, shape (n, 3, 3).
         used: image points in the adjustment, shape (k,).
-        out: those that leave it first, shape (k,).
-        least: standardised residual above which image points of each photograph may leave, shape (m,).
+        out: image points that are rejected first, shape (k,).
+        least: standardised residual above which image points of each photograph may be rejected, shape (m,).
     """
     further = np.zeros(len(used), dtype=bool)
     count = np.bincount(observations.image[used], minlength=len(least))
@@ -325,15 +332,15 @@ def further_rays(
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays of one point, whitened."""
+    """Whitened rays of one point."""
 
     e: FloatArray  # residuals, (r, 2)
-    Q: FloatArray  # their cofactors, (r, 2, 2)
+    Q: FloatArray  # cofactors of the residuals, (r, 2, 2)
     B: FloatArray  # derivatives by the point, (r, 2, 3)
-    C: FloatArray  # cofactors of the point, (3, 3): -B C B' are those of two residuals
+    C: FloatArray  # cofactors of the point, (3, 3); -B C B' are the cofactors between residuals
 
     def without(self, a: int) -> _Rays:
-        """Return what is left when one of them leaves; its place means nothing afterwards."""
+        """Return the rays after rejecting one; its own values are meaningless afterwards."""
         with_a = -self.B @ self.C @ self.B[a].T
         weight = np.linalg.pinv(self.Q[a], rcond=MIN_REDUNDANCY, hermitian=True)
         gain = with_a @ weight
@@ -347,9 +354,9 @@ class _Rays:
 
 
 def _by_points(observations: Observations, state: State, v: FloatArray, limiting: FloatArray) -> FloatArray:
-    """Return the derivatives of the image points by their object point, px over unit, (k, 2, 3).
+    """Return the derivatives of image points by their object point, px per object unit, (k, 2, 3).
 
-    By differences over the standard deviation of the point, within which image points move in proportion.
+    They are differences over the standard deviation of the point, a range in which the projection is linear.
     """
     h = np.sqrt(np.maximum(np.trace(limiting, axis1=1, axis2=2), 0.0))
     B = np.zeros((len(v), 2, 3))
@@ -357,7 +364,7 @@ def _by_points(observations: Observations, state: State, v: FloatArray, limiting
         moved = state.points.copy()
         moved[:, p] += h
         step = moved[:, p] - state.points[:, p]
-        free = (step != 0)[observations.point]  # a point that is held has no cofactors to multiply
+        free = (step != 0)[observations.point]  # a held point has no cofactors
         difference = residuals(observations, state._replace(points=moved)) - v
         B[free, :, p] = difference[free] / step[observations.point[free], None]
     return B
