@@ -1,7 +1,7 @@
-"""Kinds of observations beside image points, one class each; `kind` has what they share.
+"""Kinds of observations other than image points, one class each; `kind` contains their base classes.
 
 A kind that a survey gives as a table is one class and one row of TABLES. The adjustment, its tests and
-variance components, the survey file, the tables and the reports take everything they need from there.
+variance components, the survey file, the tables and the reports get everything they need from the class.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sfm.observations.point_pairs import (
 from sfm.observations.pose import AntennaPositions, RelativeOrientations
 from sfm.observations.rigid_frames import RigidFrames
 
-TABLES: dict[str, type[TableKind]] = {  # by the word of the survey file
+TABLES: dict[str, type[TableKind]] = {  # by the name used in the survey file
     "distance": Distances,
     "distance with additive constant": OffsetDistances,
     "height difference": HeightDifferences,

@@ -1,4 +1,4 @@
-"""Values known beforehand: control points, interior orientation and lengths of scale bars."""
+"""Given values: control points, interior orientation and lengths of scale bars."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ObjectPoints(Kind):
-    """Object points whose coordinates are known beforehand (control)."""
+    """Object points with given coordinates (control)."""
 
     name: ClassVar[str] = "control points"
     single: ClassVar[str] = "control point"
@@ -24,15 +24,14 @@ class ObjectPoints(Kind):
 
     point: IntArray = field(default_factory=no_index)  # index of the point, (n,)
     xyz: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # object unit, (n, 3)
-    covariance: FloatArray = field(
-        default_factory=lambda: np.zeros((0, 3, 3))
-    )  # object unit^2; variance 0 = fixed, infinite = not known, (n, 3, 3)
+    # object unit^2; variance 0 = fixed, infinite = unknown, (n, 3, 3)
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
     def __len__(self) -> int:
         return len(self.point)
 
     def covariances(self) -> FloatArray:
-        """Return the covariance of each, (n, d, d)."""
+        """Return the covariance of each point, (n, 3, 3)."""
         return self.covariance
 
     @property
@@ -42,19 +41,19 @@ class ObjectPoints(Kind):
 
     @property
     def complete(self) -> ObjectPoints:
-        """Those of which all three coordinates are known."""
+        """The points with all three coordinates known."""
         return self.select(np.isfinite(np.einsum("nii->ni", self.covariance)).all(axis=1))
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other coordinates."""
+        """Return the points with other coordinates, (n, 3)."""
         return replace(self, xyz=values)
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return the points."""
+        """Return the block of the points."""
         return (Block(POINT, self.point),)
 
     def linearise(self, values: Values) -> Linear:
-        """Return X - observed, and the unit matrix."""
+        """Return X - observed, and the unit matrix as derivative."""
         J = np.broadcast_to(np.eye(3), (len(self), 3, 3))
         return Linear(values.points[self.point] - self.xyz, (J,))
 
@@ -67,21 +66,21 @@ class ObjectPoints(Kind):
         return ((length_unit,) * 3,) * len(self)
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the points."""
+        """Return the points selected by a mask or indices."""
         return replace(self, point=self.point[rows], xyz=self.xyz[rows], covariance=self.covariance[rows])
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the points at other places."""
+        """Return the points with new indices."""
         return replace(self, point=points[self.point])
 
     def shifted(self, by: FloatArray) -> Self:
-        """Return them with a shift added to all coordinates."""
+        """Return the points with a shift added to all coordinates, object unit, (3,)."""
         return replace(self, xyz=self.xyz + by)
 
 
 @dataclass(frozen=True)
 class InteriorObservations(Kind):
-    """Parameters of interior orientation known beforehand, as from a calibration certificate."""
+    """Given parameters of interior orientation, for example from a calibration certificate."""
 
     name: ClassVar[str] = "interior orientation"
     single: ClassVar[str] = "interior orientation"
@@ -91,7 +90,7 @@ class InteriorObservations(Kind):
     parameter: IntArray = field(default_factory=no_index)  # index among the camera's names, (p,)
     value: FloatArray = field(default_factory=no_value)  # in the parameter's unit, (p,)
     sigma: FloatArray = field(default_factory=no_value)  # in the parameter's unit, (p,)
-    correlation: FloatArray | None = None  # of all of them together; independent where not given, (p, p)
+    correlation: FloatArray | None = None  # correlation of all parameters; independent if not given, (p, p)
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -106,20 +105,20 @@ class InteriorObservations(Kind):
         return self.value[:, None]
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other values."""
+        """Return the parameters with other values, (p, 1)."""
         return replace(self, value=values[:, 0])
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return the parameters."""
+        """Return the block of the parameters."""
         return (Block(PARAMETER, np.stack([self.camera, self.parameter], axis=1)),)
 
     def linearise(self, values: Values) -> Linear:
-        """Return parameter minus observed, and 1."""
+        """Return parameter minus observed, and 1 as derivative."""
         difference = values.parameters[self.camera, self.parameter] - self.value
         return Linear(difference[:, None], (np.ones((len(self), 1, 1)),))
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return "c of camera A"."""
+        """Return names such as "c of camera A"."""
         pairs = [(estimate.cameras[a], s) for a, s in zip(self.camera, self.parameter, strict=True)]
         return tuple(f"{camera.names[s]} of camera {camera.owner_of(s)}" for camera, s in pairs)
 
@@ -129,7 +128,7 @@ class InteriorObservations(Kind):
         return tuple((estimate.cameras[a].units[s],) for a, s in pairs)
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the parameters."""
+        """Return the parameters selected by a mask or indices."""
         R = self.correlation
         return replace(
             self,
@@ -141,13 +140,13 @@ class InteriorObservations(Kind):
         )
 
     def weight_of_all(self) -> FloatArray | None:
-        """Return the inverse of the covariance of all of them, (p, p); None where they are independent."""
+        """Return the inverse covariance of all parameters, (p, p); None if they are independent."""
         if self.correlation is None:
             return None
         return np.asarray(np.linalg.inv(self.correlation) / np.outer(self.sigma, self.sigma))
 
     def weight_of(self, rows: IntArray) -> FloatArray:
-        """Return the inverse of the covariance of some of the values, (r, r)."""
+        """Return the inverse covariance of the parameters in some rows, (r, r)."""
         some = self.select(rows)
         together = some.weight_of_all()
         return np.diag(1 / some.sigma**2) if together is None else together
@@ -187,11 +186,11 @@ class ScaleBars(Kind):
         return replace(self, sigma=sigma)
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return both ends."""
+        """Return the blocks of both ends."""
         return Block(POINT, self.start), Block(POINT, self.end)
 
     def linearise(self, values: Values) -> Linear:
-        """Return |X2 - X1| - length, and the direction between them."""
+        """Return |X2 - X1| - length, and the directions between the ends as derivatives."""
         d = values.points[self.end] - values.points[self.start]
         length = np.linalg.norm(d, axis=1)
         direction = (d / np.maximum(length, np.finfo(float).tiny)[:, None])[:, None]
@@ -207,7 +206,7 @@ class ScaleBars(Kind):
         return ((length_unit,),) * len(self)
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the bars."""
+        """Return the bars selected by a mask or indices."""
         return replace(
             self,
             start=self.start[rows],
@@ -217,5 +216,5 @@ class ScaleBars(Kind):
         )
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the points at other places."""
+        """Return the bars with new indices of their points."""
         return replace(self, start=points[self.start], end=points[self.end])

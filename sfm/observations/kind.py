@@ -1,12 +1,12 @@
-"""Kinds of observations beside image points: single ones, and groups with common parameters.
+"""Base classes of the kinds of observations other than image points: single observations and groups.
 
-A kind is one class in one file of this package. The adjustment takes from it what its normal equations,
-redundancy numbers, tests and variance components need; the report takes its names and units.
+A kind is one class in this package. The adjustment gets from it the input of its normal equations, redundancy
+numbers, tests and variance components; the report gets its names and units.
 
-Observations of a group of points with parameters of the group: planes, lines, frames, directions. The
-parameters of a group are found anew from its points whenever the observations are linearised, and do not
-appear among the unknowns: with their derivatives H and the weight W, the derivatives by the points are (I - H
-(H'W H)^-1 H'W) Jx, which leaves minimum and covariance as they are with the parameters among them.
+The observations of a `Group` share parameters: planes, lines, frames, directions. These parameters are
+computed from the points of the group at each linearisation, and are not among the unknowns. With their
+derivatives H and the weight W, the derivatives by the points are (I - H (H'W H)^-1 H'W) Jx. The minimum and
+the covariance are the same as with the parameters among the unknowns.
 
 Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least squares);
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.6 (elimination of groups of
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 NO_PARAMETERS = np.zeros(0)
-SINGULAR = 1e-9  # eigenvalue of the group's scaled normal equations below which a parameter is open
-POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # sorts of unknowns
+SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of a group below which a parameter is open
+POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # types of unknowns
 
 
 def no_index() -> IntArray:
-    """Return indices of nothing, (0,)."""
+    """Return an empty array of indices, (0,)."""
     return np.zeros(0, dtype=np.int64)
 
 
 def no_value() -> FloatArray:
-    """Return values of nothing, (0,)."""
+    """Return an empty array of values, (0,)."""
     return np.zeros(0)
 
 
@@ -55,7 +55,7 @@ class Values(Protocol):
 
     @property
     def M(self) -> FloatArray:  # noqa: N802
-        """Object to image axes of each photograph, (m, 3, 3)."""
+        """Rotation from object axes to image axes of each photograph, (m, 3, 3)."""
 
     @property
     def parameters(self) -> FloatArray:
@@ -67,38 +67,38 @@ class Values(Protocol):
 
     @property
     def camera_from_rig(self) -> FloatArray:
-        """Axes of the rig to those of each camera, (a, 3, 3)."""
+        """Rotation from rig axes to the image axes of each camera, (a, 3, 3)."""
 
 
 class Block(NamedTuple):
-    """Unknowns of one sort, one for each observation."""
+    """Unknowns of one type, one set for each observation."""
 
     of: str  # POINT: X, 3 unknowns | PHOTOGRAPH: X0, w, 6 | MOUNT: of a camera, 6 | PARAMETER: of a camera, 1
     at: IntArray  # index of the point, photograph or camera, (n,); of camera and parameter, (n, 2)
 
 
 class Linear(NamedTuple):
-    """Observations at some values of the unknowns."""
+    """Linearised observations at given values of the unknowns."""
 
     difference: FloatArray  # computed minus observed, (n, d)
     J: tuple[FloatArray, ...]  # derivatives by the unknowns of each block, (n, d, 1, 3 or 6)
-    taken: FloatArray | None = None  # of cofactors by parameters that are not among the unknowns, (n, d, d)
+    taken: FloatArray | None = None  # cofactors due to parameters that are not among the unknowns, (n, d, d)
 
 
 class Kind(ABC):
-    """Observations of one kind: n of them, of d components each."""
+    """Observations of one kind: n observations with d components each."""
 
     name: ClassVar[str]  # "scale bars"
     single: ClassVar[str]  # "scale bar"
     components: ClassVar[tuple[str, ...]]  # names of the d components
-    needs_scale: ClassVar[bool] = False  # whether they mean nothing where the scale of the network is open
+    needs_scale: ClassVar[bool] = False  # whether they are meaningless if the scale of the network is open
 
     @abstractmethod
     def __len__(self) -> int: ...
 
     @abstractmethod
     def covariances(self) -> FloatArray:
-        """Return that of the components of each; 0 = fixed, infinite = not observed, (n, d, d)."""
+        """Return the covariance of each; variance 0 = fixed, infinite = not observed, (n, d, d)."""
 
     @property
     @abstractmethod
@@ -111,11 +111,11 @@ class Kind(ABC):
 
     @abstractmethod
     def linearise(self, values: Values) -> Linear:
-        """Return computed minus observed and the derivatives at some values of the unknowns."""
+        """Return computed minus observed and the derivatives at given values of the unknowns."""
 
     @abstractmethod
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return what each observation is called in tables, (n,)."""
+        """Return the name of each observation in tables, (n,)."""
 
     @abstractmethod
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
@@ -123,18 +123,18 @@ class Kind(ABC):
 
     @abstractmethod
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the observations."""
+        """Return the observations selected by a mask or indices."""
 
     @abstractmethod
     def with_values(self, values: FloatArray) -> Self:
         """Return the observations with other observed values, (n, d)."""
 
     def simulated(self, values: Values, rng: np.random.Generator | None = None) -> Self:
-        """Return the observations that values of the unknowns give, with errors as stated.
+        """Return simulated observations for given values of the unknowns, with the stated errors.
 
         Args:
-            values: taken as true.
-            rng: source of the errors, normally distributed with the covariance stated; no errors if None.
+            values: true values.
+            rng: source of the errors, normally distributed with the stated covariance; no errors if None.
         """
         if not len(self):
             return self
@@ -144,12 +144,16 @@ class Kind(ABC):
     def displaced(self, values: Values, rng: np.random.Generator) -> FloatArray:
         """Return object points with the errors of observations that have no values, (n, 3).
 
-        A wire is straight; what is on it only nearly are the points.
+        For example, a wire is straight, and it is the points that deviate from it.
+
+        Args:
+            values: true values.
+            rng: source of the errors.
         """
         return values.points
 
     def draw_errors(self, rng: np.random.Generator) -> FloatArray:
-        """Return errors of the components, normally distributed; 0 where fixed or not observed, (n, d)."""
+        """Return normally distributed errors of the components; 0 where fixed or not observed, (n, d)."""
         P = self.weight_of_all()
         C = self.covariances() if P is None else np.linalg.inv(P)[None]
         variance = np.diagonal(C, axis1=1, axis2=2)
@@ -160,35 +164,35 @@ class Kind(ABC):
         return np.asarray(sigma * np.einsum("nab,nb->na", vectors, normal)).reshape(self.values.shape)
 
     def met(self, values: Values) -> FloatArray:
-        """Return object points that meet the observations, near those of values, (n, 3).
+        """Return object points that fulfil the observations exactly, near the given values, (n, 3).
 
-        There the effect of a motion of the network on observations is asked for: offsets of nothing from a
-        line would have its errors determine the scale.
+        The effect of motions of the network on observations is computed there. Otherwise the errors of points
+        on a line, with observed offsets of 0, would seem to determine the scale.
         """
         return values.points
 
     def labels(self, network: Network) -> tuple[str, ...]:
-        """Return what the components are called in tables, (d,)."""
+        """Return the names of the components in tables, (d,)."""
         return self.components
 
     def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return the names of what can leave alone, as a wrong observation does, (q,)."""
+        """Return the names of parts that can be left out separately, such as a wrong observation, (q,)."""
         return tuple(f"{self.single} {name}" for name in self.names(network, estimate))
 
     def part_of(self, row: int, component: int) -> int:
-        """Return the part that a component of an observation belongs to."""
+        """Return the index of the part to which a component of an observation belongs."""
         return row
 
     def select_parts(self, on: BoolArray) -> Self:
-        """Return the observations of some parts, (q,)."""
+        """Return the observations of the parts selected by a mask, (q,)."""
         return self.select(on)
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the observations as they would be without a common mistake, by what the mistake is."""
+        """Return the observations corrected for common mistakes, by the name of the mistake."""
         return {}
 
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the observations of some points (n,) and photographs (m,) alone."""
+        """Return the observations that involve only the points (n,) and photographs (m,) to keep."""
         on = np.ones(len(self), dtype=bool)
         for of, at in self.blocks():
             if of in (POINT, PHOTOGRAPH):
@@ -196,20 +200,20 @@ class Kind(ABC):
         return self.select(on)
 
     def weight_of_all(self) -> FloatArray | None:
-        """Return the weight matrix of all components, (n d, n d); None where it is block diagonal."""
+        """Return the weight matrix of all components, (n d, n d); None if it is block diagonal."""
         return None
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return the observations of a network with its points and photographs at other places.
+        """Return the observations with new indices of points and photographs.
 
         Args:
-            points: place of each object point, (n,).
-            images: place of each photograph, (m,); the same as before if None.
+            points: new index of each object point, (n,).
+            images: new index of each photograph, (m,); unchanged if None.
         """
         return self
 
     def shifted(self, by: FloatArray) -> Self:
-        """Return the observations for coordinates with a shift added, object unit, (3,)."""
+        """Return the observations after a shift of all coordinates, object unit, (3,)."""
         return self
 
 
@@ -217,18 +221,18 @@ class TableKind(Kind):
     """A kind that a survey gives as a table: names, then values, then their standard deviations."""
 
     texts: ClassVar[tuple[str, ...]]  # columns of names
-    texts_of: ClassVar[str] = POINT  # what they name: POINT or PHOTOGRAPH
+    texts_of: ClassVar[str] = POINT  # type of the named things: POINT or PHOTOGRAPH
     numbers: ClassVar[tuple[str, ...]] = ()  # columns of numbers without a standard deviation
-    angles: ClassVar[tuple[str, ...]] = ()  # components that are angles: rad, and degrees in tables
+    angles: ClassVar[tuple[str, ...]] = ()  # components that are angles: rad, but degrees in tables
 
-    sigma: FloatArray  # of each component, object unit or rad, (n, d); of groups (r, c)
+    sigma: FloatArray  # standard deviation of each component, object unit or rad, (n, d); groups: (r, c)
 
     @abstractmethod
     def with_sigma(self, sigma: FloatArray) -> Self:
-        """Return the observations with other standard deviations."""
+        """Return the observations with other standard deviations, of the shape of `sigma`."""
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the observations in other units, and what a kind knows besides."""
+        """Return the observations in other units; some kinds add further mistakes."""
         turned = np.array([name in self.angles for name in self.components])
         units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048} if not turned.all() else {}
         found: dict[str, Self] = {}
@@ -246,23 +250,23 @@ class TableKind(Kind):
 
     @classmethod
     def in_tables(cls) -> FloatArray:
-        """Return the factor of each component from rad to degrees, 1 for lengths, (d,)."""
+        """Return the factor from rad to degrees for each component, 1 for lengths, (d,)."""
         return np.array([np.degrees(1.0) if name in cls.angles else 1.0 for name in cls.components])
 
     @abstractmethod
     def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
-        """Return the observations as a table has them: `texts`, then `columns`."""
+        """Return the rows of the table of the observations: `texts`, then `columns`."""
 
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
-        """Return the unit of each component: that of lengths, or rad."""
+        """Return the unit of each component: the length unit, or rad."""
         return (tuple("rad" if name in self.angles else length_unit for name in self.components),) * len(self)
 
 
 class RowKind(TableKind):
-    """A kind of table of which each row is an observation."""
+    """A kind of table in which each row is an observation."""
 
     def covariances(self) -> FloatArray:
-        """Return the covariance of each, (n, d, d)."""
+        """Return the covariance of each observation, (n, d, d)."""
         return np.eye(self.sigma.shape[1]) * self.sigma[:, None] ** 2
 
     @property
@@ -271,7 +275,7 @@ class RowKind(TableKind):
         return np.zeros((len(self), 0))
 
     def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
-        """Return the observations as a table has them."""
+        """Return the rows of the table of the observations."""
         names = [
             [(network.images if of == PHOTOGRAPH else network.points)[i] for i in at]
             for of, at in self.blocks()
@@ -286,7 +290,7 @@ class RowKind(TableKind):
         """Return the observations of a table.
 
         Args:
-            indices: of the photographs or points of each column of names, (n,) each.
+            indices: indices of the photographs or points in each column of names, (n,) each.
             value: `numbers` and values, object unit or rad, (n, q + d).
             sigma: standard deviations of the values, (n, d).
         """
@@ -298,7 +302,7 @@ def is_observed(variance: FloatArray) -> BoolArray:
 
 
 def inverse_of_observed(covariance: FloatArray) -> FloatArray:
-    """Return inverse covariances over the observed components only, 0 elsewhere, (n, d, d)."""
+    """Return the inverse covariances of the observed components, 0 elsewhere, (n, d, d)."""
     weight = np.zeros(covariance.shape)
     for p, Q in enumerate(covariance):
         on = is_observed(np.diagonal(Q))
@@ -307,43 +311,43 @@ def inverse_of_observed(covariance: FloatArray) -> FloatArray:
 
 
 class Fit(NamedTuple):
-    """A group at some values of its points, with the parameters of the group fitted."""
+    """A group at given coordinates of its points, with the parameters of the group fitted."""
 
     difference: FloatArray  # computed minus observed, (r, c)
     Jx: FloatArray  # derivatives by the points, (r, c, p, 3)
     H: FloatArray  # derivatives by the parameters of the group, (r, c, h)
-    parameters: FloatArray = NO_PARAMETERS  # their values, where they are reported, (h,)
+    parameters: FloatArray = NO_PARAMETERS  # values of the parameters if they are reported, (h,)
 
 
 class OwnParameters(NamedTuple):
-    """Parameters of a group at some values of its points."""
+    """Parameters of a group at given coordinates of its points."""
 
     value: FloatArray  # object unit or rad, (h,)
-    cofactor: FloatArray  # were the points without error, (h, h)
+    cofactor: FloatArray  # cofactors for points without error, (h, h)
     J: FloatArray  # derivatives by the points, (h, p, 3)
 
 
 @dataclass(frozen=True)
 class Group(TableKind):
-    """Observations of one group: r of them, of c components each, by p points."""
+    """Observations of one group: r observations with c components each, on p points."""
 
     texts: ClassVar[tuple[str, ...]] = ("group", "point")
-    labelled: ClassVar[bool] = True  # whether the first of these names the group alone, and no point
-    least: ClassVar[int]  # points that a group needs to be of use
+    labelled: ClassVar[bool] = True  # whether the first column names the group rather than a point
+    least: ClassVar[int]  # smallest number of points of a useful group
 
     group: str
     point: IntArray  # indices of the points, (p,)
-    value: FloatArray  # one row for each observation, (r, c)
+    value: FloatArray  # value of each observation, (r, c)
     sigma: FloatArray  # (r, c)
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """Names of the parameters that a survey is made to find, (h,)."""
+        """Names of the parameters that are results of a survey, (h,)."""
         return ()
 
     @abstractmethod
     def fit(self, X: FloatArray) -> Fit:
-        """Return the observations at coordinates of the points, (p, 3)."""
+        """Return the observations at given coordinates of the points, (p, 3)."""
 
     def __len__(self) -> int:
         return int(len(self.point) >= self.least)
@@ -354,7 +358,7 @@ class Group(TableKind):
         return 1 / self.sigma.ravel() ** 2
 
     def covariances(self) -> FloatArray:
-        """Return that of all components together, (1, r c, r c)."""
+        """Return the joint covariance of all components, (1, r c, r c)."""
         return np.diag(self.sigma.ravel() ** 2)[None][: len(self)]
 
     @property
@@ -367,15 +371,15 @@ class Group(TableKind):
         return replace(self, value=values.reshape(self.value.shape))
 
     def with_sigma(self, sigma: FloatArray) -> Self:
-        """Return them with other standard deviations."""
+        """Return the group with other standard deviations, (r, c)."""
         return replace(self, sigma=sigma)
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return the points, each a block."""
+        """Return the points, one block each."""
         return tuple(Block(POINT, self.point[k : k + 1][: len(self)]) for k in range(len(self.point)))
 
     def linearise(self, values: Values) -> Linear:
-        """Return computed minus observed and the derivatives, the parameters of the group fitted."""
+        """Return computed minus observed and the derivatives, with the parameters of the group fitted."""
         fit = self.fit(values.points[self.point])
         d = fit.difference.size
         Jx, H = fit.Jx.reshape(d, -1, 3), fit.H.reshape(d, -1)
@@ -386,7 +390,7 @@ class Group(TableKind):
         return Linear(fit.difference.reshape(1, d), blocks, (HQ @ H.T)[None])
 
     def own_parameters(self, values: Values) -> OwnParameters:
-        """Return the parameters named `reported`: h = -(H'W H)^-1 H'W Jx dX about these values."""
+        """Return the parameters named in `reported`: h = -(H'W H)^-1 H'W Jx dX about these values."""
         fit = self.fit(values.points[self.point])
         H = fit.H.reshape(self.sigma.size, -1)
         HW = H.T * self.weights
@@ -404,75 +408,75 @@ class Group(TableKind):
         return (of_row * len(self.sigma),)[: len(self)]
 
     def labels(self, network: Network) -> tuple[str, ...]:
-        """Return what each component of the group is called, (r c,)."""
+        """Return the name of each component of the group, (r c,)."""
         several = len(self.components) > 1
         return tuple(
             f"{row} {part}" if several else row for row in self.rows(network) for part in self.components
         )
 
     def rows(self, network: Network) -> tuple[str, ...]:
-        """Return what the observations of the group are called, (r,)."""
+        """Return the names of the observations of the group, (r,)."""
         return tuple(" - ".join(names) for names in self.row_points(network))
 
     def row_points(self, network: Network) -> list[tuple[str, ...]]:
-        """Return the names of the points of each observation, as columns of a table have them, (r,)."""
+        """Return the names of the points of each observation, in the order of the table columns, (r,)."""
         return [(network.points[j],) for j in self.point[len(self.point) - len(self.value) :]]
 
     def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
-        """Return the observations as a table has them."""
+        """Return the rows of the table of the observations."""
         factor, group = self.in_tables(), self.group if self.labelled else network.points[self.point[0]]
         numbers = np.hstack([factor * self.value, factor * self.sigma])[:, -len(self.columns()) :]
         rows = zip(self.row_points(network), numbers.tolist(), strict=True)
         return [(group, *names, *values) for names, values in rows]
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return the group, or nothing of it."""
+        """Return the group if it is selected, otherwise an empty group."""
         if np.asarray(rows).size and (np.asarray(rows).dtype != bool or np.asarray(rows).any()):
             return self
         return replace(self, point=self.point[:0], value=self.value[:0], sigma=self.sigma[:0])
 
     def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
-        """Return the names of the rows: "plane wall: 7", (r,)."""
+        """Return the names of the rows, such as "plane wall: 7", (r,)."""
         return tuple(f"{self.single} {self.group}: {row}" for row in self.rows(network))
 
     def part_of(self, row: int, component: int) -> int:
-        """Return the row of a component."""
+        """Return the row to which a component belongs."""
         return component // len(self.components)
 
     def select_parts(self, on: BoolArray) -> Self:
-        """Return some of the rows, (r,)."""
+        """Return the group with the rows selected by a mask, (r,)."""
         stations = len(self.point) - len(self.value)
         point = np.concatenate([self.point[:stations], self.point[stations:][on]])
         return replace(self, point=point, value=self.value[on], sigma=self.sigma[on])
 
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the group with some points alone; nothing where too few are left."""
+        """Return the group with the points to keep; it has length 0 if too few remain."""
         on = points[self.point]
         stations = len(on) - len(self.value)
         return self.select_parts(on[stations:] & on[:stations].all())
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return the group with its points at other places."""
+        """Return the group with new indices of its points."""
         return replace(self, point=points[self.point])
 
     @classmethod
     def of_group(
         cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
-        """Return the observations of one group of a table, its rows in order.
+        """Return the observations of one group of a table, with its rows in order.
 
         Args:
-            group: its name.
+            group: name of the group.
             points: indices of the points of each row, (r, columns of points).
-            value: object unit or rad, (r, c).
+            value: values, object unit or rad, (r, c).
             sigma: standard deviations, (r, c).
-            number: of each point of the network, by name.
+            number: index of each point of the network, by name.
         """
         return cls(group, points[:, 0], value, sigma)
 
 
 def inverse_of_determined(N: FloatArray) -> FloatArray:
-    """Return the inverse of the group's normal equations over the determined parameters, (h, h)."""
+    """Return the inverse of the normal equations of a group in its determined directions, (h, h)."""
     scale = 1 / np.sqrt(np.maximum(np.diagonal(N), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(N * scale[:, None] * scale)
     on = values > SINGULAR

@@ -22,8 +22,8 @@ class Pairs(RowKind):
 
     texts: ClassVar[tuple[str, ...]] = ("from", "to")
 
-    start: IntArray  # index of the first one, (n,)
-    end: IntArray  # index of the second one, (n,)
+    start: IntArray  # index of the first point or photograph, (n,)
+    end: IntArray  # index of the second point or photograph, (n,)
     value: FloatArray  # object unit or rad, (n, d)
     sigma: FloatArray  # (n, d)
 
@@ -36,15 +36,15 @@ class Pairs(RowKind):
         return self.value
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other observed values."""
+        """Return the observations with other observed values, (n, d)."""
         return replace(self, value=values)
 
     def with_sigma(self, sigma: FloatArray) -> Self:
-        """Return them with other standard deviations."""
+        """Return the observations with other standard deviations, (n, d)."""
         return replace(self, sigma=sigma)
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return both ends."""
+        """Return the blocks of both ends."""
         return Block(self.texts_of, self.start), Block(self.texts_of, self.end)
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ class Pairs(RowKind):
         return tuple(f"{of[i]} - {of[j]}" for i, j in zip(self.start, self.end, strict=True))
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the observations."""
+        """Return the observations selected by a mask or indices."""
         return replace(
             self,
             start=self.start[rows],
@@ -63,7 +63,7 @@ class Pairs(RowKind):
         )
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with their ends at other places."""
+        """Return the observations with new indices of their ends."""
         place = points if self.texts_of == POINT else images
         return self if place is None else replace(self, start=place[self.start], end=place[self.end])
 
@@ -97,14 +97,14 @@ class Distances(PointPairs):
 
     @classmethod
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return |d|, and its direction."""
+        """Return |d|, and the direction of d as derivative."""
         length = np.linalg.norm(d, axis=1, keepdims=True)
         return length, (d / np.maximum(length, np.finfo(float).tiny))[:, None]
 
 
 @dataclass(frozen=True)
 class OffsetDistances(Group):
-    """Slope distances that are all longer than the true ones by the same unknown constant."""
+    """Slope distances of an instrument, all too long by the same unknown constant."""
 
     name: ClassVar[str] = "distances with additive constant"
     single: ClassVar[str] = "distances with additive constant"
@@ -112,7 +112,7 @@ class OffsetDistances(Group):
     texts: ClassVar[tuple[str, ...]] = ("instrument", "from", "to")
     least: ClassVar[int] = 3  # two distances
 
-    ends: IntArray  # of each distance, which of the points, (r, 2)
+    ends: IntArray  # indices, in `point`, of both ends of each distance, (r, 2)
 
     @property
     def reported(self) -> tuple[str, ...]:
@@ -120,7 +120,7 @@ class OffsetDistances(Group):
         return ("additive constant",)
 
     def fit(self, X: FloatArray) -> Fit:
-        """Return |X2 - X1| plus the constant less the distances; H by the constant."""
+        """Return |X2 - X1| plus the constant minus the distances, with derivatives H by the constant."""
         d = X[self.ends[:, 1]] - X[self.ends[:, 0]]
         length = np.maximum(np.linalg.norm(d, axis=1), np.finfo(float).tiny)
         away, w, row = length - self.value[:, 0], self.weights, np.arange(len(d))
@@ -131,9 +131,10 @@ class OffsetDistances(Group):
         return Fit((away + constant)[:, None], Jx, np.ones((len(d), 1, 1)), np.array([constant]))
 
     def simulated(self, values: Values, rng: np.random.Generator | None = None) -> Self:
-        """Return the distances of an instrument with the constant that these have; 0 where they are all 0.
+        """Return simulated distances with the same constant; the constant is 0 if all distances are 0.
 
-        Distances of a plan are not measured yet: zeros do not state that the constant takes off the lengths.
+        Planned distances are not measured yet, and their zeros do not mean that the constant cancels the
+        lengths.
         """
         one = self
         if not self.value.any():
@@ -147,11 +148,11 @@ class OffsetDistances(Group):
         return [(names[i], names[j]) for i, j in self.ends]
 
     def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the distances between some points alone."""
+        """Return the distances between points to keep."""
         return self.select_parts(np.logical_and(*points[self.point[self.ends]].T))
 
     def select_parts(self, on: BoolArray) -> Self:
-        """Return some of the distances, with the points that they are between, (r,)."""
+        """Return the distances selected by a mask (r,), with their end points."""
         used, ends = np.unique(self.ends[on], return_inverse=True)
         part = replace(self, point=self.point[used], ends=ends.reshape(-1, 2))
         return replace(part, value=self.value[on], sigma=self.sigma[on])
@@ -174,7 +175,7 @@ class HeightDifferences(PointPairs):
 
     @classmethod
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return dZ, and the direction of Z."""
+        """Return dZ, and the direction of Z as derivative."""
         return d[:, 2:], np.broadcast_to(np.array([0.0, 0.0, 1.0]), (len(d), 1, 3))
 
     def mistakes(self) -> Mapping[str, Self]:
@@ -191,7 +192,7 @@ class CoordinateDifferences(PointPairs):
 
     @classmethod
     def computed(cls, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return d, and the unit matrix."""
+        """Return d, and the unit matrix as derivative."""
         return d, np.broadcast_to(np.eye(3), (len(d), 3, 3))
 
     def mistakes(self) -> Mapping[str, Self]:
@@ -200,7 +201,7 @@ class CoordinateDifferences(PointPairs):
 
 
 class HorizontalDirections(Group):
-    """Directions in X, Y from one object point to others, clockwise as instruments count; Z is up."""
+    """Directions in X, Y from one object point to others, clockwise as instruments count, with Z up."""
 
     name: ClassVar[str] = "horizontal directions"
     single: ClassVar[str] = "horizontal direction"
@@ -211,7 +212,7 @@ class HorizontalDirections(Group):
     least: ClassVar[int] = 3  # the station and two targets
 
     def fit(self, X: FloatArray) -> Fit:
-        """Return atan2(dX, dY) less orientation and direction; H by the orientation."""
+        """Return atan2(dX, dY) minus orientation and direction, with derivatives H by the orientation."""
         d = X[1:, :2] - X[0, :2]
         square = np.maximum((d**2).sum(axis=1), np.finfo(float).tiny)
         away = np.arctan2(d[:, 0], d[:, 1]) - self.value[:, 0]
@@ -226,14 +227,14 @@ class HorizontalDirections(Group):
         return Fit(l[:, None], Jx, -np.ones((len(d), 1, 1)))
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the directions counted the other way round."""
+        """Return the directions counted counter-clockwise."""
         return {**super().mistakes(), "counter-clockwise": replace(self, value=-self.value)}
 
     @classmethod
     def of_group(
         cls, group: str, points: IntArray, value: FloatArray, sigma: FloatArray, number: Mapping[str, int]
     ) -> Self:
-        """Return the directions from a station, whose point comes before those of its targets."""
+        """Return the directions from a station; its point precedes those of the targets."""
         return cls(group, np.concatenate([[number[group]], points[:, 0]]), value, sigma)
 
 

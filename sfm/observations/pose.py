@@ -1,4 +1,4 @@
-"""Position and angles known beforehand: of photographs, mounts, photograph pairs and antennas."""
+"""Given positions and angles of photographs, mounts, photograph pairs and antennas."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from sfm.observations.point_pairs import Pairs
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
-MIN_COS_PHI = 1e-8  # nearer to +-90 deg omega and kappa have no separate sigmas
+MIN_COS_PHI = 1e-8  # closer to +-90 deg, omega and kappa have no separate sigmas
 
 
 class PoseObservations(Kind):
-    """Positions and angles of n things known beforehand; a kind adds the index of each."""
+    """Given positions and angles of n photographs or mounts; a derived class adds their indices."""
 
     position: FloatArray  # X0, object unit, (n, 3)
     angles: FloatArray  # omega, phi, kappa, rad, (n, 3)
-    covariance: FloatArray  # of both; variance 0 = fixed, infinite = not observed, (n, 6, 6)
+    covariance: FloatArray  # position and angles; variance 0 = fixed, infinite = not observed, (n, 6, 6)
 
     @abstractmethod
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return X0, (n, 3), and the rotations into the image axes, (n, 3, 3), at some values."""
+        """Return X0, (n, 3), and the rotations to image axes, (n, 3, 3), at given values."""
 
     def __len__(self) -> int:
         return len(self.position)
 
     def covariances(self) -> FloatArray:
-        """Return the covariance of each, (n, 6, 6)."""
+        """Return the covariance of each observation, (n, 6, 6)."""
         return self.covariance
 
     @property
@@ -43,14 +43,14 @@ class PoseObservations(Kind):
         return np.hstack([self.position, self.angles])
 
     def linearise(self, values: Values) -> Linear:
-        """Return X0, omega, phi, kappa minus those observed, and the derivatives by X0, w."""
+        """Return X0, omega, phi, kappa minus the observed ones, and the derivatives by X0, w."""
         position, M = self.poses(values)
         angles = angles_from_rotation(np.swapaxes(M, 1, 2)) - self.angles
         turned = (angles + np.pi) % (2 * np.pi) - np.pi
         return Linear(np.hstack([position - self.position, turned]), (exterior_jacobian(M),))
 
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
-        """Return the unit of lengths, and rad."""
+        """Return the length unit, and rad."""
         return ((length_unit,) * 3 + ("rad",) * 3,) * len(self)
 
 
@@ -61,7 +61,7 @@ def angle_jacobian(M: FloatArray) -> FloatArray:
         M: object to image axes, shape (m, 3, 3).
 
     Returns:
-        Derivatives, shape (m, 3, 3); huge where phi is near +-90 deg and omega is not separable.
+        Derivatives, shape (m, 3, 3); huge if phi is near +-90 deg, where omega is not separable.
     """
     _, phi, kappa = np.moveaxis(angles_from_rotation(np.swapaxes(M, 1, 2)), -1, 0)
     sk, ck = np.sin(kappa), np.cos(kappa)
@@ -75,7 +75,11 @@ def angle_jacobian(M: FloatArray) -> FloatArray:
 
 
 def exterior_jacobian(M: FloatArray) -> FloatArray:
-    """Return d (X0, omega, phi, kappa) / d (X0, w), see `angle_jacobian`, (m, 6, 6)."""
+    """Return d (X0, omega, phi, kappa) / d (X0, w), see `angle_jacobian`, (m, 6, 6).
+
+    Args:
+        M: object to image axes, shape (m, 3, 3).
+    """
     J = np.zeros((len(M), 6, 6))
     J[:, :3, :3] = np.eye(3)
     J[:, 3:, 3:] = angle_jacobian(M)
@@ -84,12 +88,12 @@ def exterior_jacobian(M: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class OfPhotographs(Kind):
-    """What is observed of single photographs."""
+    """Observations of single photographs."""
 
     image: IntArray  # index of the photograph, (n,)
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return the photographs."""
+        """Return the block of the photographs."""
         return (Block(PHOTOGRAPH, self.image),)
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
@@ -97,13 +101,13 @@ class OfPhotographs(Kind):
         return tuple(network.images[i] for i in self.image)
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
-        """Return them with the photographs at other places."""
+        """Return the observations with new indices of the photographs."""
         return self if images is None else replace(self, image=images[self.image])
 
 
 @dataclass(frozen=True)
 class ExteriorObservations(OfPhotographs, PoseObservations):
-    """Exterior orientation known beforehand (satellite positions, a calibrated rig)."""
+    """Given exterior orientation (satellite positions, a calibrated rig)."""
 
     name: ClassVar[str] = "exterior orientation"
     single: ClassVar[str] = "photograph"
@@ -112,12 +116,11 @@ class ExteriorObservations(OfPhotographs, PoseObservations):
     image: IntArray = field(default_factory=no_index)  # index of the photograph, (e,)
     position: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # X0, object unit, (e, 3)
     angles: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # omega, phi, kappa, rad, (e, 3)
-    covariance: FloatArray = field(
-        default_factory=lambda: np.zeros((0, 6, 6))
-    )  # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
+    # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other positions and angles."""
+        """Return the observations with other positions and angles, (e, 6)."""
         return replace(self, position=values[:, :3], angles=values[:, 3:])
 
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -125,7 +128,7 @@ class ExteriorObservations(OfPhotographs, PoseObservations):
         return values.position[self.image], values.M[self.image]
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the photographs."""
+        """Return the observations selected by a mask or indices."""
         return replace(
             self,
             image=self.image[rows],
@@ -135,13 +138,13 @@ class ExteriorObservations(OfPhotographs, PoseObservations):
         )
 
     def shifted(self, by: FloatArray) -> Self:
-        """Return them with a shift added to all projection centres."""
+        """Return the observations with a shift added to all projection centres, object unit, (3,)."""
         return replace(self, position=self.position + by)
 
 
 @dataclass(frozen=True)
 class MountObservations(PoseObservations):
-    """Mounts of the cameras of a rig known beforehand, as from an earlier calibration."""
+    """Given mounts of the cameras of a rig, for example from an earlier calibration."""
 
     name: ClassVar[str] = "mounts"
     single: ClassVar[str] = "mount"
@@ -149,19 +152,19 @@ class MountObservations(PoseObservations):
 
     camera: IntArray  # index of the camera, (c,)
     position: FloatArray  # projection centre in the axes of the rig, object unit, (c, 3)
-    angles: FloatArray  # omega, phi, kappa of image axes to those of the rig, rad, (c, 3)
-    covariance: FloatArray  # of both; infinite = not observed, (c, 6, 6)
+    angles: FloatArray  # omega, phi, kappa from image axes to rig axes, rad, (c, 3)
+    covariance: FloatArray  # position and angles; infinite = not observed, (c, 6, 6)
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other positions and angles."""
+        """Return the mounts with other positions and angles, (c, 6)."""
         return replace(self, position=values[:, :3], angles=values[:, 3:])
 
     def blocks(self) -> tuple[Block, ...]:
-        """Return the mounts."""
+        """Return the block of the mounts."""
         return (Block(MOUNT, self.camera),)
 
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return the projection centres, (c, 3), and axes of the rig to image axes, (c, 3, 3)."""
+        """Return the projection centres, (c, 3), and the rotations from rig axes to image axes, (c, 3, 3)."""
         return values.mount_position[self.camera], values.camera_from_rig[self.camera]
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
@@ -169,12 +172,12 @@ class MountObservations(PoseObservations):
         return tuple(estimate.cameras[a].name for a in self.camera)
 
     def of_cameras(self, on: BoolArray) -> Self:
-        """Return the mounts of some cameras, counted anew, (a,)."""
+        """Return the mounts of the cameras selected by a mask (a,), with new camera indices."""
         kept = self.select(on[self.camera])
         return replace(kept, camera=(np.cumsum(on) - 1)[kept.camera])
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the mounts."""
+        """Return the mounts selected by a mask or indices."""
         return replace(
             self,
             camera=self.camera[rows],
@@ -194,10 +197,10 @@ class RelativeOrientations(Pairs):
     texts_of: ClassVar[str] = PHOTOGRAPH
 
     def linearise(self, values: Values) -> Linear:
-        """Return t = M1 (X2 - X1) and the angles of M1 R2, less those observed.
+        """Return t = M1 (X2 - X1) and the angles of M1 R2, minus the observed values.
 
-        With R <- R exp([w]x) the derivatives of t are -M1, [t]x by X1, w1 and M1, 0 by X2, w2; the second
-        photograph turns by w2 - R2' R1 w1 in the axes of the first.
+        With R <- R exp([w]x) the derivatives of t are -M1, [t]x by X1, w1 and M1, 0 by X2, w2. The rotation
+        M1 R2 changes by the small rotation w2 - R2' R1 w1.
         """
         M1, M2 = values.M[self.start], values.M[self.end]
         t = np.einsum("nab,nb->na", M1, values.position[self.end] - values.position[self.start])
@@ -217,7 +220,7 @@ class RelativeOrientations(Pairs):
 
 @dataclass(frozen=True)
 class AntennaPositions(OfPhotographs, RowKind):
-    """Positions of an antenna that is mounted on the camera."""
+    """Positions of an antenna mounted on the camera."""
 
     name: ClassVar[str] = "antenna positions"
     single: ClassVar[str] = "antenna position"
@@ -226,7 +229,7 @@ class AntennaPositions(OfPhotographs, RowKind):
     texts_of: ClassVar[str] = PHOTOGRAPH
     numbers: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
 
-    lever: FloatArray  # the antenna in image axes from the projection centre, object unit, (n, 3)
+    lever: FloatArray  # from the projection centre to the antenna, image axes, object unit, (n, 3)
     position: FloatArray  # X, Y, Z of the antenna, object unit, (n, 3)
     sigma: FloatArray  # object unit, (n, 3)
 
@@ -244,11 +247,11 @@ class AntennaPositions(OfPhotographs, RowKind):
         return self.lever
 
     def with_values(self, values: FloatArray) -> Self:
-        """Return them with other positions."""
+        """Return the observations with other positions, (n, 3)."""
         return replace(self, position=values)
 
     def with_sigma(self, sigma: FloatArray) -> Self:
-        """Return them with other standard deviations."""
+        """Return the observations with other standard deviations, (n, 3)."""
         return replace(self, sigma=sigma)
 
     def linearise(self, values: Values) -> Linear:
@@ -259,7 +262,7 @@ class AntennaPositions(OfPhotographs, RowKind):
         return Linear(computed - self.position, (np.concatenate([unit, -R @ skew(self.lever)], axis=2),))
 
     def select(self, rows: IntArray | BoolArray) -> Self:
-        """Return some of the positions."""
+        """Return the positions selected by a mask or indices."""
         return replace(
             self,
             image=self.image[rows],
@@ -269,10 +272,10 @@ class AntennaPositions(OfPhotographs, RowKind):
         )
 
     def shifted(self, by: FloatArray) -> Self:
-        """Return them with a shift added to all positions."""
+        """Return the observations with a shift added to all positions, object unit, (3,)."""
         return replace(self, position=self.position + by)
 
     @classmethod
     def of_table(cls, indices: tuple[IntArray, ...], value: FloatArray, sigma: FloatArray) -> Self:
-        """Return the observations of a table; the lever arms come before the values."""
+        """Return the observations of a table; the lever arms precede the values."""
         return cls(indices[0], value[:, :3], value[:, 3:], sigma)

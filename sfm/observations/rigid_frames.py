@@ -1,4 +1,4 @@
-"""Points that are rigid to one another: bars of several targets, scale crosses, probes, frames."""
+"""Rigid frames: points in fixed relation, such as bars with several targets, scale crosses, and probes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sfm.observations.kind import Fit, Group, OwnParameters, Values, inverse_of_
 if TYPE_CHECKING:
     from sfm.network import Network
 
-ON_LINE = 1e-6  # of the largest singular value, below which a turn does not change coordinates given
+ON_LINE = 1e-6  # share of the largest singular value below which a rotation does not change given coordinates
 
 
 @dataclass(frozen=True)
 class RigidFrames(Group):
-    """Coordinates of points in a local system, known up to a motion of it.
+    """Coordinates of points in a local system, known up to a rigid motion.
 
-    Points of the frame that no photograph shows, as the tip of a probe, are parameters: they add nothing to
-    the adjustment, and follow from the motion of the frame.
+    Points of the frame that no photograph shows, such as the tip of a probe, are parameters. They add nothing
+    to the adjustment, and follow from the motion of the frame.
     """
 
     name: ClassVar[str] = "rigid frames"
@@ -32,26 +32,26 @@ class RigidFrames(Group):
     least: ClassVar[int] = 2
 
     hidden: tuple[str, ...] = ()  # names of points that no photograph shows, (q,)
-    hidden_value: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # in the local system, (q, 3)
+    hidden_value: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # local coordinates, (q, 3)
     hidden_sigma: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (q, 3)
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """The coordinates of points that no photograph shows."""
+        """Names of the coordinates of points that no photograph shows."""
         return tuple(f"{name} {axis}" for name in self.hidden for axis in self.components)
 
     def own_parameters(self, values: Values) -> OwnParameters:
-        """Return the points that no photograph shows: R l + t, and what errors of the motion do to them.
+        """Return the points that no photograph shows, R l + t, with the effect of errors of the motion.
 
-        Of points on a line the turn about it is not determined, nor are points beside it: their cofactors
-        are infinite.
+        If the visible points lie on a line, the rotation about it is not determined, and neither are hidden
+        points off the line. Their cofactors are infinite.
         """
         X, W = values.points[self.point], self.weights
         R, t = self._fitted(X)
         local = (X - t) @ R
         H = self._by_motion(local)[0].reshape(len(W), -1)
         Q = inverse_of_determined((H.T * W) @ H)
-        by_motion = -Q @ (H.T * W) @ np.kron(np.eye(len(X)), R.T)  # of d(local) = R' dX
+        by_motion = -Q @ (H.T * W) @ np.kron(np.eye(len(X)), R.T)  # derivatives of d(local) = R' dX
         arm = self.hidden_value - self.value.mean(axis=0)
         A = np.concatenate([np.broadcast_to(R, (len(arm), 3, 3)), -R @ skew(arm)], axis=2).reshape(-1, 6)
         alone = R @ (self.hidden_sigma[:, :, None] ** 2 * R.T)
@@ -63,13 +63,13 @@ class RigidFrames(Group):
         return OwnParameters((self.hidden_value @ R.T + t).ravel(), cofactor, J)
 
     def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
-        """Return the coordinates as a table has them, those of points that no photograph shows last."""
+        """Return the rows of the table of coordinates, with points that no photograph shows last."""
         numbers = np.hstack([self.hidden_value, self.hidden_sigma]).tolist()
         rows = zip(self.hidden, numbers, strict=True)
         return [*super().table_rows(network), *((self.group, name, *values) for name, values in rows)]
 
     def fit(self, X: FloatArray) -> Fit:
-        """Return R'(X - t) - observed of the best motion R, t; H by it."""
+        """Return R'(X - t) - observed for the best motion R, t, with derivatives H by the motion."""
         R, t = self._fitted(X)
         local = (X - t) @ R
         H, about = self._by_motion(local)
@@ -78,10 +78,10 @@ class RigidFrames(Group):
         return Fit(local - self.value, self._without(about, Jx), self._without(about, H))
 
     def _fitted(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the motion R, t by which the frame fits its points best: X near R local + t."""
+        """Return the motion R, t that fits the frame to its points best: X near R local + t."""
         W = self.weights.reshape(-1, 3)
         R, t = _motion(self.value, X, W.mean(axis=1))
-        for _ in range(5):  # to the weights of single coordinates
+        for _ in range(5):  # iterations with the weights of single coordinates
             local = (X - t) @ R
             H, _ = self._by_motion(local)
             root = np.sqrt(W)
@@ -94,14 +94,14 @@ class RigidFrames(Group):
         return R, t
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the coordinates of a mirrored system."""
+        """Return the coordinates in a mirrored system."""
         return {**super().mistakes(), "mirrored": replace(self, value=self.value * [1.0, 1.0, -1.0])}
 
     def _by_motion(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives of R'(X - t) by a shift and a turn about the centre of the frame, (p, 3, 6).
+        """Return the derivatives of R'(X - t) by a shift and a rotation about the centre, (p, 3, 6).
 
-        Of points on a line a turn about it changes nothing but the errors of their coordinates: it is no
-        parameter. Its derivatives are the second array, (p, 3, 3).
+        If the points lie on a line, a rotation about it changes only the errors of their coordinates, so it
+        is not a parameter. Its derivatives are the second array, (p, 3, 3).
 
         Args:
             local: R'(X - t), (p, 3).
@@ -112,17 +112,19 @@ class RigidFrames(Group):
         return np.concatenate([shift, turn], axis=2), about
 
     def _axes(self) -> tuple[FloatArray, FloatArray]:
-        """Return the axes of turns that change the coordinates given, (3 or 2, 3), and of any other."""
+        """Return the axes of rotations that change the given coordinates, (3 or 2, 3), and any other axis."""
         given = skew(self.value - self.value.mean(axis=0)).reshape(-1, 3)
         _, singular, Vt = np.linalg.svd(given, full_matrices=False)
         on = singular > ON_LINE * singular[0]
         return Vt[on], Vt[~on]
 
     def _without(self, about: FloatArray, A: FloatArray) -> FloatArray:
-        """Return derivatives without their part along a turn about the points, which may fix no attitude.
+        """Return derivatives without their part along a rotation about the line of the points.
+
+        This rotation must not fix any attitude.
 
         Args:
-            about: derivatives by turns, (p, 3, 3).
+            about: derivatives by the rotation, (p, 3, 3).
             A: derivatives, (p, 3, ...).
         """
         root = np.sqrt(self.weights)[:, None]
