@@ -1,16 +1,17 @@
 """Orientation: from measured image points to approximate values of photographs and object points.
 
-- `orient`: begin here; a whole network from its image points and nothing else.
-- `resect_robust`: one photograph on known points, of which some may be wrong; `resect_fischler_bolles` from
-  three points (by the roots of `leg_quartic`; `choose_by_line` finds the true one of its solutions),
-  `resect_least_squares` from a start, with its covariance. `expected_trials`: how many samples it takes.
-- `relative_orientations`: two photographs from conjugate rays alone, whatever the scene;
-  `refine_coplanarity`: the adjustment of them.
+- `orient`: start here; it orients a whole network from its image points alone.
+- `resect_robust`: one photograph on known points, some of which may be wrong. `resect_fischler_bolles` needs
+  three points (by the roots of `leg_quartic`; `choose_by_line` selects the true solution).
+  `resect_least_squares` starts from an approximate orientation and gives the covariance. `expected_trials` is
+  the number of samples.
+- `relative_orientations`: two photographs from conjugate rays alone, for any scene; `refine_coplanarity`
+  adjusts them.
 - `intersect`: object points from the rays of oriented photographs.
 - `orient_absolute`: a model onto control.
 
-Rays are tangents u = -U/W, v = -V/W, which `sfm.camera.tangents_from_pixel` makes of pixels. Other methods of
-resection, of pairs and of scanned photographs are in `sfm.textbook`.
+Rays are tangents u = -U/W, v = -V/W; `sfm.camera.tangents_from_pixel` computes them from pixels. Other
+methods for resection, pairs and scanned photographs are in `sfm.textbook`.
 
     >>> import numpy as np
     >>> from sfm.orientation import resect_robust, tangents_of

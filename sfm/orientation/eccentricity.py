@@ -1,10 +1,10 @@
-"""Eccentricity: the centre of a circle's image is not the image of the circle's centre.
+"""Eccentricity: the difference between the centre of a circle's image and the image of the circle's centre.
 
-With e1, e2 across the normal n of a circle of radius r and d from the projection centre to its centre, all in
-image axes, its points have the rays G (cos t, sin t, 1)' with G = diag(1, 1, -1) (r e1, r e2, d) in the
-coordinates (u, v, 1). The dual conic of its image is D = G diag(1, 1, -1) G'; scaled to D33 = -1 it is
-(S - m m', -m; -m', -1) with the centre m and the shape S of the ellipse. Radius and normal of a target follow
-from the ellipses that all photographs show of it, and from these the shift m - (image of the centre).
+A circle has radius r, unit vectors e1, e2 across its normal n, and d from the projection centre to its
+centre, all in image axes. Its points have the rays G (cos t, sin t, 1)' in the coordinates (u, v, 1), with G
+= diag(1, 1, -1) (r e1, r e2, d). The dual conic of its image is D = G diag(1, 1, -1) G'. Scaled to D33 = -1
+it is (S - m m', -m; -m', -1), with the centre m and the shape S of the ellipse. Radius and normal of a target
+are fitted to its ellipses in all photographs. The shift m - (image of the centre) follows from them.
 
 Source: Ahn, Warnecke and Kotowski (1999), Photogrammetric Record 16(93); Hartley and Zisserman (2003),
 Multiple View Geometry, sec. 2.2.3 (dual conics) and 2.3.1 (their transformation).
@@ -19,11 +19,11 @@ import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
 
-STEPS = 30  # of Gauss-Newton at most; it settles in six to ten
-SETTLED = 1e-8  # change of the normal, rad, and relative change of the radius
+STEPS = 30  # largest number of Gauss-Newton steps; six to ten are usual
+SETTLED = 1e-8  # last change of the normal, rad, and relative change of the radius
 DIFFERENCE = 1e-6  # step of the difference quotients, rad and relative
-LONGEST_STEP = 0.3  # rad and relative; ellipses change their kind beyond
-HUBER = 2.0  # residuals beyond this many robust sigma lose weight; Huber (1981), Robust Statistics, ch. 4
+LONGEST_STEP = 0.3  # rad and relative; beyond it, ellipses turn into other conics
+HUBER = 2.0  # robust sigmas beyond which residuals lose weight; Huber (1981), Robust Statistics, ch. 4
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class Circles:
 
     radius: FloatArray  # object unit, (n,)
     normal: FloatArray  # unit vectors towards the cameras, object axes, (n, 3)
-    covariance: FloatArray  # of two tilts of the normal (rad) and ln radius, (n, 3, 3)
-    misfit: FloatArray  # root mean square relative difference of the semi-axes from the circle's, (n,)
+    covariance: FloatArray  # covariance of two tilts of the normal (rad) and ln radius, (n, 3, 3)
+    misfit: FloatArray  # root mean square relative difference of the semi-axes from the predicted ones, (n,)
     shift: FloatArray  # centre of the ellipse minus image of the circle's centre, px, (k, 2)
     shift_covariance: FloatArray  # px^2, (k, 2, 2)
 
 
 @dataclass(frozen=True)
 class CircleViews:
-    """Circular targets as the photographs show them; one row for each image point."""
+    """Views of circular targets in the photographs, one row for each image point."""
 
     point: IntArray  # index of the target, (k,)
-    shape: FloatArray  # measured ellipses, S of (x - m)' S^-1 (x - m) = 1, px^2, (k, 2, 2)
+    shape: FloatArray  # measured ellipses, S in (x - m)' S^-1 (x - m) = 1, px^2, (k, 2, 2)
     rays: FloatArray  # from the projection centre to the target, image axes, object unit, (k, 3)
     rotation: FloatArray  # R of the photograph, image to object axes, (k, 3, 3)
     pixel_jacobian: FloatArray  # d pixel / d (u, v) at the target, px, (k, 2, 2)
@@ -51,12 +51,12 @@ class CircleViews:
 
 
 def fit_circles(views: CircleViews, n_points: int, *, radius: FloatArray | None = None) -> Circles:
-    """Return the circles that look like the measured ellipses, and their eccentricity in each photograph.
+    """Fit circles to the measured ellipses, and return their eccentricity in each photograph.
 
     Args:
-        views: at least two photographs of each target.
+        views: views in at least two photographs of each target.
         n_points: number of targets.
-        radius: known radius of each target, NaN where it is to be found, object unit, (n,).
+        radius: known radius of each target, NaN where unknown, object unit, (n,).
     """
     point = views.point
     known = np.full(n_points, np.nan) if radius is None else radius
@@ -96,7 +96,7 @@ def fit_circles(views: CircleViews, n_points: int, *, radius: FloatArray | None 
 
 
 def ellipse_shape(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return the matrices S of (x - m)' S^-1 (x - m) = 1, px^2, shape (k, 2, 2).
+    """Return the matrices S in (x - m)' S^-1 (x - m) = 1, px^2, shape (k, 2, 2).
 
     Args:
         semi_axes: major and minor semi-axis, px, shape (k, 2).
@@ -108,7 +108,7 @@ def ellipse_shape(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
 
 
 def _start(views: CircleViews, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Return normals towards the mean of the cameras, (n, 3), and ln of the radii of the major axes, (n,)."""
+    """Return normals towards the mean of the cameras, (n, 3), and ln of radii from the major axes, (n,)."""
     towards = -np.einsum("kij,kj->ki", views.rotation, views.rays)
     towards /= np.linalg.norm(towards, axis=1)[:, None]
     normal = np.zeros((n_points, 3))
@@ -123,7 +123,7 @@ def _start(views: CircleViews, n_points: int) -> tuple[FloatArray, FloatArray]:
 def _ellipses(
     views: CircleViews, normal: FloatArray, log_radius: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centre (k, 2) and shape (k, 2, 2) of the images and the images of the centres, tangents."""
+    """Return centres (k, 2) and shapes (k, 2, 2) of the images, and images of the centres, in tangents."""
     axes = np.einsum("kji,kaj->kai", views.rotation, _across(normal)[views.point])
     G = np.concatenate([axes * np.exp(log_radius)[views.point, None, None], views.rays[:, None]], axis=1)
     G = np.swapaxes(G, 1, 2) * np.array([1.0, 1.0, -1.0])[:, None]
@@ -136,7 +136,7 @@ def _ellipses(
 def _misfit(
     views: CircleViews, whitening: FloatArray, normal: FloatArray, log_radius: FloatArray
 ) -> FloatArray:
-    """Return the relative difference of predicted and measured ellipses, zero where equal, (k, 3)."""
+    """Return the relative difference between predicted and measured ellipses, zero if equal, (k, 3)."""
     _, S, _ = _ellipses(views, normal, log_radius)
     F = whitening @ views.pixel_jacobian
     E = F @ S @ np.swapaxes(F, 1, 2) - np.eye(2)
@@ -144,7 +144,7 @@ def _misfit(
 
 
 def _shift(views: CircleViews, normal: FloatArray, log_radius: FloatArray) -> FloatArray:
-    """Return the eccentricity, px, (k, 2): of the ellipse in the tangents, and of its image by distortion."""
+    """Return the eccentricity, px, (k, 2): of the ellipse in tangents, plus the effect of distortion."""
     m, S, centre = _ellipses(views, normal, log_radius)
     J, H = views.pixel_jacobian, views.pixel_curvature
     shift = np.einsum("kab,kb->ka", J, m - centre)
@@ -159,7 +159,7 @@ def _derivatives(
     axes: FloatArray,
     log_radius: FloatArray,
 ) -> FloatArray:
-    """Return d function / d (two tilts, ln radius) by central differences, (k, rows, 3)."""
+    """Return d function / d (two tilts, ln radius) from central differences, (k, rows, 3)."""
     columns = []
     for j in range(3):
         step = np.zeros((len(normal), 3))
@@ -179,6 +179,6 @@ def _across(normal: FloatArray) -> FloatArray:
 
 
 def _tilted(normal: FloatArray, axes: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the normals moved along their two axes, unit vectors, (n, 3)."""
+    """Return the unit normals tilted along their two axes, (n, 3)."""
     moved = normal + np.einsum("na,nac->nc", step[:, :2], axes)
     return np.asarray(moved / np.linalg.norm(moved, axis=1)[:, None])

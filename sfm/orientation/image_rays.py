@@ -1,4 +1,4 @@
-"""Rays of image points: where and at which angles they meet, and homographies of planes."""
+"""Rays of image points: their intersections and angles, and homographies of planes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.intersection import Intersection, intersect
 
 PLANAR_POINTS = 4
-RANSAC_TRIALS = 300  # a plane is of interest that most pairs lie on; enough where half of them do, at 1e-8
-NO_BASE = 1e-9  # (sigma1 - sigma3) of a homography of unit sigma2 below which it is a rotation
-MAX_PAIRS = 4_000_000  # of rays that are compared at a time
+RANSAC_TRIALS = 300  # only planes with most of the pairs matter; if half fit, it fails with probability 1e-8
+NO_BASE = 1e-9  # (sigma1 - sigma3) of a homography with sigma2 = 1 below which it is a rotation
+MAX_PAIRS = 4_000_000  # pairs of rays compared at a time
 
 
 def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera]) -> FloatArray:
-    """Return the tangents u = -U/W, v = -V/W of image points, NaN where no ray has them, (k, 2).
+    """Return the tangents u = -U/W, v = -V/W of image points, NaN for image points without a ray, (k, 2).
 
     Args:
         seen: image points.
@@ -37,15 +37,15 @@ def intersect_image_points(
 ) -> Intersection:
     """Return the object points that most rays of oriented photographs support; see `intersect`.
 
-    Rays of wide-angle cameras are compared by their angles: each is taken as the axis of a separate
-    photograph. Their tangents would weigh a pixel at 70 degrees off the axis as much as eight in the middle.
+    Rays of wide-angle cameras are compared by angles: each becomes the axis of a separate photograph. With
+    tangents, one pixel at 70 degrees off the axis would weigh as much as eight in the middle.
 
     Args:
         seen: image points.
         camera: index of the camera of each photograph, (m,).
         estimate: interior and exterior orientation.
         n_points: number of object points.
-        tolerance_px: largest residual of a ray that takes part, px of the camera with the shortest c.
+        tolerance_px: largest residual of a ray that takes part, in px of the camera with the shortest c.
     """
     uv, image = image_tangents(seen, camera, estimate.cameras), seen.image
     position, rotation = estimate.position, estimate.rotation
@@ -55,7 +55,7 @@ def intersect_image_points(
         rotation = np.concatenate([rotation, _along_rays(rotation[image[wide]], uv[wide])])
         image = image.copy()
         image[wide] = len(estimate.position) + np.arange(int(wide.sum()))
-        uv[wide] *= 0.0  # NaN stays
+        uv[wide] *= 0.0  # keeps NaN
     return intersect(
         uv,
         image,
@@ -68,7 +68,7 @@ def intersect_image_points(
 
 
 def _along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return rotations whose axis -z is the ray with tangents (u, v) under other ones, (k, 3, 3)."""
+    """Return rotations with axis -z along the rays with tangents (u, v) under given rotations, (k, 3, 3)."""
     u, v = uv.T
     one = np.ones(len(uv))
     z = np.column_stack([-u, -v, one])
@@ -81,12 +81,12 @@ def _along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
 def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:
     """Return the largest angle between two rays of each point, deg, NaN with fewer than two, (n,).
 
-    Rays that meet head on are as parallel as those side by side, so that no angle is above 90 degrees.
+    Opposite rays count as parallel, so no angle exceeds 90 degrees.
 
     Args:
-        network: of k image points and n points.
-        estimate: of the same, all that is used determined.
-        used: image points whose rays count, (k,).
+        network: network of k image points and n points.
+        estimate: estimate of this network, with everything used determined.
+        used: image points with rays that count, (k,).
     """
     seen = network.image_points.select(used)
     order = np.argsort(seen.point, kind="stable")
@@ -114,7 +114,7 @@ def fit_homography(
         first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 4.
         second: the conjugate rays of photograph 2, shape (n, 2).
         tolerance: largest residual in photograph 2, tangents.
-        seed: of the random samples.
+        seed: seed of the random samples.
     """
     n = len(first)
     used = np.ones(n, dtype=bool)
@@ -132,7 +132,13 @@ def fit_homography(
 
 
 def transfer_residuals(H: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return computed minus measured tangents in photograph 2, NaN behind it, shape (n, 2)."""
+    """Return computed minus measured tangents in photograph 2, NaN for rays behind it, shape (n, 2).
+
+    Args:
+        H: homography with r2 ~ H r1, shape (3, 3).
+        first: tangents of rays of photograph 1, shape (n, 2).
+        second: tangents of the conjugate rays of photograph 2, shape (n, 2).
+    """
     mapped = rays_of(first) @ H.T
     W = np.where(mapped[:, 2] < 0, mapped[:, 2], np.nan)
     return np.asarray(-mapped[:, :2] / W[:, None] - second)
@@ -144,13 +150,13 @@ def decompose_homography(
     """Return (base, rotation, normal) of the camera pairs that a homography describes.
 
     Args:
-        H: r2 ~ H r1 for rays r = (u, v, -1), its sign such that depths are positive, shape (3, 3).
+        H: r2 ~ H r1 for rays r = (u, v, -1), with the sign that makes depths positive, shape (3, 3).
         first: tangents u = -U/W, v = -V/W of rays of photograph 1 to points of the plane, shape (n, 2).
         second: the conjugate rays of photograph 2, shape (n, 2).
 
     Returns:
-        The solutions that have the plane in front of photograph 1: two, one where they coincide, none for a
-        mere rotation.
+        The solutions with the plane in front of photograph 1: two, one if they coincide, none for a pure
+        rotation.
 
     Source: Ma et al. (2004), alg. 5.2: H = R' + t n', from the eigenvectors of H'H.
     """
@@ -177,7 +183,7 @@ def decompose_homography(
 
 
 def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Direct linear solution with conditioned coordinates (Hartley, Zisserman 2004, alg. 4.2)."""
+    """Return the direct linear solution with conditioned coordinates (Hartley, Zisserman 2004, alg. 4.2)."""
     T1, T2 = _conditioner(first), _conditioner(second)
     r1, r2 = rays_of(first) @ T1.T, rays_of(second) @ T2.T
     rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)

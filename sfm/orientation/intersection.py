@@ -1,4 +1,8 @@
-"""Intersection: object points from rays of several photographs, linear, robust and by least squares."""
+"""Intersection: object points from the rays of several photographs, linear, robust and by least squares.
+
+The point nearest to all rays is the start. If rays contradict one another, the start is the two-ray point
+that most rays support. Gauss-Newton on the image residuals then gives the least-squares solution.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,8 @@ from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_scaled
 
 MAX_STEPS = 20
-CONVERGED = 1e-13  # step relative to the distance of the point
-MAX_PAIRS = 400  # pairs of rays tried for one point
+CONVERGED = 1e-13  # last step, relative to the distance of the point
+MAX_PAIRS = 400  # pairs of rays that are tried for one point
 
 
 @dataclass(frozen=True)
@@ -23,10 +27,10 @@ class Intersection:
 
     points: FloatArray  # object points, object unit, (n, 3)
     cofactors: FloatArray  # Qxx of each point for rays of weight 1, object unit^2, (n, 3, 3)
-    covariance: FloatArray  # sigma0^2 Qxx with the sigma0 of all points together, (n, 3, 3)
-    residuals: FloatArray  # v = computed - measured of every ray, tangents, NaN if behind, (k, 2)
+    covariance: FloatArray  # sigma0^2 Qxx with the common sigma0 of all points, (n, 3, 3)
+    residuals: FloatArray  # v = computed - measured of every ray, tangents, NaN behind the camera, (k, 2)
     used: BoolArray  # rays that took part, (k,)
-    rays: IntArray  # rays that took part at each point, (n,)
+    rays: IntArray  # number of rays that took part at each point, (n,)
     angle: FloatArray  # largest angle between two of the rays that took part, rad, (n,)
     sigma0: float  # a posteriori standard deviation of unit weight; tangents if weights are not given
     redundancy: int  # 2 (rays used) - 3 (points)
@@ -45,28 +49,29 @@ def intersect(
     tolerance: float = np.inf,
     min_angle_deg: float = 0.0,
 ) -> Intersection:
-    """Return the object points that many rays determine, each by least squares on its image residuals.
+    """Return the object points determined by many rays, each by least squares on its image residuals.
 
     Args:
         tangents: u = -U/W, v = -V/W of each measured ray, shape (k, 2).
         image: index of the photograph of each ray, shape (k,).
         point: index of the object point of each ray, shape (k,).
-        positions: projection centres X0, shape (m, 3), object unit; rays from NaN are left out.
+        positions: projection centres X0, shape (m, 3), object unit; rays of photographs with NaN are left
+            out.
         rotations: R of the photographs, image to object axes, shape (m, 3, 3).
         n_points: number of object points; the largest index + 1 if not given.
         weights: weight matrix of each ray, shape (k, 2, 2); unit matrices if not given.
-        tolerance: largest residual vector of a ray that takes part, tangents. With a finite tolerance
-            the point is the one that most rays support.
+        tolerance: largest residual vector of a ray that takes part, tangents. With a finite tolerance the
+            point is the one that most rays support.
         min_angle_deg: smallest ray angle of a determined point, deg.
 
     Returns:
         Points with covariance; a point needs two rays and lies in front of all photographs that see it.
 
     Raises:
-        GeometryError: an index of a photograph or point that is not there.
+        GeometryError: an index of a photograph or point is out of range.
 
-    Source: Foerstner, Wrobel (2016), sec. 13.4: the point nearest to the rays, then Gauss-Newton on
-    the collinearity equations. The two-ray candidates are weighed against all other rays as in RANSAC.
+    Source: Foerstner, Wrobel (2016), sec. 13.4: the point nearest to the rays, then Gauss-Newton on the
+    collinearity equations. The two-ray candidates are tested against all other rays as in RANSAC.
     """
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     n = int(np.max(point, initial=-1)) + 1 if n_points is None else n_points
@@ -86,7 +91,7 @@ def intersect(
         np.ascontiguousarray(image, dtype=np.int64),
         np.ascontiguousarray(positions, dtype=float),
         np.ascontiguousarray(rotations, dtype=float),
-        np.array(P, dtype=float, order="C"),  # that kernels may write to, as they are compiled for
+        np.array(P, dtype=float, order="C"),  # writable, because the kernels are compiled for that
     )
     limit, cos_limit = tolerance * tolerance, float(np.cos(np.radians(min_angle_deg)))
     cost = _intersect_all(rays, ray, start, limit, cos_limit, xyz, Q, count, angle, residuals, used)
@@ -96,7 +101,7 @@ def intersect(
 
 
 class _Rays(NamedTuple):
-    """All measured rays, and the photographs they belong to."""
+    """All measured rays, with their photographs."""
 
     tangents: FloatArray  # u = -U/W, v = -V/W, (k, 2)
     image: IntArray  # index of the photograph, (k,)
@@ -119,7 +124,7 @@ def _intersect_all(
     residuals: FloatArray,
     used: BoolArray,
 ) -> float:
-    """Intersect point by point and return the sum of v'Pv over all of them.
+    """Intersect point by point, and return the sum of v'Pv over all points.
 
     The rays of point j are `ray[start[j]:start[j + 1]]`; a ray fits up to the squared residual `limit`.
     """
@@ -226,7 +231,7 @@ def _nearest_to_rays(
     b: FloatArray,
     X: FloatArray,
 ) -> bool:
-    """Fill the point with the least squared distances from the rays in use; False if there is none."""
+    """Fill the point with the least sum of squared distances from the rays in use; False if there is none."""
     N[:] = 0.0
     b[:] = 0.0
     for i in range(len(of_point)):
@@ -254,7 +259,7 @@ def _best_pair(
     X: FloatArray,
     best_X: FloatArray,
 ) -> float:
-    """Fill the two-ray point with the least truncated squares over all rays; return them (inf: none)."""
+    """Fill the two-ray point with the least truncated squares over all rays; return their sum (inf: none)."""
     m = len(of_point)
     best = np.inf
     stride = max(1, (m * (m - 1) // 2) // MAX_PAIRS)
@@ -287,8 +292,8 @@ def _best_pair(
 def _sum_of_squares(rays: _Rays, of_point: IntArray, X: FloatArray) -> float:
     """Return the sum of the squared image residuals of rays.
 
-    Up to the limit of a single ray no point has smaller truncated squares than the least squares of all
-    rays: to give up a ray costs as much.
+    If this sum is below the limit of a single ray, no other point has smaller truncated squares than the
+    least-squares point of all rays, because giving up one ray costs the limit.
     """
     total = 0.0
     for k in of_point:
@@ -298,7 +303,7 @@ def _sum_of_squares(rays: _Rays, of_point: IntArray, X: FloatArray) -> float:
 
 @compiled
 def _square(rays: _Rays, ray: int, X: FloatArray) -> float:
-    """Return the squared image residual of a ray; inf for a point behind the camera."""
+    """Return the squared image residual of a ray, infinite for a point behind the camera."""
     uv, C, R = rays.tangents[ray], rays.positions[rays.image[ray]], rays.rotations[rays.image[ray]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
@@ -311,7 +316,7 @@ def _square(rays: _Rays, ray: int, X: FloatArray) -> float:
 
 @compiled
 def _residual(rays: _Rays, ray: int, X: FloatArray, residual: FloatArray) -> None:
-    """Fill the image residual of a ray, (2,); nothing for a point behind the camera."""
+    """Fill the image residual of a ray, (2,); unchanged for a point behind the camera."""
     uv, C, R = rays.tangents[ray], rays.positions[rays.image[ray]], rays.rotations[rays.image[ray]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
@@ -330,7 +335,7 @@ def _least_squares(
     b: FloatArray,
     dx: FloatArray,
 ) -> bool:
-    """Move X by Gauss-Newton on the image residuals of the rays in use; leave N; False if it fails."""
+    """Refine X by Gauss-Newton on the image residuals of the rays in use, and fill N; False if it fails."""
     A = np.empty((2, 3))
     for _ in range(MAX_STEPS):
         N[:] = 0.0

@@ -1,7 +1,7 @@
-"""Relative orientation of two photographs: closed form, and the coplanarity condition adjusted.
+"""Relative orientation of two photographs: closed form, and adjustment by the coplanarity condition.
 
-Photograph 1 is the frame: X0 = 0, R = I, image axes of photograph 1. Photograph 2 has the base b
-(length 1, as scale is not determined) and R, from image axes 2 to image axes 1.
+Photograph 1 defines the frame: X0 = 0, R = I, with its image axes. Photograph 2 has the base b, of length 1
+because scale is not determined, and R from image axes 2 to image axes 1.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ UNKNOWNS = 5
 MAX_STEPS = 30
 CONVERGED = 1e-12  # sum of the five steps, rad
 HALVINGS = 8
-SPATIAL_POINTS = 6  # five points give up to ten solutions, the sixth decides between them
-PLANAR_SHARE = 0.8  # share of the pairs that must lie on one homography for a planar solution
-INFINITE_SHARE = 0.1  # of the tolerance: residuals of a mere rotation below which a base means nothing
-BASE_EXPLAINS = 5.0  # ratio of sigma0 without and with a base; distortion, which both lack, does not reach it
-NARROW = 0.1  # part of the tolerance in which a small base is looked for
-CONFIDENCE = 0.999  # of the tests whether a simpler scene explains the rays as well
+SPATIAL_POINTS = 6  # five points give up to ten solutions, and the sixth decides between them
+PLANAR_SHARE = 0.8  # share of the pairs that must fit one homography for a planar solution
+INFINITE_SHARE = 0.1  # residuals of a pure rotation, as a share of the tolerance, below which a base is moot
+BASE_EXPLAINS = 5.0  # ratio of sigma0 without and with a base; neglected distortion does not reach it
+NARROW = 0.1  # share of the tolerance used to find a small base
+CONFIDENCE = 0.999  # confidence of the tests whether a simpler scene explains the rays as well
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_TRIALS = 2000
-ROUNDS = 5  # of adjustment and new choice of the fitting pairs
+ROUNDS = 5  # rounds of adjustment and new selection of the fitting pairs
 _IMAGE_FROM_VISION = np.diag([1.0, -1.0, -1.0])  # cv2: y down, looking along +z
 _NAN = np.full(3, np.nan)
 
@@ -49,19 +49,19 @@ _NAN = np.full(3, np.nan)
 class RelativeOrientation:
     """Photograph 2 in the frame of photograph 1."""
 
-    kind: str  # spatial | planar | infinite (no base: the same standpoint, or all points far away)
+    kind: str  # spatial | planar | infinite (no base: the same station, or all points far away)
     base: FloatArray  # unit vector from projection centre 1 to 2; NaN if infinite, (3,)
     rotation: FloatArray  # R, image axes 2 to image axes 1, (3, 3)
     normal: FloatArray  # unit normal of the plane, away from photograph 1; NaN if not planar, (3,)
     inliers: BoolArray  # point pairs that fit, (n,)
-    residuals: FloatArray  # distance from coplanarity of each pair, tangents, (n,)
+    residuals: FloatArray  # distance of each pair from coplanarity, tangents, (n,)
     sigma0: float  # a posteriori standard deviation of an image coordinate, tangents
-    redundancy: int  # fitting pairs - 5
-    normal_matrix: FloatArray  # of two small turns of b (across it) and w in R exp([w]x), (5, 5)
+    redundancy: int  # number of fitting pairs - 5
+    normal_matrix: FloatArray  # N of two small rotations of b (across it) and w in R exp([w]x), (5, 5)
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance of two small turns of b (across it) and w in R exp([w]x), rad^2, (5, 5)."""
+        """Covariance of two small rotations of b (across it) and w in R exp([w]x), rad^2, (5, 5)."""
         if not np.isfinite(self.normal_matrix).all():
             return np.full((5, 5), np.nan)
         return np.asarray(self.sigma0**2 * np.linalg.pinv(self.normal_matrix, hermitian=True))
@@ -81,27 +81,27 @@ def relative_orientations(
     seed: int = 0,
     max_trials: int = RANSAC_TRIALS,
 ) -> tuple[RelativeOrientation, ...]:
-    """Return the relative orientations that conjugate rays allow, from nothing but the rays.
+    """Return the relative orientations that fit conjugate rays, from the rays alone.
 
     Args:
         first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 4.
         second: the conjugate rays of photograph 2, shape (n, 2).
         tolerance: largest residual of a fitting pair, tangents.
-        seed: of the random samples.
-        max_trials: most samples of five points that are tried.
+        seed: seed of the random samples.
+        max_trials: largest number of samples of five points.
 
     Returns:
-        The kind of the first describes the scene. Infinite: a rotation explains the rays. Planar: both
-        solutions of the homography (they fit equally well; more photographs decide), then the
-        spatial one if there is one. Spatial: one orientation, adjusted by coplanarity, then the planar ones
-        if the points are near enough to a plane for them to be possible within the tolerance.
+        Orientations; the kind of the first one describes the scene. Infinite: a rotation explains the rays.
+        Planar: both solutions of the homography, which fit equally well until more photographs decide, then
+        the spatial one if there is one. Spatial: one orientation, adjusted by coplanarity, then the planar
+        ones if the points are close enough to a plane for the tolerance.
 
     Raises:
         GeometryError: fewer than four pairs, or none that fit one geometry.
 
     Source: Nister (2004), IEEE PAMI 26(6), five-point start (cv2.findEssentialMat); Ma, Soatto, Kosecka,
-    Sastry (2004), An Invitation to 3-D Vision, alg. 5.2 for the plane; the kinds are distinguished by
-    F tests of the residual variances.
+    Sastry (2004), An Invitation to 3-D Vision, alg. 5.2 for the plane. F tests of the residual variances
+    distinguish the kinds.
     """
     uv1 = np.ascontiguousarray(first, dtype=float).reshape(-1, 2)
     uv2 = np.ascontiguousarray(second, dtype=float).reshape(-1, 2)
@@ -116,7 +116,7 @@ def relative_orientations(
     if on_plane.sum() >= max(PLANAR_POINTS, PLANAR_SHARE * n):
         infinite = _infinite(H, uv1, uv2, on_plane, tolerance)
         if infinite is not None:
-            # within a wide tolerance a false base fits every pair of a small one
+            # with a wide tolerance, a false base would fit all pairs of a small base
             spatial = (
                 _spatial(uv1, uv2, NARROW * tolerance, seed, max_trials) if n >= SPATIAL_POINTS else None
             )
@@ -142,7 +142,13 @@ def relative_orientations(
 
 
 def model_points(first: FloatArray, second: FloatArray, pair: RelativeOrientation) -> FloatArray:
-    """Return the points that the fitting pairs intersect in, frame of photograph 1, NaN elsewhere, (n, 3)."""
+    """Return the intersections of the fitting pairs in the frame of photograph 1, NaN elsewhere, (n, 3).
+
+    Args:
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2).
+        second: the conjugate rays of photograph 2, shape (n, 2).
+        pair: relative orientation.
+    """
     n = len(first)
     image, point = np.repeat([0, 1], n), np.tile(np.arange(n), 2)
     positions = np.stack([np.zeros(3), pair.base])
@@ -154,7 +160,7 @@ def model_points(first: FloatArray, second: FloatArray, pair: RelativeOrientatio
 def _infinite(
     H: FloatArray, uv1: FloatArray, uv2: FloatArray, used: BoolArray, tolerance: float
 ) -> RelativeOrientation | None:
-    """The rotation that explains the rays, if a homography does not explain them better."""
+    """Return the rotation that explains the rays, None if a homography explains them better."""
     rays1 = np.concatenate([uv1, -np.ones((len(uv1), 1))], axis=1)
     R = rotation_from_position(uv2[used], rays1[used], np.zeros(3))
     off = transfer_residuals(R.T, uv1, uv2)
@@ -168,7 +174,7 @@ def _infinite(
         r_full, extra = 2 * n - 8, 5
         ratio = (square - full) / extra / max(full / r_full, np.finfo(float).tiny)
         simple = simple or ratio <= fdtri(extra, r_full, CONFIDENCE)
-        # noise-free rays of one standpoint: both sums are rounding
+        # noise-free rays of one station: both sums are rounding
         simple = simple or square <= (1e-12) ** 2 * n
     if not simple:
         return None
@@ -182,7 +188,7 @@ def _infinite(
 
 
 def _is_planar(H: FloatArray, uv1: FloatArray, uv2: FloatArray, spatial: RelativeOrientation) -> bool:
-    """Whether a plane explains the pairs as well as a spatial scene does, by the variance ratio."""
+    """Return whether a plane explains the pairs as well as a spatial scene does, by the variance ratio."""
     used = spatial.inliers
     n = int(used.sum())
     if n <= PLANAR_POINTS or spatial.redundancy < 1:
@@ -199,7 +205,7 @@ def _is_planar(H: FloatArray, uv1: FloatArray, uv2: FloatArray, spatial: Relativ
 def _spatial(
     uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int, max_trials: int
 ) -> RelativeOrientation | None:
-    """Five-point start and adjustment by coplanarity; None if fewer than six pairs fit."""
+    """Return the orientation from a five-point start and coplanarity; None if fewer than six pairs fit."""
     down = np.array([1.0, -1.0])
     cv2.setRNGSeed(seed)
     E, mask = cv2.findEssentialMat(
@@ -230,10 +236,10 @@ def _nearest_to_coplanar(
     uv2: FloatArray,
     tolerance: float,
 ) -> RelativeOrientation:
-    """Return the orientation with the smallest residuals, of that found first and those of a plane adjusted.
+    """Return the orientation with the smallest residuals among the first one and the adjusted planar ones.
 
-    Both orientations of a plane fit the rays of a shallow relief within a wide tolerance, and random samples
-    take whichever comes first: the adjustment from it ends in another minimum, with larger residuals.
+    With shallow relief and a wide tolerance, both orientations of a plane fit the rays, and random samples
+    select either. An adjustment from the wrong one ends in another minimum, with larger residuals.
     """
     found = [spatial]
     found += [_adjusted(one.base, one.rotation, uv1, uv2, one.inliers, tolerance) for one in planar]
@@ -249,7 +255,7 @@ def _adjusted(
     used: BoolArray,
     tolerance: float,
 ) -> RelativeOrientation:
-    """Adjust a spatial orientation by coplanarity, and choose the fitting pairs anew until they stay."""
+    """Adjust a spatial orientation by coplanarity, selecting the fitting pairs again until they stay."""
     best = _evaluate("spatial", base, rotation, _NAN, uv1, uv2, used)
     for _ in range(ROUNDS):
         try:
@@ -273,7 +279,7 @@ def _evaluate(
     uv2: FloatArray,
     inliers: BoolArray,
 ) -> RelativeOrientation:
-    """Residuals, sigma0 and normal equations of an orientation over its fitting pairs."""
+    """Return an orientation with residuals, sigma0 and normal equations from its fitting pairs."""
     redundancy = int(inliers.sum()) - UNKNOWNS
     residuals = np.abs(coplanarity_residuals(uv1, uv2, base, rotation)[0])
     sigma0, N = np.nan, np.full((5, 5), np.nan)
@@ -297,7 +303,7 @@ def refine_coplanarity(
 
     Returns:
         Base (unit), rotation, distances from coplanarity in tangents (n,), and Qxx (5, 5) of two small
-        turns of b about axes across it and of w in R exp([w]x).
+        rotations of b about axes across it and of w in R exp([w]x).
 
     Raises:
         GeometryError: fewer than five pairs, or pairs that do not determine the orientation.
@@ -322,7 +328,7 @@ def refine_coplanarity(
 def coplanarity_residuals(
     first: FloatArray, second: FloatArray, base: FloatArray, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far conjugate rays are from coplanarity, and the normal matrix of the five parameters.
+    """Return the distances of conjugate rays from coplanarity, and the normal matrix of five parameters.
 
     Args:
         first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2).
@@ -331,9 +337,9 @@ def coplanarity_residuals(
         rotation: R, image axes 2 to image axes 1, shape (3, 3).
 
     Returns:
-        Distances in tangents, (n,); normal matrix of two turns of b and of w in R exp([w]x), (5, 5).
+        Distances in tangents, (n,); normal matrix of two rotations of b and of w in R exp([w]x), (5, 5).
 
-    Source: as `refine_coplanarity`.
+    Source: as for `refine_coplanarity`.
     """
     residuals, N, b = np.empty(len(first)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     uv1, uv2 = np.ascontiguousarray(first, dtype=float), np.ascontiguousarray(second, dtype=float)
@@ -342,7 +348,13 @@ def coplanarity_residuals(
 
 
 def turned_pair(base: FloatArray, rotation: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return base and rotation after a step of the five unknowns: two turns of b, and w in R exp([w]x)."""
+    """Return base and rotation after a step of the five unknowns.
+
+    Args:
+        base: unit vector from projection centre 1 to 2, shape (3,).
+        rotation: R, image axes 2 to image axes 1, shape (3, 3).
+        step: two small rotations of b, and w in R exp([w]x), rad, shape (5,).
+    """
     new_base, new_rotation = np.empty(3), np.empty((3, 3))
     _turn_base(base, step[0], step[1], new_base)
     turn(np.ascontiguousarray(rotation), step[2], step[3], step[4], new_rotation)
@@ -353,7 +365,7 @@ def turned_pair(base: FloatArray, rotation: FloatArray, step: FloatArray) -> tup
 def _adjust_coplanarity(
     uv1: FloatArray, uv2: FloatArray, base: FloatArray, R: FloatArray, residuals: FloatArray, N: FloatArray
 ) -> bool:
-    """Gauss-Newton in place with halved steps; False if singular."""
+    """Adjust base and R in place by Gauss-Newton with halved steps; False if singular."""
     b5, dx = np.empty(5), np.empty(5)
     new_base, new_R, new_N, new_b = np.empty(3), np.empty((3, 3)), np.empty((5, 5)), np.empty(5)
     cost = _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5)
@@ -382,7 +394,7 @@ def _adjust_coplanarity(
 
 @compiled
 def _across(base: FloatArray, p: FloatArray, q: FloatArray) -> None:
-    """Fill two unit vectors at right angles to the base."""
+    """Fill two unit vectors perpendicular to the base and to each other."""
     k = 0
     for d in range(1, 3):
         if abs(base[d]) < abs(base[k]):
@@ -395,7 +407,7 @@ def _across(base: FloatArray, p: FloatArray, q: FloatArray) -> None:
 
 @compiled
 def _turn_base(base: FloatArray, s: float, t: float, out: FloatArray) -> None:
-    """Fill the base turned by two small angles across it."""
+    """Fill the base rotated by two small angles about axes across it."""
     p, q = np.empty(3), np.empty(3)
     _across(base, p, q)
     out[:] = base + s * p + t * q
@@ -412,7 +424,7 @@ def _coplanarity_normals(
     N: FloatArray,
     b5: FloatArray,
 ) -> float:
-    """Fill the normal equations of (two turns of b, w), each divided by its gradient; return v'v."""
+    """Fill the normal equations for two rotations of b and w, with gradient-normed conditions; return v'v."""
     N[:] = 0.0
     b5[:] = 0.0
     p, q = np.empty(3), np.empty(3)

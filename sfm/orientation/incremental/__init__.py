@@ -1,1 +1,1 @@
-"""Orientation of a set of photographs: a pair to start from, then one photograph after the other."""
+"""Incremental orientation of a set of photographs: a starting pair, then the other photographs in turn."""

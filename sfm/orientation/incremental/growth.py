@@ -1,4 +1,9 @@
-"""A network that grows: resection, intersection, adjustment, and which photographs are confirmed."""
+"""A growing network: resection, intersection, adjustment, and tests whether photographs are confirmed.
+
+`Growth` replaces one estimate step by step. Photographs are resected on the points known so far, new points
+are intersected, and the caller adjusts the network. `photograph_support` counts the image points for and
+against each photograph; photographs without enough support are dropped.
+"""
 
 from __future__ import annotations
 
@@ -21,19 +26,19 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import report_step
 
-RELATIVE_UNKNOWNS = 5  # of a relative orientation
+RELATIVE_UNKNOWNS = 5  # unknowns of a relative orientation
 FIRST_ADJUSTMENT = 4  # photographs
-MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
-MIN_SHARE = 0.5  # of the rays of a point must meet in it
+MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point used to orient other photographs
+MIN_SHARE = 0.5  # smallest share of the rays of a point that must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
-ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
-WEAK_PER_ROUND = 20  # of so many unsupported photographs one is removed before the others are judged anew
-SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
+ALL_FREE_PHOTOGRAPHS = 6  # number of photographs from which all parameters are adjusted
+WEAK_PER_ROUND = 20  # one in this number of unsupported photographs is removed before the next judgement
+SURPLUS_PER_PARAMETER = 3  # observations, beyond those of exterior orientations, for each free parameter
 Refine = Callable[[Network, Estimate], Estimate]
 
 
 class Growth:
-    """The state of a growing network: one estimate that is replaced step by step."""
+    """State of a growing network: one estimate that is replaced step by step."""
 
     def __init__(
         self, network: Network, estimate: Estimate, seed: int, tolerance_px: FloatArray, min_points: int
@@ -44,12 +49,12 @@ class Growth:
         self.tolerance_px = tolerance_px
         self.start_tolerance_px = tolerance_px
         self.min_points = min_points
-        self.reasons: dict[int, Remark] = {}  # why a photograph is not oriented
-        self.dropped = np.zeros(len(network.images), dtype=bool)  # does not belong, (m,)
+        self.reasons: dict[int, Remark] = {}  # reason why a photograph is not oriented
+        self.dropped = np.zeros(len(network.images), dtype=bool)  # photographs that do not belong, (m,)
         area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
         self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
         control = network.control.complete
-        # control that the estimate does not hold to its coordinates is intersected like any other point
+        # control with other coordinates in the estimate is intersected like any other point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[control.point] = (estimate.points[control.point] == control.xyz).all(axis=1)
         self.adjusted = np.zeros(0, dtype=bool)  # image points of the last adjustment, (k,)
@@ -57,28 +62,28 @@ class Growth:
     # --- views of the measured image points --------------------------------------------------------
 
     def tangents(self) -> FloatArray:
-        """Tangents of all image points with the present interior orientations, (k, 2)."""
+        """Return the tangents of all image points with the present interior orientations, (k, 2)."""
         return image_tangents(self.network.image_points, self.network.camera, self.estimate.cameras)
 
     def tolerance(self) -> FloatArray:
-        """Tolerance of every photograph, tangents, (m,)."""
+        """Return the tolerance of every photograph, tangents, (m,)."""
         c = np.array([camera.c_px for camera in self.estimate.cameras])
         return np.asarray((self.tolerance_px / c)[self.network.camera])
 
     def residuals_px(self) -> FloatArray:
-        """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""
+        """Return the length of every reprojection residual, px, inf where undetermined, (k,)."""
         return residual_lengths(self.network, self.estimate)
 
     # --- steps -------------------------------------------------------------------------------------
 
     def begin(self, judge: Callable[[Estimate], float] | None = None) -> Start:
-        """Find a start and take it over.
+        """Find a start and adopt it.
 
         Args:
-            judge: misfit of an estimate with what the caller knows besides, see `best_start`.
+            judge: misfit of an estimate with other knowledge of the caller, see `best_start`.
 
         Raises:
-            GeometryError: nothing orients two photographs; with given values these are not enough.
+            GeometryError: no two photographs can be oriented, or the given values do not suffice.
         """
         network, control = self.network, self.network.control.complete
         given = has_given_values(network, self.estimate)
@@ -100,7 +105,7 @@ class Growth:
                     f"orientation: the given approximate values orient {oriented} of {len(network.images)} "
                     "photographs, at least 2 are needed"
                 )
-        # no control or too little of it in any photograph: a free start, later brought onto control
+        # too little control in any photograph: a free start, transformed to control later
         self.estimate = empty_estimate(network, self.estimate.cameras)
         self.fixed[:] = False
 
@@ -121,10 +126,10 @@ class Growth:
         return start
 
     def resect_next(self) -> int:
-        """Orient the photographs that see enough determined points; return how many were added.
+        """Orient the photographs that see enough determined points; return the number added.
 
-        Those with the most points come first; a photograph with less than half as many as the best
-        waits for the points that the others bring.
+        Photographs with most points come first. A photograph with less than half as many points as the best
+        one waits for the points that the others add.
         """
         waiting = np.flatnonzero(~self.estimate.oriented)
         seen = self.network.image_points
@@ -144,12 +149,16 @@ class Growth:
         return added
 
     def resect_all(self, *, only_new: bool = False) -> None:
-        """Resect the photographs anew on the present points; oriented ones keep what fits better."""
+        """Resect the photographs again on the present points; oriented ones keep the better orientation.
+
+        Args:
+            only_new: whether to resect only photographs that are not oriented.
+        """
         left_out = self.dropped | (self.estimate.oriented if only_new else False)
         self.resect(np.flatnonzero(~left_out).tolist())
 
     def share_fitting(self) -> FloatArray:
-        """Share of the image points of each photograph, of determined points, that fit, (m,)."""
+        """Return the share of fitting image points of determined points in each photograph, (m,)."""
         seen, m = self.network.image_points, len(self.network.images)
         known = self.estimate.determined[seen.point] & self.estimate.oriented[seen.image]
         fits = self.residuals_px() <= self.tolerance_px[self.network.camera[seen.image]]
@@ -157,7 +166,11 @@ class Growth:
         return np.asarray(np.bincount(seen.image[known & fits], minlength=m) / np.maximum(count, 1))
 
     def resect(self, images: list[int]) -> int:
-        """Resect photographs, of which oriented ones keep what fits better; return how many are new."""
+        """Resect photographs; oriented ones keep the better orientation. Return the number of new ones.
+
+        Args:
+            images: indices of the photographs.
+        """
         uv = self.tangents()
         position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
         seen = self.network.image_points
@@ -188,12 +201,12 @@ class Growth:
         return added
 
     def resection(self, i: int, rows: IntArray, uv: FloatArray) -> RobustResection:
-        """Return a photograph resected on the present points.
+        """Return the resection of a photograph on the present points.
 
         Args:
-            i: the photograph.
+            i: index of the photograph.
             rows: some of its image points, all of determined points, (k,).
-            uv: their tangents, (k, 2).
+            uv: tangents of these image points, (k, 2).
         """
         camera = self.network.camera[i]
         return resect_robust(
@@ -206,14 +219,22 @@ class Growth:
         )
 
     def release(self, images: IntArray) -> None:
-        """Take away the orientation of photographs, and intersect the points anew from the others."""
+        """Remove the orientation of photographs, and intersect the points again from the others.
+
+        Args:
+            images: indices of the photographs.
+        """
         position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
         position[images], rotation[images] = np.nan, np.nan
         self.estimate = replace(self.estimate, position=position, rotation=rotation)
         self.intersect()
 
     def intersect(self, *, only_missing: bool = False) -> None:
-        """Intersect the points that are not control from the oriented photographs, all or those missing."""
+        """Intersect the points from the oriented photographs, except fixed control.
+
+        Args:
+            only_missing: whether to intersect only points without coordinates.
+        """
         seen = self.network.image_points
         result = intersect(
             self.tangents(),
@@ -225,19 +246,19 @@ class Growth:
             tolerance=float(self.tolerance().max()),
             min_angle_deg=MIN_ANGLE_DEG,
         )
-        # rays of a point that is somewhere else in every photograph meet by twos, here and there
+        # if a point is elsewhere in every photograph, pairs of its rays still meet by chance
         rays = np.bincount(seen.point[self.estimate.oriented[seen.image]], minlength=len(self.network.points))
         points = np.where((result.rays >= MIN_SHARE * rays)[:, None], result.points, np.nan)
         stay = self.fixed | self.estimate.determined if only_missing else self.fixed
         points = np.where(stay[:, None], self.estimate.points, points)
         self.estimate = replace(self.estimate, points=points)
 
-    def refined(self, refine: Refine | None, *, everything: bool = False) -> bool:
-        """Let the caller adjust what is determined; keep the result if the image points fit better.
+    def adjust(self, refine: Refine | None, *, everything: bool = False) -> bool:
+        """Let the caller adjust everything determined; keep the result if the image points fit better.
 
         Args:
             refine: the caller's adjustment.
-            everything: whether image points beyond the tolerance take part, as from rough start values.
+            everything: whether image points beyond the tolerance take part, for rough start values.
 
         Returns:
             Whether there was anything new to adjust.
@@ -283,9 +304,9 @@ class Growth:
         return True
 
     def drop_unsupported(self) -> int:
-        """Let go the photographs that the others do not hold up, the worst first; return how many are gone.
+        """Drop the photographs that the others do not support, worst first; return the number dropped so far.
 
-        Points that rested on them are intersected anew from the others, or are gone.
+        Points that depended on them are intersected again from the others, or lost.
         """
         seen = self.network.image_points
         limit = self.tolerance_px[self.network.camera[seen.image]]
@@ -319,7 +340,11 @@ class Growth:
         return int(self.dropped.sum())
 
     def adapt_tolerance(self, final_px: float) -> None:
-        """Let the tolerance of each camera follow the spread of its residuals."""
+        """Adapt the tolerance of each camera to the spread of its residuals.
+
+        Args:
+            final_px: smallest tolerance, px.
+        """
         camera = self.network.camera[self.network.image_points.image]
         residuals = self.residuals_px()
         tolerance = self.tolerance_px.copy()
@@ -334,7 +359,12 @@ class Growth:
 
 
 def has_given_values(network: Network, estimate: Estimate) -> bool:
-    """Return whether an estimate has more than cameras and the coordinates of control."""
+    """Return whether an estimate has more than cameras and the coordinates of control.
+
+    Args:
+        network: network with the control.
+        estimate: start values.
+    """
     control = network.control.complete
     other = estimate.determined
     other[control.point] &= (estimate.points[control.point] != control.xyz).any(axis=1)
@@ -342,7 +372,12 @@ def has_given_values(network: Network, estimate: Estimate) -> bool:
 
 
 def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
-    """Return the length of every image residual in px, inf where it is not determined, shape (k,)."""
+    """Return the length of every image residual, px, inf where undetermined, shape (k,).
+
+    Args:
+        network: network of k image points.
+        estimate: estimate of this network.
+    """
     seen = network.image_points
     out = np.full(len(seen), np.inf)
     order = np.argsort(seen.image, kind="stable")
@@ -375,14 +410,14 @@ def _staged(camera: Camera, network: Network, index: int) -> Camera:
 
 
 def _determined_early(camera: Camera) -> BoolArray:
-    """Parameters that few photographs determine: focal lengths and the first of radial distortion, (n,)."""
+    """Return the parameters that few photographs determine: focal lengths and the first radial one, (n,)."""
     early = camera.plays(Role.FOCAL)
     early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
     return early
 
 
 def _too_few(fitting: int, points: int, needed: int) -> Remark:
-    """Return the reason why a photograph is not oriented: it shows too few points, or too few of them fit."""
+    """Return why a photograph is not oriented: it shows too few points, or too few of its points fit."""
     if points < needed:
         return remark("photograph_with_few_points", seen=points, needed=needed)
     return remark("photograph_with_few_fitting", fitting=fitting, points=points, needed=needed)
@@ -394,17 +429,16 @@ class Support:
 
     fitting: IntArray  # image points within the tolerance, (m,)
     known: IntArray  # image points of determined points, (m,)
-    confirmed: IntArray  # conditions beyond those that the orientation and its points take up, (m,)
-    against: (
-        IntArray  # image points that lie elsewhere, or in the midst of points that should know them, (m,)
-    )
+    confirmed: IntArray  # conditions beyond those that the orientation and its points use up, (m,)
+    against: IntArray  # image points that lie elsewhere, or inside the network without belonging to it, (m,)
 
     @property
     def doubtful(self) -> BoolArray:
-        """Photographs of whose image points fewer than half are where the network predicts, (m,).
+        """Photographs with fewer than half of their image points where the network predicts them, (m,).
 
-        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be distinguished from its contrary
-        if more than half of what it rests on contradicts it.
+        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be distinguished from its opposite
+            if
+        more than half of its data contradict it.
         """
         return np.asarray(self.confirmed < self.against)
 
@@ -412,21 +446,24 @@ class Support:
 def photograph_support(
     network: Network, estimate: Estimate, residuals_px: FloatArray, limit_px: FloatArray, fixed: BoolArray
 ) -> Support:
-    """Count the image points of each photograph that speak for its orientation, and those against it.
+    """Count the image points of each photograph for and against its orientation.
 
-    A point of three rays does not rest on this photograph and confirms it. Points that this photograph and
-    one other see were intersected from the two: each leaves one condition, that its rays meet, and five of
-    these the relative orientation takes up (Luhmann et al. 2020, sec. 4.3.3); the surplus confirms. An image
-    point in the midst of the network that has no place in it contradicts: a
-    mirrored photograph fits, seen from behind, the few coplanar codes that a mirror leaves as they are, and
-    no other photograph shows the rest of its codes. Outside the network nothing is expected of the others.
+    A point with three rays does not depend on this photograph, and confirms it. A point seen by this
+    photograph and one other was intersected from the two. It leaves one condition, that its rays meet.
+    Relative orientation uses up five of these conditions (Luhmann et al. 2020, sec. 4.3.3); the surplus
+    confirms the photograph.
+
+    An image point inside the network that does not belong to it is evidence against the photograph. A
+    mirrored photograph, for example, fits the few coplanar codes that are unchanged by mirroring, as if seen
+    from behind. No other photograph shows the rest of its codes. Outside the network, other photographs need
+    not confirm anything.
 
     Args:
-        network: k image points of m photographs and n points.
-        estimate: the orientation that is judged.
-        residuals_px: lengths, inf where undetermined, px, (k,).
+        network: network of k image points, m photographs and n points.
+        estimate: orientation that is judged.
+        residuals_px: lengths of the residuals, inf where undetermined, px, (k,).
         limit_px: largest residual of a fitting image point, px, (k,).
-        fixed: points known from elsewhere than the photographs, (n,).
+        fixed: points known independently of the photographs, (n,).
     """
     seen, m = network.image_points, len(network.images)
     fits = residuals_px <= limit_px
@@ -440,7 +477,7 @@ def photograph_support(
 
 
 def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
-    """Return the conditions that the pairs of each photograph have beyond a relative orientation, (m,)."""
+    """Return the surplus conditions, beyond a relative orientation, in the pairs of each photograph, (m,)."""
     m = len(network.images)
     both = np.zeros(m)
     for first, second, count in network.common_points(two_rays):
@@ -450,7 +487,7 @@ def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
 
 
 def _amidst(network: Network, estimate: Estimate) -> BoolArray:
-    """Return which image points lie in the convex hull of the network as their photograph shows it, (k,)."""
+    """Return which image points lie inside the convex hull of the projected network, (k,)."""
     seen = network.image_points
     out = np.zeros(len(seen), dtype=bool)
     points = estimate.points[estimate.determined]
@@ -464,7 +501,7 @@ def _amidst(network: Network, estimate: Estimate) -> BoolArray:
             continue
         try:
             lines = ConvexHull(xy).equations
-        except QhullError:  # all on one line
+        except QhullError:  # all on a line
             continue
         out[rows] = (seen.xy[rows] @ lines[:, :2].T + lines[:, 2] <= 0).all(axis=1)
     return out

@@ -1,16 +1,14 @@
-"""Photographs that fit worse than the others, and other solutions of a flat object.
+"""Photographs that fit worse than the others, and other solutions for a flat object.
 
-On an object with little depth a mirrored picture finds a place behind it or at its side where most of its
-image points fit a wide tolerance, and near-duplicates of it bend with it. Turned over it fits the others as
-they fit each other, once these are adjusted without it.
+**Mirrored photographs.** If an object has little depth, a mirrored photograph finds a position behind it or
+at its side where most of its image points fit a wide tolerance. Near-duplicates of it are distorted with it.
+Turned over, it fits the others as well as they fit each other, once these are adjusted without it.
 
-Solutions that a network could have in place of the first one found, and which of them fits best.
-
-A flat object photographed at moderate angles is almost the same as itself turned inside out in depth; a start
-tolerance of some tens of pixels hardly separates the two, for all photographs or for a part of them, and
-an adjustment ends in the minimum that it starts nearest to. The reversal in depth of a first solution shows
-whether it is in doubt: where the rays are strong the reversal fits a hundred times worse or not at all. A
-solution in doubt is followed from smaller start tolerances too, and the one with the smallest residuals is
+**Reversed depth.** A flat object photographed at moderate angles looks almost the same with its depth
+reversed. A start tolerance of tens of pixels hardly separates the two solutions, for all photographs or some
+of them, and an adjustment ends in the nearest minimum. The reversal in depth of a first solution shows
+whether the solution is in doubt. With strong rays the reversal fits a hundred times worse, or not at all. A
+solution in doubt is also sought from smaller start tolerances, and the one with the smallest residuals is
 kept.
 
 Source: Szeliski and Kang (1997), IEEE PAMI 19(5) (reversal of depth); Rousseeuw and Leroy (1987), Robust
@@ -32,28 +30,25 @@ from sfm.orientation.incremental.growth import Growth, Refine
 from sfm.remarks.remark import remark
 from sfm.similarity import reverse_depth
 
-DOUBTFUL = 30.0  # times the RMS residual of a solution, below which its reversal casts doubt on it
-SMALLER_TOLERANCES = (
-    1 / 3,
-    1 / 10,
-)  # of the first start tolerance, from which a solution in doubt is followed
-FAR_WORSE = 3.0  # times the median residual of all photographs, of one that may not belong to them
+DOUBTFUL = 30.0  # multiple of the median residual of a solution below which its reversal casts doubt on it
+SMALLER_TOLERANCES = (1 / 3, 1 / 10)  # shares of the first start tolerance, for a solution in doubt
+FAR_WORSE = 3.0  # multiple of the median residual from which a photograph may not belong to the others
 CONTRADICTING = "photograph_against_the_others"
-BOUND = 6.0  # times the median residual of the best solution: what lies farther off counts as that
-MIN_OTHERS = 3  # oriented photographs that one is judged by
-WORSE = 1.5  # times the typical median residual of a photograph, from which on it is looked at turned over
-FAR_BETTER = 8.0  # times smaller residuals, turned over: 20 to 80 of mirrored pictures, 2 of four points
+BOUND = 6.0  # multiple of the median residual of the best solution to which residuals are limited
+MIN_OTHERS = 3  # oriented photographs needed to judge another one
+WORSE = 1.5  # multiple of the typical median residual from which a photograph is tested turned over
+FAR_BETTER = 8.0  # ratio of residuals before and after turning: 20 to 80 if mirrored, 2 with four points
 
 
 def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
-    """Name and take out mirrored photographs, and take back what a rival solution left out though it fits.
+    """Remove mirrored photographs, and reinstate fitting photographs that a rival solution left out.
 
     Args:
-        growth: settled; changed where a photograph comes or goes.
-        refine: the caller's adjustment, of the others alone.
+        growth: settled network; it changes if a photograph is removed or reinstated.
+        refine: the caller's adjustment, used for the other photographs.
 
     Returns:
-        Whether a photograph came or went, so that the network is to be settled anew.
+        Whether a photograph was removed or reinstated, so that the network must settle again.
     """
     changed = False
     for i, reason in list(growth.reasons.items()):
@@ -72,7 +67,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         if _resected(growth, i, turned_over=True).median_px < medians[i]:
             with_it = growth.estimate
             growth.release(np.array([i]))
-            growth.refined(refine)
+            growth.adjust(refine)
             if _is_mirrored(growth, i):
                 growth.dropped[i], changed = True, True
             else:
@@ -81,9 +76,10 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
 
 
 def _is_mirrored(growth: Growth, i: int) -> bool:
-    """Return whether a photograph fits the others far better turned over, and give that as its reason.
+    """Return whether a photograph fits the others far better turned over; if so, record it as the reason.
 
-    No fewer of its image points do so: those on a plane alone fit turned over as well, seen from behind.
+    At least as many of its image points must fit turned over. Image points of a plane alone also fit turned
+    over, as if seen from behind.
     """
     as_it_is, turned = _resected(growth, i), _resected(growth, i, turned_over=True)
     before, after = as_it_is.median_px, turned.median_px
@@ -97,19 +93,19 @@ def _is_mirrored(growth: Growth, i: int) -> bool:
 
 
 class _Resected(NamedTuple):
-    """How a photograph fits the present points."""
+    """Fit of a photograph to the present points."""
 
-    median_px: float  # residual, infinite where it is not resected
-    fitting: int  # image points within the tolerance
+    median_px: float  # median residual, infinite if it cannot be resected
+    fitting: int  # number of image points within the tolerance
 
 
 def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected:
-    """Return how a photograph fits the present points, resected on them.
+    """Return the fit of a photograph after resection on the present points.
 
     Args:
-        growth: gives points and interior orientation.
-        i: the photograph.
-        turned_over: whether left and right of its image points are exchanged.
+        growth: network with points and interior orientation.
+        i: index of the photograph.
+        turned_over: whether to exchange left and right of its image points.
     """
     seen, camera = growth.network.image_points, growth.estimate.cameras[growth.network.camera[i]]
     rows = np.flatnonzero((seen.image == i) & growth.estimate.determined[seen.point])
@@ -125,7 +121,7 @@ def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected
 
 
 def _medians_px(growth: Growth) -> FloatArray:
-    """Return the median residual of every photograph, NaN where it has none, px, (m,)."""
+    """Return the median residual of every photograph, NaN where undetermined, px, (m,)."""
     residuals = growth.residuals_px()
     known = np.isfinite(residuals)
     rows = rows_of(growth.network.image_points.image, len(growth.network.images))
@@ -133,14 +129,15 @@ def _medians_px(growth: Growth) -> FloatArray:
 
 
 def bounded_costs(residuals_px: Sequence[FloatArray], image: IntArray) -> FloatArray:
-    """Return the mean logarithm of the median residual of the photographs in several solutions.
+    """Return the mean logarithm of the median residual of the photographs, for each of several solutions.
 
-    Photographs have a vote each, bounded at BOUND times the median of the best solution: what a solution does
-    not determine counts as much as what contradicts it, so that none is better for leaving photographs out,
-    and one photograph that does not belong cannot bend all others a little to fit itself.
+    Each photograph has one vote, limited to BOUND times the median of the best solution. An undetermined
+    photograph counts as much as a contradicting one, so a solution does not improve by leaving photographs
+    out.
+    And a single wrong photograph cannot win by distorting all others a little.
 
     Args:
-        residuals_px: of each solution the lengths of all image residuals, inf where undetermined, px, (k,).
+        residuals_px: lengths of all image residuals in each solution, inf where undetermined, px, (k,) each.
         image: photograph of each image point, (k,).
     """
     of_photograph = [rows for rows in rows_of(image, int(image.max(initial=-1)) + 1) if len(rows)]
@@ -153,11 +150,11 @@ def bounded_costs(residuals_px: Sequence[FloatArray], image: IntArray) -> FloatA
 
 
 def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: BoolArray) -> Growth:
-    """Return a network reversed in depth and adjusted, without the photographs that may have turned it over.
+    """Return a network reversed in depth and adjusted, without photographs that may have reversed it.
 
     Args:
         growth: the network.
-        empty: the same network before its start, which takes the reversal over.
+        empty: the same network before its start, which receives the reversal.
         refine: the caller's adjustment.
         without: photographs that take no part, (m,).
     """
@@ -167,12 +164,12 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
     empty.dropped, empty.reasons = growth.dropped | without, dict(growth.reasons)
     for i in np.flatnonzero(without).tolist():
         empty.reasons[i] = remark(CONTRADICTING)
-    empty.refined(refine, everything=True)
+    empty.adjust(refine, everything=True)
     return empty
 
 
 def worst_photographs(residuals_px: FloatArray, image: IntArray, m: int) -> BoolArray:
-    """Return which oriented photographs fit far worse than the others: these may have turned all over, (m,).
+    """Return which oriented photographs fit far worse than the others and may have reversed them, (m,).
 
     Args:
         residuals_px: lengths of the image residuals, inf where undetermined, px, (k,).
@@ -186,11 +183,11 @@ def worst_photographs(residuals_px: FloatArray, image: IntArray, m: int) -> Bool
 
 
 def casts_doubt(first_px: FloatArray, reversed_px: FloatArray) -> bool:
-    """Return whether the reversal of a solution in depth fits well enough for either to be the true one.
+    """Return whether the reversal of a solution in depth fits so well that either may be the true solution.
 
     Args:
         first_px: lengths of the image residuals, inf where undetermined, px, (k,).
-        reversed_px: the same of its reversal, adjusted.
+        reversed_px: lengths of the residuals of the adjusted reversal, px, (k,).
     """
     both = np.isfinite(first_px) & np.isfinite(reversed_px)
     if not both.any():

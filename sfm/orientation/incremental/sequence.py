@@ -1,16 +1,14 @@
-"""Orient a whole network from nothing but image points: a start, then photograph by photograph.
+"""Incremental orientation: orients a whole network from its image points, photograph by photograph.
 
-The start is control or given approximate values where there are some, else the pair of photographs
-whose model most other photographs can be resected on. Planar pairs have two solutions; the one
-is taken that the other photographs confirm. After that: resection of every photograph that sees enough
-points, intersection of all points, and adjustment by a function of the caller, so that the interior
-orientation is learnt while the network grows. At last photographs that the others contradict leave. Given
-values are start values: they are completed and adjusted as they are, and only where the image points do not
-fit the result are photographs oriented anew, with them or, if they lead nowhere, without them.
+The start is control or given approximate values, if there are any. Otherwise it is the pair of photographs
+with the model on which most other photographs can be resected. A planar pair has two solutions; the other
+photographs confirm one of them. Then every photograph that sees enough points is resected, all points are
+intersected, and a function of the caller adjusts the network. So the interior orientation is determined while
+the network grows. Finally, photographs that the others contradict are removed.
 
-Given start values are judged afterwards. A photograph is oriented anew only where most of its image points do
-not fit the others after the adjustment; where most photographs do not, the given values are wrong, and the
-caller starts without them.
+Given approximate values are first completed and adjusted, and then judged. A photograph is oriented again
+only if most of its image points do not fit the others after the adjustment. If most photographs do not fit,
+the given values are wrong. Then the network is grown from them or, if they do not help, without them.
 """
 
 from __future__ import annotations
@@ -47,34 +45,34 @@ from sfm.orientation.intersection import intersect
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 
-PARALLEL_SIGMAS = 4.0  # standard deviations of its angle by which two rays must differ from parallel ones
-MAX_COMPLETIONS = 50  # rounds of resection and intersection of what no values were given for
-KEPT_SHARE = 0.5  # of the photographs must fit, each with most of its image points, for given values to stay
-KEPT_TOLERANCE = 2.0  # times the final tolerance, that the residuals from given values may need
-ROUNDS = 3  # of adjustment, while image points come or go
+PARALLEL_SIGMAS = 4.0  # smallest ray angle, in its standard deviations, for rays that are not parallel
+MAX_COMPLETIONS = 50  # rounds of resection and intersection without given values
+KEPT_SHARE = 0.5  # share of photographs, each with most image points fitting, needed to keep given values
+KEPT_TOLERANCE = 2.0  # largest tolerance with given values, as a multiple of the final tolerance
+ROUNDS = 3  # most rounds of adjustment, while the set of image points changes
 Judge = Callable[[Estimate], float]
-MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
-START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
-FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
-MIN_RIVALS = 3  # oriented photographs: of two, what is known besides decides, see `best_start`
-GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
+MIN_POINTS = 4  # fewest points of a photograph: P3P always fits three, the fourth checks the result
+START_TOLERANCE = 0.03  # share of the photograph's diagonal: residuals of unknown distortion after resection
+FINAL_TOLERANCE_PX = 4.0  # no image point is excluded below this here; the adjustment tests further
+MIN_RIVALS = 3  # oriented photographs; with two, other knowledge decides, see `best_start`
+GROWTH = 1.25  # growth in the number of photographs after which the network is adjusted again
 MAX_ROUNDS = 200
-FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
+FINAL_ROUNDS = 3  # most rounds of resection, intersection and adjustment of all
 
 
 @dataclass(frozen=True)
 class Orientation:
-    """Approximate values of a whole network and what could not be had."""
+    """Approximate values of a whole network, and what could not be determined."""
 
     estimate: Estimate  # NaN for photographs and points that are not determined
     failures: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
     point_failures: tuple[tuple[str, Remark], ...]  # (name of the point, reason)
-    pair: tuple[str, str] | None  # photographs it started from; None: from control or given values
+    pair: tuple[str, str] | None  # starting pair; None if it started from control or given values
     kind: str  # start: spatial | planar | control | given
     fits: BoolArray  # image points within the tolerance, (k,)
-    rms_px: float  # over these, per coordinate, px
-    tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
-    remarks: tuple[Remark, ...] = ()  # given values of no use, and what the image points do not decide
+    rms_px: float  # root mean square residual of these, per coordinate, px
+    tolerance_px: FloatArray  # last tolerance of each camera, px, (a,)
+    remarks: tuple[Remark, ...] = ()  # on useless given values, and on ambiguities of the image points
 
 
 @checked_arguments()
@@ -93,28 +91,28 @@ def orient(
     """Return exterior orientations and points of a network, from its image points.
 
     Args:
-        network: measured facts; image points without a known object point belong out of it.
-        estimate: cameras with start values, or an estimate in which exterior orientation and points are NaN,
-            or given where known.
-        seed: of all random choices.
-        refine: adjusts a fully determined part of the network (no NaN in it) and returns it adjusted; the
-            cameras it is given have as many free parameters as the part can determine. Its result
-            is taken only if the image points fit better with it.
-        start_tolerance: largest residual at the beginning, as a fraction of the photograph's diagonal.
-        final_tolerance_px: the tolerance follows the residuals down to this, px.
-        min_points: points that a photograph must share with the network, at least 4.
-        contradicting: whether points whose rays do not meet within the tolerance get coordinates, too, for
-            an adjustment that is to judge them.
-        judge: returns the misfit of an estimate with what is known besides the image points; it is asked
-            where two photographs of points in a plane have two orientations that fit alike.
+        network: the measurements, without image points of unknown object points.
+        estimate: cameras with start values, or an estimate in which exterior orientation and points are given
+            where known and NaN elsewhere.
+        seed: seed of all random choices.
+        refine: adjusts a fully determined part of the network (without NaN) and returns it. The cameras
+            passed to it have as many free parameters as the part can determine. Its result is used only if
+            the image points fit better.
+        start_tolerance: largest residual at the start, as a fraction of the photograph's diagonal.
+        final_tolerance_px: smallest tolerance, px; the tolerance follows the residuals down to it.
+        min_points: number of points that a photograph must share with the network, at least 4.
+        contradicting: whether points with rays that do not meet within the tolerance also get coordinates,
+            for an adjustment that judges them.
+        judge: returns the misfit of an estimate with knowledge other than the image points. It is called if
+            two photographs of points in a plane have two orientations that fit equally well.
 
     Returns:
-        The orientation, NaN with a reason for every photograph that could not be oriented, and for every
-        point that its rays do not determine.
+        The orientation. Photographs that could not be oriented, and points that their rays do not determine,
+        are NaN and have a reason.
 
     Raises:
-        GeometryError: no two photographs could be oriented, with the given values or without them, or fewer
-            cameras than the network has.
+        GeometryError: no two photographs could be oriented, with or without the given values, or there are
+            fewer cameras than in the network.
 
     Source: Luhmann et al. (2020), sec. 4.4.4 (orientation of image networks), with resection by Fischler and
     Bolles (1981) in every photograph.
@@ -190,7 +188,7 @@ def _as_cameras(cameras: Sequence[Camera], count: int) -> tuple[Camera, ...]:
 
 
 def _holds_control(network: Network, found: Orientation) -> bool:
-    """Return whether every control point that is measured fits in some photograph."""
+    """Return whether every measured control point fits in at least one photograph."""
     control, seen = network.control.complete, network.image_points
     measured = np.isin(control.point, seen.point[found.estimate.oriented[seen.image]])
     return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
@@ -205,18 +203,18 @@ def _best_of_rivals(
     final_tolerance_px: float,
     judge: Judge | None,
 ) -> tuple[Growth, Start]:
-    """Return the solution with the smallest residuals, of that found first and, if in doubt, of its rivals.
+    """Return the solution with the smallest residuals among the first one and, if it is in doubt, its rivals.
 
-    A solution is in doubt if its reversal in depth fits hardly worse, if it leaves residuals beyond the final
-    tolerance, or if a photograph had to leave it.
+    A solution is in doubt if its reversal in depth fits almost as well, if it leaves residuals beyond the
+    final tolerance, or if a photograph had to be dropped.
 
     Args:
-        growth: with the first solution.
-        start: what it started from.
-        values: cameras to begin anew with.
-        begin: begins anew with a share of the start tolerance.
+        growth: network with the first solution.
+        start: its start.
+        values: cameras for a new start.
+        begin: starts again with a share of the start tolerance.
         refine: the caller's adjustment.
-        final_tolerance_px: below this no image point is put aside, px.
+        final_tolerance_px: tolerance below which no image point is excluded, px.
         judge: as in `orient`.
     """
     oriented = growth.estimate.oriented
@@ -246,7 +244,7 @@ def _best_of_rivals(
 
 
 def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judge: Judge | None) -> Start:
-    """Start, resect and intersect until nothing more comes, and remove what does not belong."""
+    """Start, resect and intersect until nothing is added, and remove photographs that do not belong."""
     start = growth.begin(judge)
     adjusted = 0
     for _ in range(MAX_ROUNDS):
@@ -254,7 +252,7 @@ def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judg
         growth.intersect()
         now = int(growth.estimate.oriented.sum())
         if now >= FIRST_ADJUSTMENT and (now >= GROWTH * adjusted or (not added and now > adjusted)):
-            growth.refined(refine)
+            growth.adjust(refine)
             growth.adapt_tolerance(final_tolerance_px)
             growth.intersect()
             adjusted = now
@@ -266,10 +264,10 @@ def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judg
 
 
 def _settle(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> bool:
-    """Settle a network, and the rest of it once photographs that the others do not support are removed.
+    """Settle a network, and settle it again after removing photographs that the others do not support.
 
     Returns:
-        Whether a photograph was removed, now or before.
+        Whether a photograph was removed, now or earlier.
     """
     _settle_oriented(growth, refine, final_tolerance_px)
     dropped = growth.drop_unsupported() > 0
@@ -279,17 +277,17 @@ def _settle(growth: Growth, refine: Refine | None, final_tolerance_px: float) ->
 
 
 def _settle_oriented(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
-    """Resect, intersect and adjust all that is oriented until no image point comes or goes."""
+    """Resect, intersect and adjust everything oriented until the set of image points stays the same."""
     for _ in range(FINAL_ROUNDS):
         growth.adapt_tolerance(final_tolerance_px)
         growth.resect_all()
         growth.intersect()
-        if not growth.refined(refine):
+        if not growth.adjust(refine):
             break
 
 
 def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contradicting: bool) -> Orientation:
-    """Intersect the remaining points, bring the network onto control if it started free, and report."""
+    """Intersect the remaining points, transform a free network to control, and return the orientation."""
     lost = intersect_remaining(growth, contradicting=contradicting)
     network, control = growth.network, growth.network.control.complete
     seen = network.image_points
@@ -330,7 +328,7 @@ def _failures(growth: Growth) -> tuple[tuple[str, Remark], ...]:
 
 
 def _list_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
-    """Return the reasons with the photographs that they are of, each reason once."""
+    """Return the reasons in words, each once, with its photographs."""
     of_reason: dict[str, list[str]] = {}
     for name, reason in failures:
         of_reason.setdefault(reason.text.rstrip("."), []).append(name)
@@ -340,19 +338,19 @@ def _list_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
 
 @dataclass(frozen=True)
 class GivenStart:
-    """Given values that stay, with what was oriented and intersected beside them."""
+    """Accepted given values, completed by resection and intersection."""
 
     estimate: Estimate  # before the adjustment that judges them
-    replaced: tuple[Remark, ...]  # given orientations of single photographs that did not fit
+    replaced: tuple[Remark, ...]  # on given orientations of single photographs that did not fit
 
 
 def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> GivenStart | None:
-    """Complete given values and adjust them; None where they do not fit the image points.
+    """Complete given values and adjust them; return None if they do not fit the image points.
 
     Args:
-        growth: begun with given values; contains the adjusted network afterwards.
+        growth: network started from given values; contains the adjusted network afterwards.
         refine: the caller's adjustment.
-        final_tolerance_px: below this no image point is put aside, px.
+        final_tolerance_px: tolerance below which no image point is excluded, px.
     """
     control = growth.network.control.complete
     held = control.point[growth.fixed[control.point]]
@@ -363,7 +361,7 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
     rough = bool(np.median(growth.share_fitting()[start.oriented]) < KEPT_SHARE)
     replaced: tuple[Remark, ...] = ()
     for _ in range(ROUNDS):
-        changed = growth.refined(refine, everything=rough)
+        changed = growth.adjust(refine, everything=rough)
         growth.adapt_tolerance(final_tolerance_px)
         if not replaced:
             replaced = _replace_misfits(growth)
@@ -378,7 +376,7 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
 
 
 def _complete(growth: Growth) -> None:
-    """Orient and intersect what no values were given for; what was given stays as it is."""
+    """Orient and intersect everything without given values; given values do not change."""
     for _ in range(MAX_COMPLETIONS):
         growth.intersect(only_missing=True)
         if not growth.resect_next():
@@ -386,7 +384,7 @@ def _complete(growth: Growth) -> None:
 
 
 def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
-    """Resect the photographs most of whose image points do not fit; return what was replaced."""
+    """Resect the photographs with most image points not fitting; return remarks on those replaced."""
     before = growth.share_fitting()
     wrong = np.flatnonzero(growth.estimate.oriented & (before < MIN_SHARE)).tolist()
     if not wrong:
@@ -408,7 +406,7 @@ def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
 
 
 def _near_control(growth: Growth, start: Estimate, held: IntArray) -> bool:
-    """Return whether most rays of control that is held to its coordinates meet it from the given stations."""
+    """Return whether most rays of fixed control points fit their coordinates from the given orientations."""
     seen = growth.network.image_points
     rows = np.isin(seen.point, held) & start.oriented[seen.image]
     if not rows.any():
@@ -421,15 +419,15 @@ def _near_control(growth: Growth, start: Estimate, held: IntArray) -> bool:
 
 
 def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[str, Remark], ...]:
-    """Intersect the points that are still missing; return (name, reason) of those that have no place.
+    """Intersect the points that are still missing; return (name, reason) of those without coordinates.
 
-    Nothing is oriented on them any more, so that a small angle does no harm: their standard deviations
-    show it. Rays that are parallel within their precision, or within the tolerance of the orientation,
-    have no point of intersection.
+    No more photographs are oriented on them, so small angles do no harm; the standard deviations show them.
+    Rays that are parallel within their precision, or within the tolerance of the orientation, do not
+    intersect.
 
     Args:
-        growth: all photographs oriented that can be; gets the points.
-        contradicting: whether points whose rays do not meet within the tolerance get a place, too.
+        growth: network with all photographs oriented that can be; receives the points.
+        contradicting: whether points with rays that do not meet within the tolerance also get coordinates.
     """
     network, estimate = growth.network, growth.estimate
     seen, n = network.image_points, len(network.points)
@@ -450,7 +448,7 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
         found = intersect(
             uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=limit
         )
-        # beyond the precision of the rays and what the orientation is known to; False where NaN
+        # beyond the precision of the rays and the tolerance of the orientation; False where NaN
         clear = found.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)
         parallel |= np.isfinite(found.angle) & ~clear
         points = np.where((missing & clear & ~np.isfinite(points[:, 0]))[:, None], found.points, points)
@@ -458,8 +456,8 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     return _reasons(growth, rays, parallel)
 
 
-def _reasons(growth: Growth, rays: np.ndarray, parallel: np.ndarray) -> tuple[tuple[str, Remark], ...]:
-    """Say why points have no coordinates, of whose rays so many are from oriented photographs, (n,)."""
+def _reasons(growth: Growth, rays: IntArray, parallel: BoolArray) -> tuple[tuple[str, Remark], ...]:
+    """Return the reasons why points lack coordinates; `rays` counts rays from oriented photographs, (n,)."""
     measured = growth.network.rays()
     out = []
     for j in np.flatnonzero(~growth.estimate.determined & (measured > 0)):

@@ -1,4 +1,9 @@
-"""The pair of photographs that a network starts from, and which of its solutions is the true one."""
+"""Starting pair: the pair of photographs from which a network grows, with the right one of its solutions.
+
+Pairs with many common points are oriented relatively. Each of their solutions becomes a model. The other
+photographs are resected on it, and the model that fits most image points is the start. If there is no third
+photograph to distinguish the two solutions of a plane, other knowledge decides.
+"""
 
 from __future__ import annotations
 
@@ -19,32 +24,30 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.runtime.progress import report_step
 from sfm.similarity import fit_similarity
 
-MAX_TIED = 1_000_000  # pairs with equally many common points of which the best spread ones are chosen
-MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
-BARREN_PAIRS = 20  # pairs most of whose points fit no orientation, after which no more are tried
-PAIR_TRIALS = 500  # samples of five points in a pair: enough where 45 % of its points fit, at 99.99 %
-AS_A_PLANE = 0.1  # tangents: by so much the relief of a flat object may move the points of a plane
+MAX_TIED = 1_000_000  # largest number of pairs with equal counts of common points to select from
+MAX_PAIRS = 60  # pairs with solutions that are tried on the other photographs
+BARREN_PAIRS = 20  # unsuccessful pairs, with most points fitting no orientation, after which the search ends
+PAIR_TRIALS = 500  # samples of five points in a pair; if 45 % of its points fit, it succeeds with 99.99 %
+AS_A_PLANE = 0.1  # tangents; largest displacement of points from a plane by the relief of a flat object
 PAIR_POINTS = 1000  # common points of a pair that take part in its orientation
-MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
-MIN_ANGLE_OF_TWO_DEG = 3.0  # of a survey of two photographs, which has no other pair
-TWOFOLD = 2.0  # ratio of two misfits from which the smaller is the true one
-SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
-SCREEN_POINTS = 30  # points per photograph, and photographs per solution, that take part in it
-SCREEN_PHOTOGRAPHS = 40
+MIN_MEDIAN_ANGLE_DEG = 5.0  # smallest median ray angle of a useful starting pair
+MIN_ANGLE_OF_TWO_DEG = 3.0  # the same in a survey of two photographs, which has no other pair
+TWOFOLD = 2.0  # ratio of two misfits above which the smaller one is right
+SCREEN_TRIALS = 200  # triples per photograph in the comparison of solutions
+SCREEN_POINTS = 30  # points per photograph in the comparison
+SCREEN_PHOTOGRAPHS = 40  # photographs per solution in the comparison
 
 
 @dataclass(frozen=True)
 class Start:
     """First photographs and points of a network, NaN for all others."""
 
-    pair: tuple[int, int] | None  # photographs it started from
+    pair: tuple[int, int] | None  # starting pair
     kind: str  # spatial | planar | control | given
     position: FloatArray  # (m, 3)
     rotation: FloatArray  # (m, 3, 3)
     points: FloatArray  # (n, 3)
-    twofold: bool = (
-        False  # the points lie in a plane, another start fits as well and no third photograph decides
-    )
+    twofold: bool = False  # ambiguous: points in a plane, another start fits as well, no third photograph
 
 
 Judge = Callable[[Start], float]
@@ -56,8 +59,8 @@ class _Candidate:
 
     start: Start
     score: float  # see _support
-    resected: int  # photographs besides the pair that fit it
-    favoured: bool  # of the kind that the conjugate rays themselves speak for
+    resected: int  # photographs other than the pair that fit it
+    favoured: bool  # whether it has the kind that the conjugate rays favour
 
 
 def best_start(
@@ -71,19 +74,19 @@ def best_start(
     """Return the pair solution on which most image points of all other photographs can be resected.
 
     Args:
-        network: measured facts.
-        tangents: of all image points, shape (k, 2).
+        network: the measurements.
+        tangents: tangents of all image points, shape (k, 2).
         tolerance: largest residual in each photograph, tangents, shape (m,).
-        seed: of the random samples.
-        judge: misfit of a start with what else is known, where no third photograph decides between the two of
-            a plane; the clearly smaller one (TWOFOLD) is taken.
+        seed: seed of the random samples.
+        judge: misfit of a start with other knowledge, used if no third photograph decides between the two
+            solutions of a plane; the clearly smaller misfit (TWOFOLD) decides.
 
     Raises:
         GeometryError: no two photographs have four points in common, or no geometry fits them.
 
-    Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be distinguished in a pair; in
-    a third photograph the false plane does not fit. All solutions of all promising pairs are tried and
-    compared by the truncated squares over the photographs that share most points with them.
+    Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be distinguished in a pair, but
+    the false plane does not fit a third photograph. All solutions of all promising pairs are compared by
+    their truncated squares over the photographs that share most points with them.
     """
     of_photograph = _sorted_rows(network, tangents)
     pairs = _promising_pairs(network, of_photograph)
@@ -92,7 +95,7 @@ def best_start(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
             f"common: {_list_common(network, of_photograph)}"
         )
-    found: list[_Candidate] = []  # of the pair with the best of them
+    found: list[_Candidate] = []  # candidates of the best pair
     fits = False  # whether most points of any pair fit an orientation
     widest, least_angle = 0.0, MIN_MEDIAN_ANGLE_DEG if len(network.images) > 2 else MIN_ANGLE_OF_TWO_DEG
     for tried, (i, j) in enumerate(pairs):
@@ -129,16 +132,16 @@ def best_start(
 
 
 def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float) -> tuple[Estimate, ...]:
-    """Return all solutions that two photographs allow, however well they fit, placed on the points.
+    """Return all solutions of two photographs, whatever their fit, transformed to the points of an estimate.
 
-    Only those with a base that a survey could start from. A plane seen at moderate angles is also one seen at
-    a grazing angle from a base of almost nothing, which bends to fit the errors better than the truth.
-    Planes are starts of flat objects too, though relief takes points away from them: a telephoto lens shows
-    relief large and perspective small, and coplanarity by itself may end in another minimum.
+    Only solutions with a useful base are returned. A plane seen at moderate angles has another solution at a
+    grazing angle with an almost vanishing base, which can fit the errors better than the true solution.
+    Planes also serve as starts for flat objects with relief. A telephoto lens shows large relief and little
+    perspective, and coplanarity alone may end in another minimum.
 
     Args:
-        network: of two photographs and points that both see.
-        estimate: one solution, whose cameras and frame they have; those like it are among them.
+        network: network of two photographs and points that both see.
+        estimate: one solution, which gives cameras and frame; similar solutions are included.
         tolerance_px: largest residual of a fitting pair of image points, px.
 
     Source: Ma et al. (2004), An Invitation to 3-D Vision, sec. 5.3.3 (the two solutions of a plane).
@@ -158,7 +161,7 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
         start, angle = _model(network, (0, 1), points, first, second, solution)
         if start is None or angle < MIN_ANGLE_OF_TWO_DEG or not np.isfinite(start.points).all():
             continue
-        with suppress(GeometryError):  # points on a line have no place
+        with suppress(GeometryError):  # points on a line do not determine it
             placing = fit_similarity(start.points, estimate.points)
             model = replace(estimate, position=start.position, rotation=start.rotation, points=start.points)
             found.append(placing.apply_estimate(model))
@@ -166,7 +169,7 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
 
 
 def _choose(found: list[_Candidate], judge: Judge | None) -> Start:
-    """Return the start with the best score; of two that no other photograph distinguishes, the judge's."""
+    """Return the start with the best score; the judge decides between two without another photograph."""
     best = _best_of(found)
     if best.resected:
         return best.start
@@ -186,20 +189,20 @@ def _best_of(found: list[_Candidate]) -> _Candidate:
 
 
 def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
-    """Rows of the usable image points of each photograph."""
+    """Return the rows of the usable image points of each photograph."""
     seen = network.image_points
     usable = np.flatnonzero(np.isfinite(tangents).all(axis=1))
     return [usable[rows] for rows in rows_of(seen.image[usable], len(network.images))]
 
 
 def _list_common(network: Network, of_photograph: list[IntArray]) -> str:
-    """Say for each photograph with which other it has most points in common."""
+    """Return in words, for each photograph, the other photograph with which it shares most points."""
     usable = np.zeros(len(network.image_points), dtype=bool)
     usable[np.concatenate(of_photograph)] = True
     most, partner = np.zeros(len(of_photograph), dtype=np.int64), np.zeros(len(of_photograph), dtype=np.int64)
     for first, second, count in network.common_points(usable):
         for one, other in ((first, second), (second, first)):
-            order = np.lexsort((-other, count, one))  # of each photograph the last one has most
+            order = np.lexsort((-other, count, one))  # the last entry of each photograph is its largest
             last = order[np.flatnonzero(np.diff(one[order], append=-1))]
             better = last[count[last] > most[one[last]]]
             most[one[better]], partner[one[better]] = count[better], other[better]
@@ -218,11 +221,11 @@ def _list_common(network: Network, of_photograph: list[IntArray]) -> str:
 
 
 def _promising_pairs(network: Network, of_photograph: list[IntArray]) -> list[tuple[int, int]]:
-    """Pairs with at least four common points, those with most first, spread over the photographs."""
+    """Return pairs with at least four common points, most points first, spread over the photographs."""
     m = len(of_photograph)
     usable = np.zeros(len(network.image_points), dtype=bool)
     usable[np.concatenate(of_photograph)] = True
-    pairs = np.zeros(1, dtype=np.int64)  # by the number of common points
+    pairs = np.zeros(1, dtype=np.int64)  # number of pairs by their number of common points
     for _, _, count in network.common_points(usable):
         now = np.bincount(count, minlength=len(pairs))
         now[: len(pairs)] += pairs
@@ -230,7 +233,7 @@ def _promising_pairs(network: Network, of_photograph: list[IntArray]) -> list[tu
     pairs[:PLANAR_POINTS] = 0
     fewest = int(np.flatnonzero(np.cumsum(pairs[::-1])[::-1] >= min(MAX_PAIRS, pairs.sum()))[-1])
     kept, passed = [], 0
-    every = 1 + int(pairs[fewest]) // MAX_TIED  # of pairs that have as many points in common as others
+    every = 1 + int(pairs[fewest]) // MAX_TIED  # stride over pairs with equal numbers of common points
     for first, second, count in network.common_points(usable):
         number = passed + np.cumsum(count == fewest)
         take = (count > fewest) | ((count == fewest) & (number % every == 0))
@@ -238,7 +241,7 @@ def _promising_pairs(network: Network, of_photograph: list[IntArray]) -> list[tu
         passed = int(number[-1]) if len(number) else passed
         kept.append(np.stack([first[take], second[take], count[take]]))
     first, second, count = np.concatenate(kept, axis=1)
-    # equal counts in the order of j - i, so that a cut takes pairs from all over the survey
+    # equal counts in the order of j - i, so that a cut keeps pairs from the whole survey
     order = np.lexsort((second, first, (second - first) % max(2, m // 3), -count))
     if len(order) > MAX_PAIRS:
         sure = int((count > count[order[MAX_PAIRS - 1]]).sum())
@@ -251,7 +254,7 @@ def _promising_pairs(network: Network, of_photograph: list[IntArray]) -> list[tu
 def _common(
     network: Network, tangents: FloatArray, a: IntArray, b: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Points that two photographs have in common, and their tangents in both."""
+    """Return the points that two photographs have in common, and their tangents in both."""
     seen = network.image_points
     points, rows_a, rows_b = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
     if len(points) > PAIR_POINTS:
@@ -268,7 +271,7 @@ def _model(
     second: FloatArray,
     solution: RelativeOrientation,
 ) -> tuple[Start | None, float]:
-    """Return a pair and its model points as a start, None if too few rays intersect, and their angle, deg."""
+    """Return a pair with its model as a start, None if too few rays intersect, and the median angle, deg."""
     xyz = model_points(first, second, solution)
     usable = np.isfinite(xyz).all(axis=1)
     if usable.sum() < PLANAR_POINTS:
@@ -294,12 +297,11 @@ def _support(
     start: Start,
     seed: int,
 ) -> tuple[float, int]:
-    """Return how many image points fit a start, and how many photographs can be resected on it.
+    """Return the score of a start, and the number of photographs that can be resected on it.
 
-    An image point counts 1 - squared residual in tolerances.
-
-    The photographs that share most points with the model are resected on it, then the points are
-    intersected again from all of them, which separates a true plane from a bent one.
+    An image point adds 1 minus its squared residual in tolerances. The photographs that share most points
+    with the model are resected on it. Then the points are intersected again from all of them, which separates
+    a true plane from a distorted one.
     """
     seen = network.image_points
     determined = np.asarray(np.isfinite(start.points).all(axis=1))

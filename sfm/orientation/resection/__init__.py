@@ -1,12 +1,12 @@
 """Space resection: the exterior orientation of one photograph from known object points.
 
-All methods take tangents u = -U/W, v = -V/W of the measured rays and the object points, and answer in the
-frame of these.
+All methods take the tangents u = -U/W, v = -V/W of the measured rays and the object points. Results are in
+the frame of the object points.
 
-- `ransac.resect_robust`: begin here; from four points on, whatever part of them is wrong.
-- `fischler_bolles.resect_fischler_bolles` (P3P): closed, without approximate values.
-- `least_squares.resect_least_squares`: the adjustment, with dispersion matrix and history.
-- `least_squares.choose_by_line`: which solution is the true one.
+- `ransac.resect_robust`: start here; for four or more points, any of which may be wrong.
+- `fischler_bolles.resect_fischler_bolles` (P3P): closed form, without approximate values.
+- `least_squares.resect_least_squares`: the adjustment, with covariance and history.
+- `least_squares.choose_by_line`: selects the true solution.
 
-The other methods are in `sfm.textbook.resection`.
+Other methods are in `sfm.textbook.resection`.
 """

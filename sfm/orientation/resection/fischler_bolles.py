@@ -1,4 +1,4 @@
-"""Space resection from three points by Fischler and Bolles: quartic in the ratio of two legs (P3P)."""
+"""Space resection from three points by Fischler and Bolles (P3P), by a quartic in the ratio of two legs."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from sfm.kernels.small_algebra import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.least_squares import ResectionSolution, checked_points, ordered, solution_of
 
 MAX_SOLUTIONS = 4
-WORK = MAX_ROOTS  # numbers of scratch space
+WORK = MAX_ROOTS  # size of the scratch space
 FLAT = 1e-14  # 16 area^2 over the fourth power of the largest side below which a triangle is a line
 NEWTON_STEPS = 20
 NEWTON_CONVERGED = 1e-10  # relative step; the error after it is its square
 FITS = 1e-9  # misfit of the squared sides, relative to the largest, below which legs are a solution
-MAX_SAME_DIFFERENCE = 1e-9  # relative difference of legs below which two solutions are one
-# Relative misfit above which the second root for the third leg is no separate solution.
+MAX_SAME_DIFFERENCE = 1e-9  # relative difference of legs below which two solutions are the same
+# Relative misfit above which the second root for the third leg is not a separate solution.
 MAX_DOUBLE_ROOT_MISFIT = 1e-6
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Exterior orientations of a batch of triples, up to four each; unused places are NaN."""
+    """Exterior orientations of a batch of triples, up to four each; unused entries are NaN."""
 
     count: IntArray  # number of solutions of each triple, (k,)
     position: FloatArray  # projection centres X0, object unit, (k, 4, 3)
@@ -36,19 +36,20 @@ class Poses:
 
 @checked_arguments(tangents="k 2", points="n 3")
 def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
-    """Return the exterior orientations from the first three points, the one that all points confirm first.
+    """Return the exterior orientations from the first three points, best fit to all points first.
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3.
         points: object points, shape (n, 3), object unit.
 
     Returns:
-        One to four solutions; from four points on their order is meaningful (see also `choose_by_line`).
+        One to four solutions; with at least four points their order is meaningful (see also
+        `choose_by_line`).
 
     Raises:
-        GeometryError: fewer than three points, points on one line or coincident, or no solution.
+        GeometryError: fewer than three points, collinear or coincident points, or no solution.
 
-    Source: as `resect_triples`.
+    Source: as for `resect_triples`.
     """
     uv, xyz = checked_points("fischler-bolles", tangents, points, needed=3)
     poses = resect_triples(rays_from_tangents(uv[:3])[None], xyz[None, :3])
@@ -67,11 +68,11 @@ def resect_triples(rays: FloatArray, points: FloatArray) -> Poses:
         points: object points, shape (k, 3, 3), object unit.
 
     Returns:
-        Up to four solutions per triple; none where the points lie on a line or coincide.
+        Up to four solutions per triple; none if the points are collinear or coincide.
 
     Source: Fischler, Bolles (1981), Comm. ACM 24(6), appendix A: sides R^2 = a^2 + b^2 - 2ab cos(theta),
-    quartic G4 x^4 + ... + G0 = 0 in x = b/a; the legs are then polished by Newton's method on the
-    three equations.
+    quartic G4 x^4 + ... + G0 = 0 in x = b/a. The legs are then polished by Newton's method on the three
+    equations.
     """
     rays = np.ascontiguousarray(rays, dtype=float).reshape(-1, 3, 3)
     points = np.ascontiguousarray(points, dtype=float).reshape(-1, 3, 3)
@@ -94,7 +95,7 @@ def leg_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def rays_from_tangents(tangents: FloatArray) -> FloatArray:
-    """Return unit vectors in the image frame of tangents u = -U/W, v = -V/W, shape (..., 3)."""
+    """Return unit vectors in the image frame from tangents u = -U/W, v = -V/W, shape (..., 3)."""
     uv = np.asarray(tangents, dtype=float)
     rays = np.concatenate([uv, -np.ones((*uv.shape[:-1], 1))], axis=-1)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
@@ -131,7 +132,13 @@ def solve_triple(
 ) -> int:
     """Fill positions (4, 3), rotations (4, 3, 3) and legs (4, 3) of one triple; return their number.
 
-    `work` is scratch space of WORK numbers, so that a batch allocates nothing.
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+        position: receives the projection centres, (4, 3).
+        rotation: receives the rotations, (4, 3, 3).
+        legs: receives the distances to the points, (4, 3).
+        work: scratch space of WORK numbers, so that a batch needs no allocation.
     """
     Rab2, Rac2, Rbc2 = squared_sides(points)
     gab, gac, gbc = squared_sides(rays)
@@ -176,7 +183,7 @@ def squared_sides(p: FloatArray) -> tuple[float, float, float]:
 
 @compiled_fused
 def is_triangle(ab: float, ac: float, bc: float) -> bool:
-    """Return whether squared sides are those of a triangle with an area (Heron)."""
+    """Return whether squared sides form a triangle with an area (Heron)."""
     area16 = 2.0 * (ab * ac + ac * bc + bc * ab) - (ab * ab + ac * ac + bc * bc)
     largest = max(ab, max(ac, bc))
     return area16 > FLAT * largest * largest and min(ab, min(ac, bc)) > 0.0
@@ -216,7 +223,22 @@ def polish_legs(
     gac: float,
     gbc: float,
 ) -> tuple[bool, float, float, float]:
-    """Improve legs by Newton's method on R^2 = (a - b)^2 + 2 a b (1 - cos); return if they fit, and them."""
+    """Improve legs by Newton's method on R^2 = (a - b)^2 + 2 a b (1 - cos).
+
+    Args:
+        a: distance to the first point.
+        b: distance to the second point.
+        c: distance to the third point.
+        Rab2: squared side between the first and second point.
+        Rac2: squared side between the first and third point.
+        Rbc2: squared side between the second and third point.
+        gab: 1 - cos of the angle between the first and second ray.
+        gac: 1 - cos of the angle between the first and third ray.
+        gbc: 1 - cos of the angle between the second and third ray.
+
+    Returns:
+        Whether the legs fit the sides, and the legs.
+    """
     misfit = np.inf
     for _ in range(NEWTON_STEPS):
         f0 = (a - b) ** 2 + 2.0 * a * b * gab - Rab2
@@ -234,7 +256,7 @@ def polish_legs(
         da = (-f0 * q1 * p2 - q0 * f1 * q2 + q0 * q1 * f2) * inverse
         db = (-p0 * q1 * f2 + p0 * f1 * q2 - f0 * p1 * q2) * inverse
         dc = (-p0 * f1 * p2 - q0 * p1 * f2 + f0 * p1 * p2) * inverse
-        # a step beyond half of a leg has left the neighbourhood of the root
+        # a step longer than half a leg leaves the neighbourhood of the root
         while abs(da) > 0.5 * a or abs(db) > 0.5 * b or abs(dc) > 0.5 * c:
             da, db, dc = 0.5 * da, 0.5 * db, 0.5 * dc
         a, b, c = a - da, b - db, c - dc
@@ -245,7 +267,7 @@ def polish_legs(
 
 @compiled_fused
 def is_known(a: float, b: float, c: float, legs: FloatArray, n: int) -> bool:
-    """Return whether legs are those of one of the first n solutions."""
+    """Return whether legs equal those of one of the first n solutions."""
     for i in range(n):
         if abs(a - legs[i, 0]) + abs(b - legs[i, 1]) + abs(c - legs[i, 2]) < MAX_SAME_DIFFERENCE * (
             a + b + c
@@ -264,7 +286,7 @@ def _pose_from_legs(
     position: FloatArray,
     rotation: FloatArray,
 ) -> None:
-    """Fill R from the orthonormal frames of the two triangles, X0 from their centres."""
+    """Fill R from the orthonormal frames of the two triangles, and X0 from their centres."""
     ax, ay, az = a * rays[0, 0], a * rays[0, 1], a * rays[0, 2]
     bx, by, bz = b * rays[1, 0], b * rays[1, 1], b * rays[1, 2]
     cx, cy, cz = c * rays[2, 0], c * rays[2, 1], c * rays[2, 2]

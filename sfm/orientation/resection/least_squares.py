@@ -1,4 +1,4 @@
-"""Space resection by least squares, and the figures that separate good orientations from others."""
+"""Space resection by least squares, and criteria that distinguish the right orientation from others."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import solve_scaled, turn
 
-COINCIDENT = 1e-9  # of the extent of the points
-COLLINEAR = 1e-7  # second singular value over the first
-MIN_TO_CHOOSE = 4  # three points are fitted by every solution
+COINCIDENT = 1e-9  # largest distance of coincident points, relative to their extent
+COLLINEAR = 1e-7  # largest ratio of the second singular value to the first for collinear points
+MIN_TO_CHOOSE = 4  # every solution fits three points
 UNKNOWNS = 6
 MAX_STEPS = 50
 HALVINGS = 8
-CONVERGED = 1e-12  # step relative to the distance of the points and to 1 rad
+CONVERGED = 1e-12  # last step, relative to the distance of the points and to 1 rad
 
 
 @dataclass(frozen=True)
 class Resection:
-    """Exterior orientation of one photograph by least squares over its points."""
+    """Exterior orientation of one photograph by least squares."""
 
     position: FloatArray  # projection centre X0, object unit, (3,)
     rotation: FloatArray  # R, image to object axes, (3, 3)
@@ -59,15 +59,15 @@ def resect_least_squares(
         points: object points, shape (n, 3), object unit.
         position: approximate projection centre X0, shape (3,), object unit.
         rotation: approximate R, image to object axes, shape (3, 3).
-        weights: weight matrix of each image point, shape (n, 2, 2); unit matrices if not given, so that
-            sigma0 is a tangent (times c: mm on the image).
+        weights: weight matrix of each image point, shape (n, 2, 2). Unit matrices if not given; then sigma0
+            is a tangent (times c: mm on the image).
         max_steps: largest number of Gauss-Newton steps.
 
     Raises:
-        GeometryError: fewer than three points, points that do not determine the orientation, or start
-            values from which points lie behind the camera.
+        GeometryError: fewer than three points, points that do not determine the orientation, or points
+            behind the camera at the start values.
 
-    Source: Kraus (2007), sec. 4.2.1; Gauss-Newton, a step halved while it raises the sum of squares.
+    Source: Kraus (2007), sec. 4.2.1; Gauss-Newton, with steps halved while they raise the sum of squares.
     """
     n = len(points)
     if n < 3:
@@ -108,11 +108,12 @@ def cofactors_in_angles(cofactors: FloatArray, rotation: FloatArray) -> FloatArr
     """Return cofactors of X0 and (omega, phi, kappa) from those of X0 and a small rotation in image axes.
 
     Args:
-        cofactors: of X0 and of w in R exp([w]x), shape (6, 6).
+        cofactors: cofactors of X0 and of w in R exp([w]x), shape (6, 6).
         rotation: R, shape (3, 3).
 
     Returns:
-        Shape (6, 6). At phi = +-90 deg omega and kappa are not separable and the pseudo-inverse is used.
+        Cofactors, shape (6, 6). At phi = +-90 deg, where omega and kappa are not separable, the
+        pseudo-inverse is used.
     """
     J = np.eye(6)
     J[3:, 3:] = np.linalg.pinv(_rotation_from_angle_rates(rotation))
@@ -128,7 +129,7 @@ def _rotation_from_angle_rates(rotation: FloatArray) -> FloatArray:
     return np.stack([(Ry @ Rz)[0], Rz[1], np.array([0.0, 0.0, 1.0])], axis=1)
 
 
-DONE, LIMIT, BEHIND, RANK = 0, 1, 2, 3  # how an adjustment of one pose ends
+DONE, LIMIT, BEHIND, RANK = 0, 1, 2, 3  # results of the adjustment of one pose
 
 
 @compiled
@@ -144,7 +145,20 @@ def adjust_pose(
     N: FloatArray,
     residuals: FloatArray,
 ) -> tuple[float, int, int]:
-    """Adjust X0 and R in place; fill history, N (of X0 and w) and residuals; return v'Pv, steps, state."""
+    """Adjust X0 and R in place; fill history, N (of X0 and w) and residuals; return v'Pv, steps, state.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, (n, 2).
+        points: object points, (n, 3).
+        weights: weight matrices of the image points, (n, 2, 2).
+        used: points that take part, (n,).
+        X0: projection centre, (3,).
+        R: rotation, image to object axes, (3, 3).
+        max_steps: largest number of steps.
+        history: receives position and angles, (steps + 1, 6) or (0, 6).
+        N: receives the normal matrix, (6, 6).
+        residuals: receives the residuals, (n, 2).
+    """
     n_vector, new_n, new_N = np.empty(6), np.empty(6), np.empty((6, 6))
     new_X0, new_R = np.empty(3), np.empty((3, 3))
     dx = np.empty(6)
@@ -209,7 +223,21 @@ def pose_normals(
     n_vector: FloatArray,
     residuals: FloatArray,
 ) -> tuple[float, float]:
-    """Normal equations of X0 and w (R exp([w]x)); returns v'Pv (inf: a point behind) and mean distance."""
+    """Fill the normal equations of X0 and w in R exp([w]x); return v'Pv and the mean distance.
+
+    v'Pv is infinite if a point is behind the camera.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, (n, 2).
+        points: object points, (n, 3).
+        weights: weight matrices of the image points, (n, 2, 2).
+        used: points that take part, (n,).
+        X0: projection centre, (3,).
+        R: rotation, image to object axes, (3, 3).
+        N: receives the normal matrix, (6, 6).
+        n_vector: receives the right-hand side, (6,).
+        residuals: receives the residuals, (n, 2).
+    """
     N[:] = 0.0
     n_vector[:] = 0.0
     cost, distance, count = 0.0, 0.0, 0
@@ -256,7 +284,7 @@ def pose_normals(
 
 @dataclass(frozen=True)
 class ResectionSolution:
-    """An exterior orientation and how it fits the image points it was tested on."""
+    """An exterior orientation with its residuals at the image points."""
 
     position: FloatArray  # projection centre X0, object unit, (3,)
     rotation: FloatArray  # R, image to object axes, (3, 3)
@@ -298,21 +326,21 @@ class LineFit:
 def choose_by_line(
     solutions: tuple[ResectionSolution, ...], tangents: FloatArray
 ) -> tuple[ResectionSolution, tuple[LineFit, ...]]:
-    """Return the solution whose computed image coordinates lie nearest to the line computed = measured.
+    """Return the solution with computed image coordinates closest to the line computed = measured.
 
     Args:
-        solutions: of a resection from three points, with residuals at all points.
+        solutions: solutions of a resection from three points, with residuals at all points.
         tangents: measured image points, shape (n, 2), n >= 4.
 
     Returns:
-        The chosen solution, and the line of every solution in the order given.
+        The chosen solution, and the lines of all solutions in the given order.
 
     Raises:
-        GeometryError: fewer than four points, others than those of the solutions, or no solution that has all
-            of them in front of the camera.
+        GeometryError: fewer than four points, points other than those of the solutions, or no solution with
+            all points in front of the camera.
 
     Source: document 001, secs. 4.2.1 and 5.1: the unique solution of the P3P by fitting a line through at
-    least four points. The document names the principle without formulas; this is our reading of it.
+    least four points. The document states the principle without formulas; this is our interpretation.
     """
     if len(tangents) < MIN_TO_CHOOSE:
         raise GeometryError(
@@ -331,7 +359,7 @@ def choose_by_line(
 
 
 def _fit(measured: FloatArray, computed: FloatArray) -> LineFit:
-    """Regression of computed on measured coordinates; infinite if a point is behind the camera."""
+    """Return the regression of computed on measured coordinates; infinite if a point is behind the camera."""
     if not np.isfinite(computed).all():
         return LineFit(np.nan, np.nan, np.inf, np.inf)
     slope, intercept = np.polyfit(measured, computed, 1)
@@ -360,7 +388,7 @@ def tangents_of(position: FloatArray, rotation: FloatArray, points: FloatArray) 
 
 
 def rotation_from_position(tangents: FloatArray, points: FloatArray, position: FloatArray) -> FloatArray:
-    """Return R that turns the measured rays best into the directions from the position to the points.
+    """Return R that best rotates the measured rays into the directions from the position to the points.
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 2.
@@ -378,18 +406,24 @@ def rotation_from_position(tangents: FloatArray, points: FloatArray, position: F
 
 
 def ordered(solutions: list[ResectionSolution]) -> tuple[ResectionSolution, ...]:
-    """Return solutions with the smallest residuals first."""
+    """Return solutions in the order of their residuals, smallest first."""
     return tuple(sorted(solutions, key=lambda solution: solution.rms))
 
 
 def checked_points(
     method: str, tangents: FloatArray, points: FloatArray, *, needed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return image and object points as arrays, or raise with the reason why a method cannot use them.
+    """Return image and object points as arrays, or raise the reason why a method cannot use them.
+
+    Args:
+        method: name of the method, for the message.
+        tangents: image points, shape (n, 2).
+        points: object points, shape (n, 3).
+        needed: number of points that the method needs.
 
     Raises:
         GeometryError: too few points, unequal numbers, values that are not finite, coincident points, or
-            all points on one line.
+            collinear points.
     """
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
@@ -410,7 +444,7 @@ def checked_points(
         i, j = np.unravel_index(int(np.argmin(distance)), distance.shape)
         raise GeometryError(f"{method}: points {min(i, j) + 1} and {max(i, j) + 1} coincide")
     for name, values in (("object", xyz), ("image", uv)):
-        # those that the method starts from, and all of them
+        # the points that the method starts from, and all points
         for some in (values[: max(needed, 3)], values):
             s = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
             if s[1] <= COLLINEAR * s[0]:
@@ -419,6 +453,6 @@ def checked_points(
 
 
 def thickness(points: FloatArray) -> float:
-    """Return the extent of object points across their plane over the largest one; 0 if all coincide."""
+    """Return the extent of object points across their plane over the largest extent; 0 if all coincide."""
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(s[2] / s[0]) if s[0] > 0 else 0.0

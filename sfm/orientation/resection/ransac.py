@@ -1,4 +1,4 @@
-"""Space resection from many points of which some are wrong: P3P in RANSAC, then least squares."""
+"""Robust space resection from many points, some of them wrong: P3P in RANSAC, then least squares."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ from sfm.orientation.resection.least_squares import (
     pose_normals,
 )
 
-SAMPLE = 3  # points of a trial
-MARGIN_SD = 3  # standard deviations of the number of trials that are added to its expectation
+SAMPLE = 3  # points in a trial
+MARGIN_SD = 3  # standard deviations of the number of trials, added to its expectation
 MAX_TRIALS = 20_000
 LOCAL, FINAL = 0, 1
-# Gauss-Newton steps of the local improvement of a candidate and of the final one; not plain numbers, for
-# each of which `adjust_pose` would be compiled
+# Gauss-Newton steps of the local and of the final improvement; an array, because `adjust_pose` would be
+# compiled for each plain number
 STEPS = np.array([4, 30])
-ROUNDS = 10  # of least squares and new choice of the fitting points
-CHANCE = 0.5  # poses that random points may be expected to support
-FEW_POINTS = 8  # up to here every triple is tried and every candidate improved
+ROUNDS = 10  # rounds of least squares and new selection of the fitting points
+CHANCE = 0.5  # largest expected number of poses that random points support
+FEW_POINTS = 8  # number of points up to which every triple is tried and every candidate improved
 _NOWHERE = np.full(3, np.nan)
 
 
 @dataclass(frozen=True)
 class RobustResection:
-    """Exterior orientation from points of which some do not fit; NaN with a reason if there is none."""
+    """Exterior orientation from points, some of which do not fit; NaN with a reason if there is none."""
 
     position: FloatArray  # projection centre X0, object unit, (3,)
     rotation: FloatArray  # R, image to object axes, (3, 3)
     inliers: BoolArray  # points that fit, (n,)
-    residuals: FloatArray  # v = computed - measured of all points, tangents, NaN if behind, (n, 2)
-    rms: float  # per coordinate over the fitting points, tangents
+    residuals: FloatArray  # v = computed - measured of all points, tangents, NaN behind the camera, (n, 2)
+    rms: float  # root mean square residual per coordinate of the fitting points, tangents
     sigma0: float  # a posteriori standard deviation of a coordinate, tangents; NaN without redundancy
     sigma: float  # standard deviation of a coordinate for the covariance, tangents
-    normal_matrix: FloatArray  # of X0 and a small rotation in image axes, for unit weights, (6, 6)
-    trials: int  # triples tried
+    normal_matrix: FloatArray  # N of X0 and a small rotation in image axes, for unit weights, (6, 6)
+    trials: int  # number of triples tried
     reason: str  # why there is no orientation; empty if there is one
-    needed: int  # points that must fit
+    needed: int  # number of points that must fit
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -87,17 +87,17 @@ def resect_robust(
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
         points: object points, shape (n, 3), object unit.
         tolerance: largest residual vector of a fitting point, tangents.
-        seed: of the choice of triples; the same seed gives the same result.
-        min_inliers: fewest fitting points, at least 4 (three always fit).
-        max_trials: most triples tried.
-        sigma: a priori standard deviation of a coordinate for the covariance, tangents; the
-            a posteriori one if not given.
-        field: area of the photograph, squared tangents; if given, more points must fit than chance
-            would bring together (`fewest_fitting`).
+        seed: seed for the choice of triples; the same seed gives the same result.
+        min_inliers: smallest number of fitting points, at least 4 (three always fit).
+        max_trials: largest number of triples.
+        sigma: a priori standard deviation of a coordinate for the covariance, tangents; the a posteriori one
+            if not given.
+        field: area of the photograph, squared tangents; if given, more points must fit than by chance
+            (`fewest_fitting`).
 
     Returns:
-        The orientation with the smallest truncated sum of squared residuals, refined by least squares
-        over the fitting points; or the reason why there is none.
+        The orientation with the smallest truncated sum of squared residuals, refined by least squares over
+        the fitting points; or the reason why there is none.
 
     Source: Fischler, Bolles (1981), secs. II-IV: trials until E(k) + 3 SD(k) for the share w of fitting
     points found so far. The truncated squares are those of Torr, Zisserman (2000), CVIU 78 (MSAC); the
@@ -145,16 +145,16 @@ def resect_robust(
 
 
 def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAMPLE + 1) -> int:
-    """Return how many of n points must fit before the fit means anything.
+    """Return how many of n points must fit for the fit to be significant.
 
     Args:
-        n: points.
+        n: number of points.
         tolerance: largest residual of a fitting point, tangents.
         field: area of the photograph, squared tangents.
-        minimum: never fewer than these, nor than four.
+        minimum: lower limit of the result, which is also at least four.
 
-    Source: Moisan, Stival (2004), Int. J. Comput. Vision 57(3): among all poses of all triples, poses that
-    so many points at random places would fit must be expected less than CHANCE times.
+    Source: Moisan, Stival (2004), Int. J. Comput. Vision 57(3): among all poses of all triples, the expected
+    number of poses that fit this many points at random positions must be less than CHANCE.
     """
     needed = max(minimum, SAMPLE + 1)
     chance = min(1.0, np.pi * tolerance**2 / field)
@@ -174,10 +174,10 @@ def expected_trials(w: float, n: int) -> tuple[float, float]:
 
     Args:
         w: probability that a point is right.
-        n: points in a sample.
+        n: number of points in a sample.
 
     Raises:
-        GeometryError: a probability or number that cannot be.
+        GeometryError: the probability or the number is out of range.
 
     Source: Fischler, Bolles (1981), sec. II.B: E(k) = w^-n, SD(k) = sqrt(1 - w^n) w^-n.
     """
@@ -210,7 +210,7 @@ def _search(
     residuals: FloatArray,
     N: FloatArray,
 ) -> int:
-    """Fill the best pose, the points that fit it, residuals and normal matrix; return trials (-1: none)."""
+    """Fill the best pose, its fitting points, residuals and normal matrix; return trials (-1: no pose)."""
     n = len(points)
     position, rotation = np.empty((MAX_SOLUTIONS, 3)), np.empty((MAX_SOLUTIONS, 3, 3))
     legs, work = np.empty((MAX_SOLUTIONS, 3)), np.empty(WORK)
@@ -292,7 +292,16 @@ def _search(
 def truncated_squares(
     tangents: FloatArray, points: FloatArray, X0: FloatArray, R: FloatArray, limit: float, stop: float
 ) -> float:
-    """Return the sum of min(squared residual, limit); inf as soon as it exceeds `stop`."""
+    """Return the sum of min(squared residual, limit), infinite as soon as it reaches `stop`.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, (n, 2).
+        points: object points, (n, 3).
+        X0: projection centre, (3,).
+        R: rotation, image to object axes, (3, 3).
+        limit: largest squared residual that counts.
+        stop: sum at which the computation ends.
+    """
     total = 0.0
     for i in range(len(points)):
         dx, dy, dz = points[i, 0] - X0[0], points[i, 1] - X0[1], points[i, 2] - X0[2]
@@ -312,7 +321,16 @@ def truncated_squares(
 def select(
     tangents: FloatArray, points: FloatArray, X0: FloatArray, R: FloatArray, limit: float, used: BoolArray
 ) -> int:
-    """Mark the points in front of the camera whose squared residual is at most `limit`; return how many."""
+    """Mark the points in front of the camera with squared residuals up to `limit`; return their number.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, (n, 2).
+        points: object points, (n, 3).
+        X0: projection centre, (3,).
+        R: rotation, image to object axes, (3, 3).
+        limit: largest squared residual of a fitting point.
+        used: receives the marks, (n,).
+    """
     count = 0
     for i in range(len(points)):
         dx, dy, dz = points[i, 0] - X0[0], points[i, 1] - X0[1], points[i, 2] - X0[2]
@@ -344,7 +362,7 @@ def _next_triple(pick: IntArray, n: int) -> bool:
 
 @compiled
 def _random_triple(state: np.uint64, n: int, pick: IntArray) -> np.uint64:
-    """Draw three different indices; returns the new state (splitmix64, Steele et al. 2014)."""
+    """Draw three different indices; return the new state (splitmix64, Steele et al. 2014)."""
     k = 0
     while k < 3:
         state += np.uint64(0x9E3779B97F4A7C15)
