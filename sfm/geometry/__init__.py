@@ -1,16 +1,16 @@
-"""Use of coordinates: distances and angles, best-fit shapes, alignment, tolerances.
+"""Geometry from coordinates: distances and angles, best-fit shapes, alignment, tolerances.
 
-- `MeasuredPoints`: what all of it takes; `measured_points` makes it of a solution.
-- `fit_shape`: begin here; line, plane, circle, ellipse, sphere, cylinder, cone, torus, paraboloid.
-- `point_function`, and of it `distance`, `angle_at`, `height`, `distance_from_axis`, `angle_of_directions`,
+- `MeasuredPoints`: input of all functions; `measured_points` extracts it from a solution.
+- `fit_shape`: start here; line, plane, circle, ellipse, sphere, cylinder, cone, torus, paraboloid.
+- `point_function`, and from it `distance`, `angle_at`, `height`, `distance_from_axis`, `angle_of_directions`,
   `coordinates_in`: functions of coordinates with their covariance.
 - `align_321`, `align_features`, `align_points`: the coordinate system of a part.
-- `deviations_from_points`, `deviations_from_mesh`, `deviations_from_shape`, `decide`: whether they are in
-  tolerance.
+- `deviations_from_points`, `deviations_from_mesh`, `deviations_from_shape`, `decide`: conformity with
+  tolerances.
 - `with_hidden_point`: a point at the end of a rod with two targets.
 
-Every quantity keeps its derivatives by the coordinates of the points, so that its covariance, and that of any
-two quantities together, follows from the covariance of the network.
+Every quantity keeps its derivatives by the coordinates of the points. So its covariance, and the joint
+covariance of any quantities, follow from the covariance of the network.
 
     >>> import numpy as np
     >>> from sfm.geometry import MeasuredPoints, distance, fit_shape, point_function

@@ -1,11 +1,11 @@
-"""Alignment of a result: 3-2-1, by features, or by best fit to nominal points; its covariance goes along.
+"""Alignment of a result with its covariance: 3-2-1, by features, or by best fit to nominal points.
 
-A transformation x' = s R x + t that is computed from the points themselves makes their errors part of it:
-dx' = s R dx + M dT with dT = F dx, so that Q' = (D + M F) Q (D + M F)', the S-transformation to the new
-datum. The defining coordinates have no variance afterwards.
+If a transformation x' = s R x + t is computed from the points themselves, it depends on their errors:
+dx' = s R dx + M dT with dT = F dx. With D = diag(s R), the covariance is Q' = (D + M F) Q (D + M F)', the
+S-transformation to the new datum. The defining coordinates have no variance afterwards.
 
-A best fit is weighted with the covariance of the points as it is in their datum: in another datum of the same
-network it lies elsewhere within its uncertainty, and its test is the same.
+A best fit is weighted with the covariance of the points in their datum. In another datum of the same network
+the fit differs within its uncertainty, and its test is the same.
 
 Source: Baarda (1973), S-transformations and criterion matrices; Luhmann et al. (2020), Close-Range
 Photogrammetry and 3D Imaging, secs. 2.2.4 and 6.2.3; Horn (1987) for the start of the best fit.
@@ -30,24 +30,28 @@ from sfm.similarity import Similarity, fit_similarity, similarity_motions
 ITERATIONS = 50
 CONVERGED = 1e-13
 REJECTED = 4.685  # robust standard deviations beyond which a point takes no part
-MEDIAN_OF_LENGTH = 1.538  # median length of a vector of three independent normal deviations, over their sigma
+MEDIAN_OF_LENGTH = 1.538  # median length of a vector of three independent normal deviations, in sigmas
 ALPHA = 0.05  # level of the global test
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A transformation into another system, and how it depends on the points that define it."""
+    """A transformation into another system, with its derivatives by the points that define it."""
 
     method: str  # 3-2-1 | features | points
     aligned_from_object: Similarity
-    points: IntArray  # indices of the points that it is computed from, (m,)
+    points: IntArray  # indices of the defining points, (m,)
     linear: FloatArray  # F: shifts, rotations, scale in the new system by their coordinates, (7, 3 m)
-    covariance_of_nominal: FloatArray  # what nominal points add to that of the seven, (7, 7)
+    covariance_of_nominal: FloatArray  # contribution of nominal points to the covariance of the seven, (7, 7)
     scaled: bool  # whether the scale was fitted
     fitted: BestFit | None = None
 
     def apply(self, points: MeasuredPoints) -> MeasuredPoints:
-        """Return points in the new system with their covariance."""
+        """Return points in the new system with their covariance.
+
+        Args:
+            points: points of the same result.
+        """
         T = self.aligned_from_object
         xyz = T.apply(points.xyz)
         if points.covariance is None:
@@ -63,9 +67,9 @@ class Alignment:
                 place[sample] = np.arange(len(sample))
                 of_sample = replace(self, points=place[self.points])
                 known = of_sample._moved_covariance(points.sample_covariance, xyz[sample])
-                assert covariance is not None  # a sample is of points that are known each by itself
+                assert covariance is not None  # points with a sample have marginal covariances
                 covariance[sample] = [known[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(sample))]
-            else:  # the system itself rests on points that are not known together with the others
+            else:  # the system depends on points without a joint covariance with the others
                 sample = None
         has_scale = points.has_scale or self.scaled
         return replace(
@@ -111,25 +115,25 @@ class Alignment:
 
 @dataclass(frozen=True)
 class BestFit:
-    """How well nominal points are met."""
+    """Result of a best fit to nominal points."""
 
-    names: tuple[str, ...]  # of the points that were given, (n,)
-    used: BoolArray  # which of them took part, (n,)
+    names: tuple[str, ...]  # names of the common points, (n,)
+    used: BoolArray  # whether each point took part, (n,)
     difference: FloatArray  # aligned minus nominal, object unit, (n, 3)
     scale: float
-    sigma0: float  # of weights "network" a ratio, of equal ones in object units; NaN without redundancy
+    sigma0: float  # a ratio with weights "network", in object units with equal ones; NaN without redundancy
     redundancy: int
-    statistic: float  # of the global test; NaN where not tested
+    statistic: float  # test statistic of the global test; NaN where not tested
     critical: float
 
 
 @dataclass(frozen=True)
 class Nominal:
-    """Points of a drawing, or of anything else that is the reference."""
+    """Nominal points, for example of a drawing."""
 
     names: tuple[str, ...]  # (n,)
     xyz: FloatArray  # object unit, (n, 3)
-    covariance: FloatArray | None = None  # of each, object unit^2; exactly known if not given, (n, 3, 3)
+    covariance: FloatArray | None = None  # of each point, object unit^2; None for exact points, (n, 3, 3)
 
 
 @checked_arguments()
@@ -137,14 +141,14 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
     """Return the 3-2-1 alignment: three points on Z = 0, two on Y = 0, one on X = 0.
 
     Args:
-        points: of a result.
-        plane: names of the three; Z is on the side from which they go round counter-clockwise.
-        line: names of the two; X leads from the first to the second.
-        origin: name of the one.
+        points: points of a result.
+        plane: names of the three points; seen from the side of Z, they are in counter-clockwise order.
+        line: names of the two points; X points from the first to the second.
+        origin: name of the point with X = 0.
 
     Raises:
-        UnknownNameError: there is no point of a name.
-        GeometryError: points that do not determine the system.
+        UnknownNameError: a name is not that of a point.
+        GeometryError: the points do not determine the system.
 
     Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
     """
@@ -173,16 +177,16 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
 def align_features(
     z_axis: Function, x_axis: Function, origin: Function, *, on_plane: Function | None = None
 ) -> Alignment:
-    """Return the alignment by features: a direction to Z, another to X, a place to the origin.
+    """Return the alignment by features: one direction becomes Z, another X, and a position the origin.
 
     Args:
         z_axis: direction that becomes Z, such as the normal of a plane.
         x_axis: direction that becomes X after projection along Z.
-        origin: place whose X and Y are 0, and Z too if there is no plane.
-        on_plane: a place whose Z is 0, on the plane of Z = 0.
+        origin: position with X = Y = 0, and also Z = 0 if `on_plane` is not given.
+        on_plane: position with Z = 0.
 
     Raises:
-        GeometryError: directions that are parallel.
+        GeometryError: the directions are parallel.
 
     Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
     """
@@ -210,14 +214,14 @@ def align_points(
     weights: str = "network",
     robust: bool = False,
 ) -> Alignment:
-    """Return the best fit of points to nominal ones of the same names.
+    """Return the best fit of points to nominal points of the same names.
 
     Args:
-        points: of a result.
-        nominal: reference points; those that were not measured do not count.
-        scale: whether the scale is fitted, too.
+        points: points of a result.
+        nominal: nominal points; those that were not measured do not count.
+        scale: whether to fit the scale, too.
         weights: network (the covariance of both) or equal.
-        robust: whether points that most of the others contradict are held out.
+        robust: whether to leave out points that contradict most of the others.
 
     Raises:
         GeometryError: fewer than three points in common, or all of them on a line.
@@ -267,7 +271,7 @@ def _refine(
     scale: bool,
     weights: str,
 ) -> tuple[Similarity, FloatArray, FloatArray, float]:
-    """Return the best fit, F, what the nominal points add to the covariance of the seven, and v' P v."""
+    """Return the best fit, F, the contribution of nominal points to the covariance, and v' P v."""
     source, n = points.xyz[rows], len(rows)
     u = 7 if scale else 6
     Q = None if points.covariance is None else points.covariance_of(rows)
@@ -277,7 +281,7 @@ def _refine(
         for k in range(n):
             spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = Qn[k]
     if weights == "network":
-        # from the start, which is so near that the weights do not change: turning Q takes the time
+        # at the start, which is so close that the weights do not change; rotating Q takes most of the time
         D, M = T.scale * T.rotation, similarity_motions(T.apply(source), centre=np.zeros(3))
         M = M.reshape(3 * n, 7)[:, :u]
         Qd = spread.copy() if Q is None else _right(_right(Q, D).T, D) + spread
@@ -329,7 +333,7 @@ def _stepped(T: Similarity, step: FloatArray) -> Similarity:
 def _agreeing(
     source: FloatArray, target: FloatArray, scale: float | None, blocks: FloatArray | None
 ) -> BoolArray:
-    """Return the points that most of the others agree with, (n,)."""
+    """Return the points that agree with most of the others, (n,)."""
     n = len(source)
     if n < 5:
         raise GeometryError(f"alignment: {counted(n, 'common point')}, a robust best fit needs 5 or more")
@@ -342,7 +346,7 @@ def _agreeing(
 
 
 def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
-    """Return the axes of the new system as rows: Z along z, X along x as far as it is square to that."""
+    """Return the axes of the new system as rows: Z along z, X along the part of x perpendicular to Z."""
     z = z / np.linalg.norm(z)
     across = x - (x @ z) * z
     if not np.linalg.norm(across) > 1e-9 * np.linalg.norm(x):
@@ -352,12 +356,12 @@ def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
 
 
 def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, int]]) -> Alignment:
-    """Return the alignment that keeps one coordinate each of six places or directions.
+    """Return the alignment that holds one coordinate of each of six positions or directions.
 
     Args:
-        method: its name.
+        method: name of the method.
         T: the transformation.
-        entities: place or direction, whether it is a direction, and the axis along which it is held.
+        entities: position or direction, whether it is a direction, and the axis along which it is held.
     """
     held = joined([one for one, _, _ in entities])
     moves, by_places = np.zeros((6, 7)), np.zeros((6, len(held.value)))
@@ -368,7 +372,7 @@ def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, in
             motions = motions * np.array([0.0, 0, 0, 1, 1, 1, 0])
         moves[k] = motions[axis]
         by_places[k, 3 * k : 3 * k + 3] = T.rotation[axis]
-    # a coordinate that is held does not change: moves dT + by_places dx = 0
+    # a held coordinate does not change: moves dT + by_places dx = 0
     linear = np.zeros((7, held.jacobian.shape[1]))
     linear[:6] = -np.linalg.solve(moves[:, :6], by_places @ held.jacobian)
     return Alignment(method, T, held.points, linear, np.zeros((7, 7)), False)

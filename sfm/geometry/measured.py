@@ -1,13 +1,12 @@
-"""Measured points and functions of their coordinates, with their joint covariance.
+"""Measured points and functions of their coordinates, with joint covariance.
 
-A function keeps its values and its derivatives by the coordinates, so that its covariance, and that of any
-functions together, is J Q J'. In a free network only what does not change with the motions that the datum
-leaves open has a covariance that means something: J G = 0, with G the shifts, rotations and, without a scale,
-the scale of the whole.
+A `Function` keeps its values and their derivatives J by the coordinates. So its covariance, and the joint
+covariance of several functions, is J Q J'. In a free network only values that do not depend on the datum have
+a meaningful covariance. For these J G = 0, with G the shifts, rotations and, without a scale, the scale of
+the network.
 
-Functions of coordinates: distances, angles, heights above a plane, in any mixture of points and shapes. Each
-takes functions of coordinates and returns one, so that the covariance of the network goes along: of points as
-well as of centres, axes and planes that were fitted to points.
+Distances, angles and heights above a plane take functions of coordinates and return one. So they propagate
+the covariance of points, and also of centres, axes and planes fitted to points, in any combination.
 
 Source: Baarda (1973), S-transformations and criterion matrices; Caspary (2000), Concepts of network and
 deformation analysis, sec. 6 (estimable functions); Luhmann et al. (2020), Close-Range Photogrammetry and 3D
@@ -29,10 +28,11 @@ from sfm.network import index_of
 from sfm.similarity import similarity_motions
 from sfm.solution import Solution
 
-# Change with a motion over the largest that derivatives of this size could have, below which there is none:
-# those of a fit are taken at adjusted points, so that residuals of a hundredth of the size still pass.
+# Change with a motion, relative to the largest possible change for derivatives of this size, below which
+# values count as invariant. Derivatives of a fit are taken at adjusted points; residuals of 1 % of the size
+# still pass.
 INVARIANT = 1e-2
-OWN_DATUM = ("control", "aligned")  # datums that coordinates are meant in
+OWN_DATUM = ("control", "aligned")  # datums in which coordinates themselves are meaningful
 
 
 @dataclass(frozen=True)
@@ -41,29 +41,34 @@ class Function:
 
     value: FloatArray  # (q,)
     points: IntArray  # indices of the points that it depends on, (m,)
-    jacobian: FloatArray  # by X Y Z of each of them, (q, 3 m)
+    jacobian: FloatArray  # derivatives by X, Y, Z of these points, (q, 3 m)
 
     def __getitem__(self, rows: slice | IntArray) -> Function:
         return Function(self.value[rows], self.points, self.jacobian[rows])
 
     def times(self, matrix: FloatArray, value: FloatArray) -> Function:
-        """Return a function of this one, by its value and its derivatives by these values (r, q)."""
+        """Return a function of these values.
+
+        Args:
+            matrix: derivatives of the new values by these values, (r, q).
+            value: new values, (r,).
+        """
         return Function(np.atleast_1d(value), self.points, matrix @ self.jacobian)
 
 
 @dataclass(frozen=True)
 class MeasuredPoints:
-    """Points of a result, or of anything else that gives coordinates."""
+    """Points of a result, or of any other source of coordinates."""
 
     names: tuple[str, ...]  # (n,)
     xyz: FloatArray  # object unit, (n, 3)
-    covariance: FloatArray | None  # of all together (3 n, 3 n), or of each by itself (n, 3, 3), object unit^2
-    unit: str = ""  # of lengths, as people call it
-    datum: str = ""  # free | minimal | control | aligned; empty where it is not known
+    covariance: FloatArray | None  # joint (3 n, 3 n), or of each point (n, 3, 3), object unit^2
+    unit: str = ""  # name of the unit of lengths
+    datum: str = ""  # free | minimal | control | aligned; empty where unknown
     has_scale: bool = True  # whether lengths are in a known unit
-    redundancy: int | None = None  # of the variances; None where they count as known
-    sample: IntArray | None = None  # points that are known together where `covariance` is of each alone, (s,)
-    sample_covariance: FloatArray | None = None  # of these, object unit^2, (3 s, 3 s)
+    redundancy: int | None = None  # redundancy of the variances; None if they count as known
+    sample: IntArray | None = None  # points with a joint covariance if `covariance` is of each point, (s,)
+    sample_covariance: FloatArray | None = None  # joint covariance of these, object unit^2, (3 s, 3 s)
 
     @property
     def correlated(self) -> bool:
@@ -71,12 +76,12 @@ class MeasuredPoints:
         return self.covariance is not None and self.covariance.ndim == 2
 
     def correlated_among(self, points: IntArray) -> bool:
-        """Whether the covariance between some points is known."""
+        """Return whether the covariance between some points, given by index, is known."""
         return self.correlated or bool(self.sample is not None and np.isin(points, self.sample).all())
 
     @property
     def blocks(self) -> FloatArray:
-        """Covariance of each point by itself, NaN where not known, (n, 3, 3)."""
+        """Covariance of each point, NaN where unknown, (n, 3, 3)."""
         n = len(self.names)
         if self.covariance is None:
             return np.full((n, 3, 3), np.nan)
@@ -85,38 +90,41 @@ class MeasuredPoints:
         return np.stack([self.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])
 
     def index(self, name: str) -> int:
-        """Return the number of a point; UnknownNameError if there is none of that name."""
+        """Return the index of a point; UnknownNameError if no point has that name."""
         return index_of(self.names, name, "point")
 
     def matching(self, patterns: Sequence[str], what: str) -> IntArray:
-        """Return the points that any of some names or patterns (`*`, `?`, `[...]`) names, in their order.
+        """Return the indices of the points that match any of several names or patterns, in their order.
 
         Args:
-            patterns: names, patterns, or ranges of numbers such as 101-120.
-            what: asks for them, for messages.
+            patterns: names, patterns with `*`, `?` or `[...]`, or ranges of numbers such as 101-120.
+            what: name of what needs the points, for the message.
 
         Raises:
-            GeometryError: a pattern that names none.
+            GeometryError: a pattern matches no point.
         """
         chosen = np.zeros(len(self.names), dtype=bool)
         for pattern in patterns:
             matched = np.array([matches(name, pattern) for name in self.names], dtype=bool)
             if not matched.any():
-                raise GeometryError(f"{what}: '{pattern}' is the name of no point, and no pattern of any")
+                raise GeometryError(f"{what}: '{pattern}' matches no point")
             chosen |= matched
         return np.flatnonzero(chosen)
 
     def covariance_of(self, points: IntArray) -> FloatArray:
-        """Return the covariance of some points together, object unit^2, (3 m, 3 m).
+        """Return the joint covariance of some points, object unit^2, (3 m, 3 m).
+
+        Args:
+            points: indices of the points, (m,).
 
         Raises:
-            GeometryError: it is not known.
+            GeometryError: it is unknown.
         """
         if self.covariance is None:
-            raise GeometryError("covariance: that of the points is not known")
+            raise GeometryError("covariance: the covariance of the points is unknown")
         if self.covariance.ndim == 2:
             if len(points) == len(self.names) and (np.diff(points) == 1).all():
-                return self.covariance  # a copy would take longer than what is done with it
+                return self.covariance  # a copy would take longer than its use
             rows = coordinates_of(points)
             return self.covariance[np.ix_(rows, rows)]
         Q = np.zeros((3 * len(points), 3 * len(points)))
@@ -131,10 +139,10 @@ class MeasuredPoints:
         return Q
 
     def covariance_between(self, functions: Sequence[Function]) -> FloatArray:
-        """Return the covariance of the values of some functions together; NaN where it is not known.
+        """Return the joint covariance of the values of several functions; NaN where unknown.
 
         Args:
-            functions: of the coordinates, q values in all.
+            functions: functions of the coordinates, q values in total.
 
         Returns:
             Covariance, (q, q).
@@ -152,7 +160,7 @@ class MeasuredPoints:
         return J
 
     def depends_on_datum(self, one: Function) -> BoolArray:
-        """Return which values change with a motion of the whole that the datum only assumes, (q,)."""
+        """Return which values depend on the datum, because a motion of the whole changes them, (q,)."""
         if self.datum in OWN_DATUM:
             return np.zeros(len(one.value), dtype=bool)
         xyz = self.xyz[one.points]
@@ -166,9 +174,12 @@ class MeasuredPoints:
 
 @checked_arguments()
 def measured_points(result: Solution) -> MeasuredPoints:
-    """Return the points of a result that have coordinates, with the covariance that is known of them.
+    """Return the points of a result that have coordinates, with their covariance as far as it is known.
 
-    Where only that of a sample of the points is known together, all others count by themselves.
+    If the joint covariance is known for a sample of the points only, the others have marginal covariances.
+
+    Args:
+        result: solution of an adjustment or read from files.
     """
     kept = np.flatnonzero(result.estimate.determined)
     covariance = result.covariance
@@ -198,17 +209,27 @@ def measured_points(result: Solution) -> MeasuredPoints:
 
 
 def with_covariance(points: MeasuredPoints, covariance: FloatArray | None) -> MeasuredPoints:
-    """Return the points with another covariance."""
+    """Return the points with another covariance.
+
+    Args:
+        points: the points.
+        covariance: joint (3 n, 3 n), or of each point (n, 3, 3), object unit^2; None if unknown.
+    """
     return replace(points, covariance=covariance)
 
 
 def coordinates_of(points: IntArray) -> IntArray:
-    """Return the rows of X Y Z of some points among those of all, (3 m,)."""
+    """Return the rows of X, Y, Z of points in a joint covariance, (3 m,), given their indices (m,)."""
     return np.asarray((3 * np.asarray(points)[:, None] + np.arange(3)).ravel())
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Whether a name is a pattern's: the name itself, `*` and `?`, or a range of numbers such as 101-120."""
+    """Return whether a name matches a pattern.
+
+    Args:
+        name: name of a point.
+        pattern: the name itself, a pattern with `*` and `?`, or a range of numbers such as 101-120.
+    """
     if name == pattern or fnmatchcase(name, pattern):
         return True
     low, dash, high = pattern.partition("-")
@@ -221,19 +242,19 @@ def matches(name: str, pattern: str) -> bool:
 def with_hidden_point(
     points: MeasuredPoints, name: str, start: str, end: str, distance: float, sigma: float = 0.0
 ) -> MeasuredPoints:
-    """Return the points with a hidden one behind two targets.
+    """Return the points with an additional hidden point on the line through two targets.
 
     Args:
-        points: of a result.
-        name: of the new point.
+        points: points of a result.
+        name: name of the new point.
         start: name of the first target.
-        end: name of the second, nearer to the hidden point.
-        distance: from the second target on, away from the first, object unit.
-        sigma: its standard deviation, object unit.
+        end: name of the second target, nearer to the hidden point.
+        distance: distance from the second target, away from the first, object unit.
+        sigma: standard deviation of the distance, object unit.
 
     Raises:
-        UnknownNameError: a target is not there.
-        GeometryError: the name is taken, or both targets are in one place.
+        UnknownNameError: a target does not exist.
+        GeometryError: the name is taken, or both targets coincide.
 
     Source: Luhmann et al. (2020), sec. 6.6.
     """
@@ -275,15 +296,19 @@ def with_hidden_point(
 def point_function(points: MeasuredPoints, name: str) -> Function:
     """Return the coordinates of a point as a function of themselves.
 
+    Args:
+        points: points of a result.
+        name: name of the point.
+
     Raises:
-        UnknownNameError: there is no point of that name.
+        UnknownNameError: no point has that name.
     """
     j = points.index(name)
     return Function(points.xyz[j], np.array([j], dtype=np.int64), np.eye(3))
 
 
 def joined(functions: list[Function]) -> Function:
-    """Return the values of several functions as one of all their points."""
+    """Return the values of several functions as one function of all their points."""
     points: IntArray = np.unique(np.concatenate([one.points for one in functions]))
     rows = []
     for one in functions:
@@ -295,14 +320,14 @@ def joined(functions: list[Function]) -> Function:
 
 @checked_arguments()
 def distance(a: Function, b: Function) -> Function:
-    """Return the distance of two points (object unit).
+    """Return the distance between two points (object unit).
 
     Args:
-        a: coordinates of the first.
-        b: coordinates of the second.
+        a: coordinates of the first point.
+        b: coordinates of the second point.
 
     Raises:
-        GeometryError: both are in one place, so that the distance has no derivative.
+        GeometryError: the points coincide, so the distance has no derivative.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
@@ -326,10 +351,10 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
     Args:
         a: first vector, of any length.
         b: second vector.
-        undirected: whether they are those of lines or planes, whose angle is at most a right one.
+        undirected: whether the vectors belong to lines or planes, which form an angle of at most 90 degrees.
 
     Raises:
-        GeometryError: parallel vectors, whose angle has no derivative, or one without length.
+        GeometryError: the vectors are parallel, so the angle has no derivative, or one has no length.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
@@ -355,8 +380,8 @@ def angle_at(vertex: Function, a: Function, b: Function) -> Function:
 
     Args:
         vertex: coordinates of the point.
-        a: coordinates of the first of the others.
-        b: coordinates of the second.
+        a: coordinates of the first of the other points.
+        b: coordinates of the second of the other points.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
@@ -368,14 +393,14 @@ def height(point: Function, origin: Function, direction: Function) -> Function:
     """Return the height of a point above a plane (object unit), positive on the side of its normal.
 
     Args:
-        point: coordinates.
-        origin: of a point of the plane.
-        direction: normal of the plane, of unit length.
+        point: coordinates of the point.
+        origin: coordinates of a point of the plane.
+        direction: unit normal of the plane.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     n, d = direction.value, point.value - origin.value
-    # the normal keeps its length of 1: what of its derivative is along itself is rounding
+    # the normal keeps its length of 1: the part of its derivative along itself is rounding
     J = np.concatenate([n, -n, d - (d @ n) * n])
     return joined([point, origin, direction]).times(J[None], np.array([d @ n]))
 
@@ -385,12 +410,12 @@ def distance_from_axis(point: Function, origin: Function, direction: Function) -
     """Return the distance of a point from a line (object unit).
 
     Args:
-        point: coordinates.
-        origin: of a point of the line.
-        direction: of the line, of unit length.
+        point: coordinates of the point.
+        origin: coordinates of a point of the line.
+        direction: unit direction of the line.
 
     Raises:
-        GeometryError: the point is on the line, so that the distance has no derivative.
+        GeometryError: the point is on the line, so the distance has no derivative.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
@@ -409,17 +434,17 @@ def distance_from_axis(point: Function, origin: Function, direction: Function) -
 def coordinates_in(
     points: MeasuredPoints, names: list[str], origin: FloatArray, rotation: FloatArray, scale: float = 1.0
 ) -> Function:
-    """Return coordinates in another system that is exactly known: scale R' (x - origin), 3 for each point.
+    """Return coordinates in another system that is known exactly: scale R' (x - origin), three per point.
 
     Args:
-        points: of a result.
-        names: of the points.
-        origin: of the system, object unit, (3,).
+        points: points of a result.
+        names: names of the points.
+        origin: origin of the system, object unit, (3,).
         rotation: R, axes of the system as columns, (3, 3).
         scale: unit of the system per object unit.
 
     Raises:
-        UnknownNameError: there is no point of a name.
+        UnknownNameError: a name is not that of a point.
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """

@@ -1,7 +1,7 @@
-"""Deviations from nominal points, a mesh or a shape, and whether they are in tolerance.
+"""Tolerances: deviations from nominal points, a mesh or a shape, and decisions on conformity.
 
-A value conforms if it is inside the limits by its expanded uncertainty U = k sigma, does not if it is outside
-by that, and nothing is decided in between.
+A value conforms if it is inside the limits by its expanded uncertainty U = k sigma. It does not conform if it
+is outside the limits by U. In between, the decision is open.
 
 Source: ISO 14253-1:2017, Decision rules for verifying conformity or nonconformity with specifications;
 Ericson (2005), Real-Time Collision Detection, sec. 5.1.5 (nearest point of a triangle); Baerentzen and Aanaes
@@ -22,8 +22,8 @@ from sfm.geometry.alignment import Nominal
 from sfm.geometry.measured import MeasuredPoints
 from sfm.geometry.shapes.fit import ShapeFit
 
-TIE = 1e-9  # of distances that are one, over the size of the mesh
-ON_SURFACE = 1e-12  # distance over the size of the mesh at which the normal is the triangle's
+TIE = 1e-9  # difference of equal distances, relative to the size of the mesh
+ON_SURFACE = 1e-12  # distance, relative to the size of the mesh, below which the normal is the triangle's
 IN, OUT, UNDECIDED, UNKNOWN = "in", "out", "undecided", "not known"
 DECISIONS = (IN, UNDECIDED, OUT, UNKNOWN)
 COVERAGE = 2.0  # k of the expanded uncertainty, for about 95 %
@@ -34,19 +34,19 @@ class Deviations:
     """Deviations of points with their limits."""
 
     name: str
-    against: str  # what they are deviations from, in words
+    against: str  # name of the reference
     points: IntArray  # indices, (m,)
     value: FloatArray  # object unit, (m,)
-    sigma: FloatArray  # object unit; NaN where not known, (m,)
+    sigma: FloatArray  # object unit; NaN where unknown, (m,)
     vector: FloatArray  # measured minus nearest nominal point, object unit, (m, 3)
     lower: float  # limits, object unit
     upper: float
     coverage: float  # k
-    decision: tuple[str, ...]  # in | out | undecided | not known, of each point
+    decision: tuple[str, ...]  # for each point: in | out | undecided | not known
     missing: tuple[str, ...] = ()  # nominal points that were not measured
 
     def count(self, decision: str) -> int:
-        """Return how many points have a decision."""
+        """Return the number of points with a decision."""
         return self.decision.count(decision)
 
 
@@ -60,18 +60,18 @@ def deviations_from_points(
     coverage: float = COVERAGE,
     chosen: IntArray | None = None,
 ) -> Deviations:
-    """Return the distances of measured points from nominal ones of the same names.
+    """Return the distances of measured points from nominal points of the same names.
 
     Args:
-        points: aligned to the system of the nominal ones.
-        nominal: reference points; their covariance counts.
-        name: of the tolerance.
+        points: points aligned to the system of the nominal points.
+        nominal: nominal points; their covariance is taken into account.
+        name: name of the tolerance.
         upper: largest distance, object unit.
         coverage: k of the expanded uncertainty.
-        chosen: indices of the points to judge; all that have a nominal one if not given.
+        chosen: indices of the points to judge; all with a nominal point if not given.
 
     Raises:
-        GeometryError: none of them was measured.
+        GeometryError: no nominal point was measured.
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
@@ -111,18 +111,18 @@ def deviations_from_mesh(
     """Return the signed distances of points from a mesh, positive outside.
 
     Args:
-        points: aligned to the system of the mesh.
+        points: points aligned to the system of the mesh.
         mesh: nominal surface.
         chosen: indices of the points to judge.
-        name: of the tolerance.
-        against: what the mesh is called.
+        name: name of the tolerance.
+        against: name of the mesh.
         lower: smallest distance, object unit.
         upper: largest distance, object unit.
         coverage: k of the expanded uncertainty.
-        offset: of the targets from the surface along its normal, object unit.
+        offset: distance of the targets from the surface along its normal, object unit.
 
     Raises:
-        GeometryError: a mesh without triangles.
+        GeometryError: the mesh has no triangle with an area.
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
@@ -146,12 +146,12 @@ def deviations_from_shape(
     upper: float,
     coverage: float = COVERAGE,
 ) -> Deviations:
-    """Return the distances of the points of a fitted shape from it, with the uncertainty of both.
+    """Return the distances of points from a shape fitted to them, with the uncertainty of both.
 
     Args:
-        points: that it was fitted to.
-        fit: the shape.
-        name: of the tolerance.
+        points: points that the shape was fitted to.
+        fit: the fitted shape.
+        name: name of the tolerance.
         lower: smallest distance, object unit.
         upper: largest distance, object unit.
         coverage: k of the expanded uncertainty.
@@ -173,10 +173,10 @@ def decide(
     """Return for each value whether it is proven to be in or out of tolerance.
 
     Args:
-        value: measured, (m,).
-        sigma: their standard deviations; NaN where not known, (m,).
-        lower: limit, -infinity for none.
-        upper: limit.
+        value: measured values, (m,).
+        sigma: standard deviations of the values; NaN where unknown, (m,).
+        lower: lower limit, -infinity for none.
+        upper: upper limit.
         coverage: k of the expanded uncertainty U = k sigma.
 
     Source: ISO 14253-1:2017, secs. 4 to 6.
@@ -213,7 +213,7 @@ def distances_from_mesh(xyz: FloatArray, mesh: Mesh) -> MeshDistances:
 
     Args:
         xyz: points, object unit, (n, 3).
-        mesh: in the same system.
+        mesh: mesh in the same system.
 
     Raises:
         GeometryError: no triangle has an area.
@@ -256,7 +256,7 @@ def distances_from_mesh(xyz: FloatArray, mesh: Mesh) -> MeshDistances:
 
 
 def _feet(p: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return the nearest point of each triangle (t, 3, 3) to a point, (t, 3)."""
+    """Return the point of each triangle (t, 3, 3) nearest to a given point, (t, 3)."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac = b - a, c - a
     n = np.cross(ab, ac)

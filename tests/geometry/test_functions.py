@@ -115,7 +115,7 @@ def test_patterns_name_points() -> None:
     assert not matches("21", "101-120") and matches("1-2", "1-2")
     measured = points()
     assert measured.matching(["A", "[FG]"], "x").tolist() == [0, 5, 6]
-    with pytest.raises(GeometryError, match="group rim: 'x1' is the name of no point, and no pattern"):
+    with pytest.raises(GeometryError, match="group rim: 'x1' matches no point"):
         measured.matching(["A", "x1"], "group rim")
 
 

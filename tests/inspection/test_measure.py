@@ -241,7 +241,7 @@ TOLERANCE = "[[tolerance]]\nname = 't'\n"
 BAD = {
     SHAPE + "kind = 'ball'\npoints = 'c*'\n": "line 3: shape 1.kind: found 'ball', needed one of",
     "[[shapes]]\n": "unknown key 'shapes' in the file, known are measure, group",
-    SHAPE + "kind = 'plane'\npoints = 'q*'\n": r"shape x: 'q\*' is the name of no point",
+    SHAPE + "kind = 'plane'\npoints = 'q*'\n": r"shape x: 'q\*' matches no point",
     SHAPE + "kind = 'circle'\npoints = ['p1', 'p2', 'p3']\n": "circle x: its 3 points lie on a line",
     SHAPE + "kind = 'sphere'\npoints = ['p1', 'p2', 'p3']\n": "sphere x: 3 points, a sphere needs 4",
     "[alignment]\nmethod = '3-2-1'\nplane = ['p1']\n": 'method "3-2-1" needs line',

@@ -1,1 +1,1 @@
-"""Best-fit shapes by orthogonal distances: `fit.fit_shape` is the entrance."""
+"""Best-fit shapes by orthogonal distances; start with `fit.fit_shape`."""

@@ -1,6 +1,8 @@
-"""Best-fit shapes by orthogonal distances: with the covariance of the network, or with equal weights.
+"""Best-fit shapes by orthogonal distances, with the covariance of the network or with equal weights.
 
-Parameters are given as people want them, with their derivatives by the motions and form of the shape.
+Points are reduced to their centroid and unit size. Start values are refined with equal weights, and then, if
+asked for, with the covariance of the points (`refine_weighted`). `parameters_of` converts the result to the
+usual parameters, such as centre and radius, with their derivatives.
 
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space; Foerstner and
 Wrobel (2016), Photogrammetric Computer Vision, secs. 4.8 and 10.6; Luhmann et al. (2020), Close-Range
@@ -27,12 +29,12 @@ from sfm.geometry.shapes.start import robust_shape, start_shapes, with_held
 WITH_DIAMETER = ("circle", "sphere", "cylinder")
 
 WEIGHTS = ("network", "equal")
-STARTS = 4  # of the likeliest start values that are refined
-START_POINTS = 300  # that start values are found from
+STARTS = 4  # number of likeliest start values that are refined
+START_POINTS = 300  # number of points used for start values
 START_STEPS = 25
-COLLINEAR = 1e-9  # spread of points over their size below which they lie on a line or plane
-UNCERTAIN = 3.0  # spread over the standard deviation of the points, likewise
-RANK = 1e-9  # smallest singular value over the largest of the design, each parameter of one size
+COLLINEAR = 1e-9  # spread of points, relative to their size, below which they lie on a line or plane
+UNCERTAIN = 3.0  # the same, relative to the standard deviation of the points
+RANK = 1e-9  # ratio of singular values of the scaled design matrix below which a parameter is undetermined
 ALPHA = 0.05  # level of the global test
 
 
@@ -44,57 +46,55 @@ class ShapeFit:
     shape: Shape
     weights: str  # network | equal
     points: IntArray  # indices of its points, (m,)
-    used: BoolArray  # which of them a robust fit has kept, (m,)
-    parameters: Parameters  # names, values and what they are
-    function: Function  # the parameters by the coordinates of its points
-    covariance: FloatArray  # of the parameters, (p, p); NaN where nothing determines
-    from_residuals: (
-        bool  # whether the covariance comes from the residuals, since that of the points is not known
-    )
+    used: BoolArray  # whether a robust fit kept each point, (m,)
+    parameters: Parameters  # names and kinds of the parameters
+    function: Function  # the parameters as a function of the coordinates of its points
+    covariance: FloatArray  # covariance of the parameters, (p, p); NaN without redundancy or covariance
+    from_residuals: bool  # whether the covariance comes from the residuals, because that of points is unknown
     distances: FloatArray  # signed distances of the points, object unit, (m, c)
-    sigma: FloatArray  # of the distance of each point, object unit; NaN where not known, (m,)
-    w: FloatArray  # standardised: the root of T of each point; NaN where not known, (m,)
-    sigma0: float  # of weights "network" a ratio, of equal ones in object units; NaN without redundancy
+    sigma: FloatArray  # standard deviation of each distance, object unit; NaN where unknown, (m,)
+    w: FloatArray  # standardised residual: root of T of each point; NaN where unknown, (m,)
+    sigma0: float  # a ratio with weights "network", in object units with equal ones; NaN without redundancy
     redundancy: int
     statistic: float  # v' Q^-1 v over the redundancy; NaN where not tested
-    critical: float  # of the global test; NaN where not tested
+    critical: float  # critical value of the global test; NaN where not tested
     converged: bool
-    offset: float = 0.0  # of the targets from the shape along its normal, object unit
+    offset: float = 0.0  # distance of the targets from the shape along its normal, object unit
 
     @property
     def deviation(self) -> FloatArray:
-        """Distance of each point from the shape, signed of a surface, object unit, (m,)."""
+        """Distance of each point from the shape, signed for a surface, object unit, (m,)."""
         if self.distances.shape[1] == 1:
             return self.distances[:, 0]
         return np.asarray(np.linalg.norm(self.distances, axis=1))
 
     @property
     def rms(self) -> float:
-        """Root mean square distance of the points that were used, object unit."""
+        """Root mean square distance of the points used, object unit."""
         return float(np.sqrt((self.deviation[self.used] ** 2).mean()))
 
     @property
     def form_error(self) -> float:
-        """Largest minus smallest distance of the points that were used; of a curve twice the largest."""
+        """Largest minus smallest distance of the points used; for a curve twice the largest."""
         deviations = self.deviation[self.used]
         return float(2 * deviations.max() if self.distances.shape[1] == 2 else np.ptp(deviations))
 
     @property
     def fits(self) -> bool | None:
-        """Whether the residuals agree with the covariance of the points; None where that is not tested."""
+        """Whether the residuals agree with the covariance of the points; None if not tested."""
         return None if np.isnan(self.statistic) else bool(self.statistic <= self.critical)
 
     @property
     def parameter_sigma(self) -> FloatArray:
-        """Standard deviations of the parameters, 0 where held, (p,)."""
+        """Standard deviations of the parameters, 0 for held ones, (p,)."""
         return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)))
 
     def value(self, name: str) -> float:
-        """Return a parameter that is one number, such as `diameter`."""
+        """Return the value of a scalar parameter, such as `diameter`."""
         return float(self.function.value[self.parameters.rows(name)][0])
 
     def sigma_of(self, name: str) -> float:
-        """Return the standard deviation of such a parameter."""
+        """Return the standard deviation of a scalar parameter."""
         return float(self.parameter_sigma[self.parameters.rows(name)][0])
 
 
@@ -113,18 +113,18 @@ def fit_shape(
     """Fit a shape to points by orthogonal distances.
 
     Args:
-        points: of a result.
+        points: points of a result.
         kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid.
         chosen: names or indices of the points; all if not given.
-        name: of the shape, for messages; its kind if empty.
+        name: name of the shape, for messages; its kind if empty.
         weights: network (the covariance of the points) or equal.
-        hold: values of what is held: `direction` (three numbers), where it lies (`point`, `centre`, `apex` or
-            `vertex`, three numbers), form parameters (object unit, rad) or `diameter`.
-        robust: whether points that most of the others contradict are left out.
-        offset: signed distance of the targets from the shape: on the side of its normal or outside positive.
+        hold: values held fixed: `direction` (three numbers), position (`point`, `centre`, `apex` or `vertex`,
+            three numbers), form parameters (object unit, rad) or `diameter`.
+        robust: whether to leave out points that contradict most of the others.
+        offset: signed distance of the targets from the shape, positive on the side of its normal or outside.
 
     Raises:
-        GeometryError: too few points, points that do not determine the shape, or nothing known of it.
+        GeometryError: too few points, points that do not determine the shape, or invalid options.
 
     Source: Ahn (2004), ch. 3; the general case of least squares as in `refine_weighted`.
     """
@@ -187,7 +187,7 @@ def _fit(
     else:
         shape = _best_start(kind, x, free, off, origin, axis, form, placed)
     if axis is None or kind.name in ("cone", "paraboloid"):
-        shape = shape.turned()  # before the offset counts, whose sign is that of the normal
+        shape = shape.turned()  # before the offset is applied, because its sign depends on the normal
     elif shape.axis @ axis < 0:
         shape = replace(shape, rotation=shape.rotation * np.array([1.0, -1, -1]))
     shape, cost, converged = refine_orthogonal(shape, x[used], free=free, offset=off, placed=placed)
@@ -224,7 +224,7 @@ def _fit(
             C = _product(flat, Q) / size**2
     d, B, A = shape.design(x)
     sigma = _sigma_of_distances(Q, d - off, B, A[..., free], linear, C * size**2)
-    # back to object units: shifts and lengths grow with the size, angles do not
+    # back to object units: shifts and lengths scale with the size, angles do not
     units = np.concatenate([np.full(3, size), np.ones(3), _lengths(kind, size)])[free]
     parameters, value, by_local = parameters_of(shape.scaled(size, centroid))
     J = by_local[:, free]
@@ -258,7 +258,7 @@ def _covariance(points: MeasuredPoints, rows: IntArray) -> FloatArray:
 
 
 def _product(J: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return J Q J' of a covariance of all coordinates, or of each point's by itself."""
+    """Return J Q J' with a joint covariance of all coordinates, or with one of each point."""
     if Q.ndim == 2:
         return np.asarray(J @ Q @ J.T)
     blocks = J.reshape(len(J), -1, 3)
@@ -272,7 +272,7 @@ def _lengths(kind: Kind, size: float) -> FloatArray:
 def _held(
     kind: Kind, hold: dict[str, float | Sequence[float]], centroid: FloatArray, size: float
 ) -> tuple[BoolArray, FloatArray | None, FloatArray | None, FloatArray]:
-    """Return what is free (6 + q,), and the held origin, direction and form in the frame of the points."""
+    """Return the free parameters (6 + q,), and held origin, direction and form in the frame of the points."""
     free = np.zeros(6 + len(kind.form), dtype=bool)
     free[list(kind.moves)] = True
     free[6:] = True
@@ -304,7 +304,7 @@ def _held(
             k = kind.form.index(name)
             form[k] = float(numbers) / _lengths(kind, size)[k]
             free[6 + k] = False
-    if kind.name == "cone" and origin is not None:  # its apex is the origin: the radius there is 0
+    if kind.name == "cone" and origin is not None:  # the apex is the origin, with radius 0
         form[0] = 0.0
         free[6] = False
     if not free.any():
@@ -322,12 +322,12 @@ def _best_start(
     form: FloatArray,
     placed: bool,
 ) -> Shape:
-    """Return the best of the likeliest starts, each refined a little."""
+    """Return the best of the likeliest starts after some refinement of each."""
     some = x
     if len(x) > START_POINTS:
         some = x[np.linspace(0, len(x) - 1, START_POINTS).astype(np.int64)]
     found: list[tuple[float, int, Shape]] = []
-    first = free.copy()  # a held form has false optima: it starts from the free one (0: an apex)
+    first = free.copy()  # a held form has false optima, so the form is free at first (0: an apex)
     first[6:] = form != 0
     for start in start_shapes(kind, some, origin=origin, axis=axis)[:STARTS]:
         shape = with_held(start, origin, np.full(len(form), np.nan))
@@ -345,7 +345,7 @@ def _best_start(
 
 
 def _refuse_flat(kind: Kind, x: FloatArray, blocks: FloatArray, *, axis_held: bool) -> None:
-    """Refuse points on a line, or on a plane where a shape needs points in space; within their precision."""
+    """Refuse points that lie, within their precision, on a line, or on a plane if the shape needs space."""
     spread = np.linalg.svd(x, compute_uv=False) / np.sqrt(len(x))
     known = np.einsum("nii->n", blocks) / 3
     sigma = float(np.sqrt(known.mean())) if np.isfinite(known).all() else 0.0
@@ -374,7 +374,7 @@ def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
 def _sigma_of_distances(
     Q: FloatArray | None, d: FloatArray, B: FloatArray, A: FloatArray, linear: FloatArray, C: FloatArray
 ) -> FloatArray:
-    """Return the standard deviation of each distance, of a curve along it: of B dx + A F dx, (n,)."""
+    """Return the standard deviation of each distance, from B dx + A F dx, (n,)."""
     n, c, u = A.shape
     if Q is None:
         return np.full(n, np.nan)
@@ -398,12 +398,12 @@ def _sigma_of_distances(
 class Parameters:
     """Names and kinds of the values of a shape."""
 
-    names: tuple[str, ...]  # of each parameter: centre, direction, radius ...
-    axes: tuple[str, ...]  # X, Y or Z of a vector, empty of a single number
+    names: tuple[str, ...]  # parameter of each value: centre, direction, radius ...
+    axes: tuple[str, ...]  # X, Y or Z for a vector, empty for a scalar
     kinds: tuple[str, ...]  # coordinate | direction | length | angle
 
     def rows(self, name: str) -> slice:
-        """Return the rows of a parameter by its name."""
+        """Return the rows of a parameter, given by name."""
         first = self.names.index(name)
         return slice(first, first + self.names.count(name))
 
@@ -412,11 +412,11 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     """Return the parameters of a shape.
 
     Args:
-        shape: in object units.
+        shape: shape in object units.
 
     Returns:
-        Their names, their values (p,), and their derivatives by shifts and rotations in the axes of the
-        shape and by its form, (p, 6 + q).
+        Names, values (p,), and derivatives by shifts and rotations in the axes of the shape and by its form,
+        (p, 6 + q).
     """
     kind, R, form = shape.kind, shape.rotation, shape.form
     q = len(form)
@@ -446,7 +446,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         rows.append(("focus", "coordinate", shape.origin + form[0] * R[:, 2], by_focus))
     for k, name in enumerate(kind.form):
         if kind.name == "cone" and name == "radius":
-            continue  # that abreast of the centroid is of no use
+            continue  # the radius beside the centroid is not useful
         derivatives = np.zeros((1, 6 + q))
         derivatives[0, 6 + k] = 1.0
         rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives))

@@ -1,13 +1,14 @@
-"""Best-fit shapes: orthogonal distances with equal weights, or with the covariance of the points.
+"""Gauss-Helmert adjustment of shapes, with equal weights or the covariance of the points.
 
-Each point x has constraints d(x + v, p) = 0, and v' Q^-1 v is least. Linearised at the adjusted points,
-B v + A dp + w = 0 with w = d + B (x - x_adjusted); the equivalent weights of the constraints are those of
-Q_w = B Q B': for a single point its normal weighs n' Q n.
+Each point x has constraints d(x + v, p) = 0, and v' Q^-1 v is minimised. Linearised at the adjusted points,
+B v + A dp + w = 0 with w = d + B (x - x_adjusted). The constraints have the cofactors Q_w = B Q B'; for a
+single point with normal n this is n' Q n.
 
-The covariance of a free network is singular, and Q_w is so where a motion of the network is one of the shape
-(all points on one plane). W = Q_w + A U A' takes its place: estimates, residuals and v' Q^-1 v are those of
-Q_w, and so is the covariance F Q F' = (A' W^-1 A)^-1 - U of the parameters. In another datum of the network
-the adjusted points and the shape are moved together: its form, v' Q^-1 v and the tests are the same.
+The covariance of a free network is singular. Q_w is singular if a motion of the network is also a motion of
+the shape, for example if all points lie on one plane. Then W = Q_w + A U A' replaces it. Estimates, residuals
+and v' Q^-1 v stay the same, and so does the covariance F Q F' = (A' W^-1 A)^-1 - U of the parameters. In
+another datum of the network, the adjusted points and the shape move together; form, v' Q^-1 v and tests do
+not change.
 
 Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
 adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory); Ahn
@@ -27,29 +28,27 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.geometry.shapes.kinds import Shape
 
-ORTHOGONAL_ITERATIONS = 400  # of equal weights: large residuals on short arcs converge slowly
+ORTHOGONAL_ITERATIONS = 400  # for equal weights; large residuals on short arcs converge slowly
 FIRST_DAMPING = 1e-4
-ORTHOGONAL_CONVERGED = 1e-15  # step over the unit size of the points
+ORTHOGONAL_CONVERGED = 1e-15  # last step, relative to the unit size of the points
 ITERATIONS = 100
-CONVERGED = 1e-13  # of steps over the unit size of the points
-SAME_NORMALS = 1e-9  # change of normals that leaves the weights as they are
-SINGULAR = 1e-6  # standard deviation of a constraint over the largest, of what others leave of it
+CONVERGED = 1e-13  # last step, relative to the unit size of the points
+SAME_NORMALS = 1e-9  # change of normals below which the weights are not recomputed
+SINGULAR = 1e-6  # ratio of the smallest to the largest pivot of W below which it is singular
 UNCHECKED = 1e-9  # redundancy of a constraint below which nothing checks it
 
 
 @dataclass(frozen=True)
 class WeightedFit:
-    """A shape adjusted with the covariance of its points, and its equations there."""
+    """A shape adjusted with the covariance of its points, and the equations at the solution."""
 
     shape: Shape
     adjusted: FloatArray  # points on the shape, (n, 3)
-    normals: FloatArray  # B, of each constraint by its point, (n, c, 3)
-    design: FloatArray  # A, of the constraints by the free parameters, (n c, u)
-    linear: FloatArray  # F, of the parameters by the coordinates, (u, 3 n)
+    normals: FloatArray  # B, derivatives of each constraint by its point, (n, c, 3)
+    design: FloatArray  # A, derivatives of the constraints by the free parameters, (n c, u)
+    linear: FloatArray  # F, derivatives of the parameters by the coordinates, (u, 3 n)
     omega: float  # v' Q^-1 v
-    standardised: (
-        FloatArray  # the largest of the tests of each point: w, or the root of T of two constraints, (n,)
-    )
+    standardised: FloatArray  # test of each point: w, or the root of T of two constraints, (n,)
     converged: bool
 
 
@@ -63,20 +62,19 @@ def refine_weighted(
     size: float = 1.0,
     placed: bool = True,
 ) -> WeightedFit:
-    """Return the shape of the least v' Q^-1 v near a start.
+    """Return the shape with the least v' Q^-1 v near a start.
 
     Args:
-        start: the fit with equal weights.
+        start: fit with equal weights.
         xyz: points about their centroid, of unit size, (n, 3).
-        covariance: Q of all coordinates together (3 n, 3 n), or of each point by itself (n, 3, 3), in units
-            of which `size` make one of the points.
+        covariance: Q, joint (3 n, 3 n) or of each point (n, 3, 3), in its own unit of length.
         free: which of the six motions and the form are adjusted, (6 + q,).
-        offset: signed distances that the points shall have, (c,).
-        size: unit of the points in those of the covariance.
+        offset: required signed distances of the points, (c,).
+        size: unit of the points in the unit of the covariance.
         placed: whether the origin may be anywhere along the axis.
 
     Raises:
-        GeometryError: the covariance is singular beyond what the free parameters take up, or the adjustment
+        GeometryError: the covariance is singular beyond the effect of the free parameters, or the adjustment
             diverges.
     """
     n = len(xyz)
@@ -85,7 +83,7 @@ def refine_weighted(
     d, B, _ = shape.design(xyz)
     adjusted = xyz - np.einsum("nc,nci->ni", d - offset, B)
     converged = False
-    factored = np.full_like(B, np.inf)  # normals that the weights were computed with
+    factored = np.full_like(B, np.inf)  # normals used for the weights
     for _ in range(ITERATIONS):
         d, B, A = shape.design(adjusted)
         w = (d - offset + np.einsum("nci,ni->nc", B, xyz - adjusted)).ravel()
@@ -131,7 +129,12 @@ def refine_weighted(
 
 
 def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return Q_w = B Q B', of all constraints together (n c, n c), or of each point's by itself (n, c, c)."""
+    """Return Q_w = B Q B', of all constraints (n c, n c), or of the constraints of each point (n, c, c).
+
+    Args:
+        covariance: Q, joint (3 n, 3 n) or of each point (n, 3, 3).
+        normals: B, (n, c, 3).
+    """
     if covariance.ndim == 3:
         return np.asarray(np.einsum("nai,nij,nbj->nab", normals, covariance, normals))
     n, c, _ = normals.shape
@@ -147,7 +150,13 @@ def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatA
 
 
 def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray) -> FloatArray:
-    """Return v = Q B' k, (n, 3), of correlates k (n c,)."""
+    """Return the residuals v = Q B' k, (n, 3).
+
+    Args:
+        covariance: Q, joint (3 n, 3 n) or of each point (n, 3, 3).
+        normals: B, (n, c, 3).
+        k: correlates, (n c,).
+    """
     n, c, _ = normals.shape
     back = np.einsum("nci,nc->ni", normals, k.reshape(n, c))
     if covariance.ndim == 3:
@@ -156,13 +165,13 @@ def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray)
 
 
 def _unit(Qw: FloatArray, A: FloatArray) -> FloatArray:
-    """Return the roots of the diagonal U: what a typical constraint would determine of each parameter."""
+    """Return the roots of the diagonal U, the precision of each parameter from a typical constraint."""
     variance = float(np.einsum("nii->", Qw) / len(A) if Qw.ndim == 3 else np.trace(Qw) / len(A))
     return np.asarray(np.sqrt(variance / np.maximum((A**2).mean(axis=0), 1e-300)))
 
 
 class _Blocks:
-    """W of points that are not correlated: Q_w block by block, and A U A' by Woodbury's formula."""
+    """W of uncorrelated points: Q_w block by block, and A U A' by Woodbury's formula."""
 
     def __init__(self, Qw: FloatArray, AU: FloatArray) -> None:
         self.inverse = np.linalg.inv(Qw)
@@ -190,7 +199,7 @@ class _Dense:
         self.factor = cho_factor(W, lower=True, overwrite_a=True, check_finite=False)
 
     def inverse_blocks(self, n: int, c: int) -> FloatArray:
-        """Return the blocks (n, c, c) on the diagonal of the inverse."""
+        """Return the diagonal blocks of the inverse, (n, c, c)."""
         lower, _ = dpotri(self.factor[0], lower=True)
         W = lower.reshape(n, c, n, c)[np.arange(n), :, np.arange(n), :]
         return np.asarray(np.tril(W) + np.tril(W, -1).transpose(0, 2, 1))
@@ -216,7 +225,10 @@ def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
 
 
 def _tests(k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: FloatArray, n: int) -> FloatArray:
-    """Return of each point the root of k' Q_kk^-1 k over its constraints: Baarda's w of one, (n,)."""
+    """Return for each point the root of k' Q_kk^-1 k over the number of its constraints, (n,).
+
+    For a single constraint this is Baarda's w.
+    """
     c = len(k) // n
     if isinstance(solve, _Blocks):
         AU = solve.weighted.reshape(n, c, -1)
@@ -244,16 +256,16 @@ def refine_orthogonal(
     placed: bool = True,
     iterations: int = ORTHOGONAL_ITERATIONS,
 ) -> tuple[Shape, float, bool]:
-    """Return the shape of the least sum of squared distances near a start.
+    """Return the shape with the least sum of squared distances near a start.
 
     Args:
         start: shape to start from.
         xyz: points about their centroid, of unit size, (n, 3).
         free: which of the six motions and the form are adjusted, (6 + q,).
-        offset: signed distances that the points shall have, (c,).
-        weight: of each point, (n,); equal if not given.
+        offset: required signed distances of the points, (c,).
+        weight: weight of each point, (n,); equal if not given.
         placed: whether the origin may be anywhere along the axis.
-        iterations: at most.
+        iterations: largest number of iterations.
 
     Returns:
         The shape, the weighted sum of squares, and whether it converged.
@@ -291,7 +303,7 @@ def refine_orthogonal(
             damping *= max(1 / 3, 1 - (2 * min(gain, 2.0) - 1) ** 3)
             growth = 2.0
         elif abs(new_cost - cost) <= 1e-13 * cost and size < 1e-5:
-            # rounding hides the gain: the gradient still shows where to go
+            # rounding hides the gain, but the gradient still shows the direction
             if float(np.abs(new_A.T @ new_e).max()) >= float(np.abs(h).max()):
                 return shape, cost, True
             shape, e, A, cost = trial, new_e, new_A, new_cost
@@ -304,6 +316,11 @@ def refine_orthogonal(
 
 
 def moved_in_place(shape: Shape, step: FloatArray) -> Shape:
-    """Return the shape after a step with its origin where the step leaves it."""
+    """Return the shape after a step, without shifting its origin along the axis.
+
+    Args:
+        shape: the shape.
+        step: shifts and rotations in the axes of the shape, and of the form, (6 + q,).
+    """
     moved = shape.moved(step, shape.origin)
     return Shape(moved.kind, shape.origin + shape.rotation @ step[:3], moved.rotation, shape.form + step[6:])

@@ -1,10 +1,11 @@
 """Shapes in space and their kinds: orthogonal distances of points, with derivatives.
 
-Each shape has its axes y = R' (x - c): its axis or normal is y3. A kind lists which of the six
-motions of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form
-parameters it has, and one function: the signed distance d of points, its gradient g by the point, a unit
-vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and off
-it. The derivative by a motion follows for all kinds alike from g (`Shape.design`).
+Each shape has its own axes y = R' (x - c), with its axis or normal along y3. A kind lists the motions of
+these axes that change it; a sphere has no direction, and a cylinder no position along its axis. It also lists
+its form parameters. One function gives the signed distance d of points, its gradient g by the point, which is
+a unit vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and
+perpendicular to it. The derivatives by the motions follow from g in the same way for all kinds
+(`Shape.design`).
 
 Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8.
@@ -19,11 +20,11 @@ import numpy as np
 
 from sfm.conventions import FloatArray, rotation_from_vector
 
-PLACED_ALONG = ("line", "cylinder", "cone")  # kinds with an origin anywhere along the axis
+PLACED_ALONG = ("line", "cylinder", "cone")  # kinds with an arbitrary origin along the axis
 Distances = tuple[FloatArray, FloatArray, FloatArray]
 """d (n, c), gradients by the point (n, c, 3), derivatives by the form parameters (n, c, q)"""
-BISECTIONS = 60  # of the foot point on an ellipse; Newton's steps follow
-NEWTON_STEPS = 60  # of the foot point on a parabola, at most
+BISECTIONS = 60  # bisections for the foot point on an ellipse; Newton's steps follow
+NEWTON_STEPS = 60  # largest number for the foot point on a parabola
 TINY = 1e-300  # keeps quotients finite on the axis, where a distance has no direction
 
 
@@ -32,12 +33,12 @@ class Kind:
     """One kind of shape."""
 
     name: str
-    place: str  # what its origin is called
-    form: tuple[str, ...]  # names of the form parameters, lengths but for `half_angle`, rad
+    place: str  # name of its origin
+    form: tuple[str, ...]  # names of the form parameters, lengths except for `half_angle`, rad
     moves: tuple[int, ...]  # motions that change it: 0-2 shifts along y1 y2 y3, 3-5 rotations about them
-    constraints: int  # distances of a point: 1 of a surface, 2 of a curve
+    constraints: int  # number of distances of a point: 1 for a surface, 2 for a curve
     min_points: int
-    distance: Callable[[FloatArray, FloatArray], Distances]  # of points y (n, 3) from the form (q,)
+    distance: Callable[[FloatArray, FloatArray], Distances]  # from points y (n, 3) and form (q,)
 
     @property
     def size(self) -> int:
@@ -87,12 +88,13 @@ def _ellipse(y: FloatArray, q: FloatArray) -> Distances:
 
 
 def _foot_on_ellipse(x: FloatArray, y: FloatArray, a: float, b: float) -> tuple[FloatArray, FloatArray]:
-    """Return cosine and sine of the parameter of the nearest point of an ellipse with semi-axes a and b.
+    """Return cosine and sine of the parameter of the nearest point on an ellipse with semi-axes a and b.
 
     Source: Eberly (2013), Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid, sec. 2.
     """
     u, v = np.abs(x), np.abs(y)
-    # (a u / (t + a^2))^2 + (b v / (t + b^2))^2 = 1 falls with t; its root lies between these bounds
+    # the left side of (a u / (t + a^2))^2 + (b v / (t + b^2))^2 = 1 falls with t; these bounds enclose the
+    # root
     least = min(a, b) ** 2
     low = np.maximum(a * u - a * a, b * v - b * b)
     low = np.maximum(low, -least)
@@ -157,9 +159,10 @@ def _paraboloid(y: FloatArray, q: FloatArray) -> Distances:
 
 
 def _foot_on_parabola(rho: FloatArray, z: FloatArray, f: float) -> FloatArray:
-    """Return the distance from the axis of the nearest point of z = rho^2 / (4 f), rho >= 0.
+    """Return the distance from the axis of the nearest point on z = rho^2 / (4 f), rho >= 0.
 
-    It is the largest root of s^3 / (8 f^2) + s (1 - z / (2 f)) - rho, which Newton's steps reach from above.
+    It is the largest root of s^3 / (8 f^2) + s (1 - z / (2 f)) - rho, which Newton's method approaches from
+    above.
     """
     linear = 1 - z / (2 * f)
     s = np.sqrt(8 * f * f * np.maximum(-linear, 0)) + np.cbrt(8 * f * f * rho)
@@ -187,7 +190,7 @@ KINDS = {
         Kind("paraboloid", "vertex", ("focal_length",), (*SHIFTS, *TILTS), 1, 6, _paraboloid),
     )
 }
-"""every kind of shape by its name"""
+"""all kinds of shapes by name"""
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ class Shape:
 
     kind: Kind
     origin: FloatArray  # c, object unit, (3,)
-    rotation: FloatArray  # R, the axes of the shape as columns, (3, 3)
+    rotation: FloatArray  # R, axes of the shape as columns, (3, 3)
     form: FloatArray  # values of kind.form, object unit, rad, (q,)
 
     @property
@@ -215,27 +218,31 @@ class Shape:
             xyz: points, object unit, (n, 3).
 
         Returns:
-            Distances, normals, and derivatives by shifts and rotations of the shape in its axes and by
-            its form, (n, c, 6 + q).
+            Distances, normals, and derivatives by shifts and rotations of the shape in its axes and by its
+            form, (n, c, 6 + q).
         """
         y = (xyz - self.origin) @ self.rotation
         d, g, of_form = self.kind.distance(y, self.form)
         return d, g @ self.rotation.T, np.concatenate([-g, -_cross(y, g), of_form], axis=2)
 
     def moved(self, step: FloatArray, centroid: FloatArray) -> Shape:
-        """Return the shape after a step, its origin abreast of a point where it may be anywhere.
+        """Return the shape after a step, with an arbitrary origin moved next to the points.
 
         Args:
-            step: shifts and rotations in the axes of the shape, and of the form, (6 + q,).
-            centroid: of the points, (3,).
+            step: shifts and rotations in the axes of the shape, and changes of the form, (6 + q,).
+            centroid: centroid of the points, (3,).
         """
         origin = self.origin + self.rotation @ step[:3]
         rotation = self.rotation @ rotation_from_vector(step[3:6])
-        U, _, Vt = np.linalg.svd(rotation)  # rounding must not add up
+        U, _, Vt = np.linalg.svd(rotation)  # keeps rounding from accumulating
         return Shape(self.kind, origin, U @ Vt, self.form + step[6:]).placed(centroid)
 
     def placed(self, centroid: FloatArray) -> Shape:
-        """Return the same shape with its origin abreast of a point, where the kind leaves it free."""
+        """Return the same shape with its origin as close to a point as its kind allows.
+
+        Args:
+            centroid: the point, (3,).
+        """
         axis, form = self.axis, self.form
         along = float(axis @ (centroid - self.origin))
         if self.kind.name in PLACED_ALONG:
@@ -247,10 +254,10 @@ class Shape:
         return self
 
     def turned(self) -> Shape:
-        """Return the same shape with a direction that does not depend on chance, and its form positive.
+        """Return the same shape with a unique direction and positive form parameters.
 
-        The largest component of the direction is positive; that of a cone opens it, that of a paraboloid
-        leads from its vertex to its focus.
+        The largest component of the direction is positive. The direction of a cone points to its opening,
+        that of a paraboloid from its vertex to its focus.
         """
         name, form, flip = self.kind.name, self.form.copy(), False
         rotation = self.rotation
@@ -272,7 +279,7 @@ class Shape:
         return replace(self, rotation=rotation, form=form)
 
     def scaled(self, factor: float, shift: FloatArray) -> Shape:
-        """Return the shape after x -> factor x + shift."""
+        """Return the shape after the transformation x -> factor x + shift."""
         lengths = np.array([1.0 if name == "half_angle" else factor for name in self.kind.form])
         return replace(self, origin=factor * self.origin + shift, form=self.form * lengths)
 

@@ -1,8 +1,8 @@
-"""Start values of shapes from their points: algebraic fits, and those that most points agree on.
+"""Start values of shapes from their points: algebraic fits, and robust fits on which most points agree.
 
-A line, plane, circle, ellipse and sphere have a direct solution. A cylinder, cone, torus and paraboloid
-become linear, or a circle, once their axis is known: directions all over the half sphere are tried, and the
-best are refined by orthogonal distances.
+A line, plane, circle, ellipse and sphere have direct solutions. With a known axis, a cylinder, cone, torus or
+paraboloid becomes a linear problem or a circle. So directions all over the half sphere are tried, and the
+best ones are refined by orthogonal distances.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and
 Flusser (1998), Numerically stable direct least squares fitting of ellipses; Rousseeuw and Leroy (1987),
@@ -22,15 +22,15 @@ from sfm.errors import GeometryError
 from sfm.geometry.shapes.gauss_helmert import refine_orthogonal
 from sfm.geometry.shapes.kinds import KINDS, Kind, Shape, axes_along
 
-TRIALS = 30  # of few points: with 20 % of outliers 99 % find some without one, of a torus too
-TRIAL_DIRECTIONS = 40  # of an axis that are tried for each
-MORE_POINTS = 1  # than a shape needs, of each trial
+TRIALS = 30  # samples of few points; with 20 % outliers, 99 % of fits have a clean sample, even for a torus
+TRIAL_DIRECTIONS = 40  # directions of an axis that are tried in each sample
+MORE_POINTS = 1  # points in a sample beyond those that a shape needs
 TRIAL_STEPS = 15
 TUKEY = 4.685  # standard deviations beyond which a point has no weight; 95 % efficient
 ROUNDS = 50
-SEED = 20  # of the trials, so that a fit gives the same each time
-DIRECTIONS = 120  # over the half sphere, some 13 degrees apart
-MAX_ANGLE = np.deg2rad(89.0)  # half angle of a cone
+SEED = 20  # seed of the samples, so that repeated fits give the same result
+DIRECTIONS = 120  # over the half sphere, about 13 degrees apart
+MAX_ANGLE = np.deg2rad(89.0)  # largest half angle of a cone
 
 
 def start_shapes(
@@ -41,14 +41,14 @@ def start_shapes(
     axis: FloatArray | None = None,
     directions: int = DIRECTIONS,
 ) -> list[Shape]:
-    """Return shapes to start from, the likeliest first; none where the points determine none.
+    """Return start shapes, likeliest first; empty if the points do not determine any.
 
     Args:
-        kind: of the shape.
+        kind: kind of the shape.
         xyz: points about their centroid, of unit size, (n, 3).
-        origin: where the shape must lie, if it is held.
-        axis: its direction, if it is held.
-        directions: of an axis that are tried.
+        origin: held origin of the shape, None if free, (3,).
+        axis: held direction of the shape, None if free, (3,).
+        directions: number of directions of an axis that are tried.
     """
     normal, along = principal_directions(xyz)
     if kind.name in DIRECT:
@@ -65,13 +65,17 @@ def start_shapes(
 
 
 def _best_first(found: list[Shape], xyz: FloatArray) -> list[Shape]:
-    """Return shapes by their sum of squared distances, those without one left out."""
+    """Return shapes sorted by their sum of squared distances, without those where it is not finite."""
     costs = [float((shape.distances(xyz) ** 2).sum()) for shape in found]
     return [found[k] for k in np.argsort(costs, kind="stable") if np.isfinite(costs[k])]
 
 
 def principal_directions(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the directions in which points about their centroid spread least and most, (3,) each."""
+    """Return the directions in which points about their centroid spread least and most, (3,) each.
+
+    Args:
+        xyz: points about their centroid, (n, 3).
+    """
     _, _, Vt = np.linalg.svd(xyz, full_matrices=True)
     return Vt[2], Vt[0]
 
@@ -93,7 +97,7 @@ def _least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _circle_in_plane(xy: FloatArray) -> tuple[FloatArray, float]:
-    """Return centre and radius of the algebraic circle (Kasa's)."""
+    """Return centre and radius of the algebraic circle (Kasa)."""
     u = _least_squares(np.column_stack([2 * xy, np.ones(len(xy))]), (xy**2).sum(axis=1))
     return u[:2], float(np.sqrt(max(u[2] + u[:2] @ u[:2], 0.0)))
 
@@ -114,7 +118,7 @@ def _spheres(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 
 
 def _ellipses(xyz: FloatArray, R: FloatArray) -> list[Shape]:
-    """Return the ellipse of Halir and Flusser, and that of the circle's centre where it has none."""
+    """Return the ellipse of Halir and Flusser, if it exists, and two ellipses about the best circle."""
     x, y = (xyz @ R)[:, :2].T
     D1, D2 = np.column_stack([x * x, x * y, y * y]), np.column_stack([x, y, np.ones_like(x)])
     S1, S2, S3 = D1.T @ D1, D1.T @ D2, D2.T @ D2
@@ -154,8 +158,8 @@ def _cylinders(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
     """Return the cone with this axis: (x - x0)^2 + (y - y0)^2 = (r + z tan)^2 is linear in five unknowns.
 
-    Few points far from a cone may have none; then that of the circle they make along the axis, and of the
-    straight line of their distances from its centre.
+    A few points far from any cone may have no solution. Then the cone follows from the circle that they form
+    along the axis, and a straight line through their distances from its centre.
     """
     y = xyz @ R
     A = np.column_stack([2 * y[:, :2], np.ones(len(y)), y[:, 2], y[:, 2] ** 2])
@@ -174,7 +178,7 @@ def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 
 
 def _cones_at(xyz: FloatArray, apex: FloatArray, directions: FloatArray) -> list[Shape]:
-    """Return cones with a given apex: of each direction the mean angle to the points."""
+    """Return cones with a given apex; the half angle for each direction is the mean angle to the points."""
     y = xyz - apex
     found = []
     for axis in np.vstack([directions, -directions]):
@@ -186,7 +190,7 @@ def _cones_at(xyz: FloatArray, apex: FloatArray, directions: FloatArray) -> list
 
 
 def _tori(xyz: FloatArray, R: FloatArray) -> list[Shape]:
-    """Return the torus about the circle that the points have as seen along this axis."""
+    """Return tori about the circle that the points form as seen along this axis."""
     y = xyz @ R
     centre, major = _circle_in_plane(y[:, :2])
     found = []
@@ -199,13 +203,13 @@ def _tori(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 
 
 def _paraboloids(xyz: FloatArray, R: FloatArray) -> list[Shape]:
-    """Return the paraboloid z = (x^2 + y^2) / (4 f) + linear terms, opening along this axis or against it."""
+    """Return the paraboloid z = (x^2 + y^2) / (4 f) + linear terms, open along this axis or against it."""
     y = xyz @ R
     A = np.column_stack([(y[:, :2] ** 2).sum(axis=1), y[:, :2], np.ones(len(y))])
     k, bx, by, c = _least_squares(A, y[:, 2])
     if not abs(k) > 1e-9:
         return []
-    if k < 0:  # turned about its first axis: y2 and y3 change sign
+    if k < 0:  # rotated about its first axis: y2 and y3 change sign
         R, k, bx, c = R * np.array([1.0, -1, -1]), -k, -bx, -c
     vertex = np.array([-bx / (2 * k), -by / (2 * k), c - (bx * bx + by * by) / (4 * k)])
     return [Shape(KINDS["paraboloid"], R @ vertex, R, np.array([1 / (4 * k)]))]
@@ -232,20 +236,20 @@ def robust_shape(
     form: FloatArray,
     placed: bool,
 ) -> tuple[Shape, BoolArray]:
-    """Return the shape that most of the points agree on, and which points those are.
+    """Return the shape on which most of the points agree, and which points these are, (n,).
 
     Args:
-        kind: of the shape.
+        kind: kind of the shape.
         xyz: points about their centroid, of unit size, (n, 3).
         free: which of the six motions and the form are adjusted, (6 + q,).
-        offset: signed distances that the points shall have, (c,).
-        origin: where it must lie, None if that is free.
-        axis: its direction, None if that is free.
-        form: held form parameters, NaN of the free ones, (q,).
+        offset: required signed distances of the points, (c,).
+        origin: held origin, None if free, (3,).
+        axis: held direction, None if free, (3,).
+        form: held form parameters, NaN for free ones, (q,).
         placed: whether the origin may be anywhere along the axis.
 
     Raises:
-        GeometryError: too few points to separate the good ones from the others.
+        GeometryError: too few points to separate good points from others.
     """
     n, size = len(xyz), kind.min_points + MORE_POINTS
     if n < size + 1:
@@ -286,12 +290,23 @@ def robust_shape(
 
 
 def robust_sigma(length: FloatArray, parameters: int) -> float:
-    """Return the standard deviation that most distances have, with Rousseeuw's factor for few of them."""
+    """Return the robust standard deviation of distances, with Rousseeuw's factor for few of them.
+
+    Args:
+        length: distances, (n,).
+        parameters: number of fitted parameters.
+    """
     return float(MAD_TO_SIGMA * (1 + 5 / max(len(length) - parameters, 1)) * np.median(length))
 
 
 def with_held(shape: Shape, origin: FloatArray | None, form: FloatArray) -> Shape:
-    """Return a shape with what is held of it in place."""
+    """Return a shape with its held values inserted.
+
+    Args:
+        shape: the shape.
+        origin: held origin, None if free, (3,).
+        form: held form parameters, NaN for free ones, (q,).
+    """
     return Shape(
         shape.kind,
         shape.origin if origin is None else origin,
