@@ -1,19 +1,19 @@
-"""Methods of the literature that a survey does not need, to learn from and to compare with.
+"""Textbook methods that a survey does not need, for study and comparison.
 
 - Resection of one photograph: `resect_p4p`, `resect_rampal`, `resect_zeng_wang`, `resect_church`,
-  `resect_dlt`, `resect_unknown_noise`. All take the measured rays and the points, `(tangents, points)`; a
-  start follows where one is needed. The DLT, which determines the camera too, takes image coordinates in mm
-  for the rays. `resect` and `resect_by_all` go by the name of the method.
+  `resect_dlt`, `resect_unknown_noise`. All take the measured rays and the points, `(tangents, points)`,
+  followed by a start if they need one. The DLT also determines the camera, and takes image coordinates in mm
+  instead of rays. `resect` and `resect_by_all` select a method by name.
 - Steps of the resection: `distance_quartic` and its `positive_roots`, `trilaterate` with `direction_test`,
-  `pope_hinsken`; `cylinder_distance`: how well three points determine the position.
+  `pope_hinsken`. `cylinder_distance` states how well three points determine the position.
 - Pairs: `orient_dependent`, `orient_independent` with the five classical parameters, `orient_direct` onto
-  control at once, `make_normal_images`.
+  control in one step, `make_normal_images`.
 - Scanned and aerial photographs: `orient_fiducials`, `photo_from_pixel`, `pixel_from_photo`.
   `correct_photo_coordinates` applies `radial_from_table`, `refraction_coefficient` and
-  `curvature_displacement`, `distort_photo_coordinates` takes them back; `compute_photo_coordinates` simulates
-  a photograph.
+  `curvature_displacement`; `distort_photo_coordinates` reverses them. `compute_photo_coordinates` simulates a
+  photograph.
 - Matching: `match_along_line`, `match_pyramid`.
-- Adjustment: `adjust_separately`, points and photographs in turn.
+- Adjustment: `adjust_separately`, which adjusts points and photographs in turn.
 
 Each docstring names its source.
 

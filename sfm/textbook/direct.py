@@ -1,10 +1,13 @@
-"""Direct orientation of a pair onto control, and adjustment of points and photographs in turn.
+"""Two other ways to adjust a network: direct orientation onto control, and separate adjustment.
 
-Separate adjustment takes object points and orientations in turn, in place of all unknowns together. Each
-round first moves every object point with the orientations held (3 x 3 systems), then all orientations with
-the points held (one system of the exterior orientations and the interior parameters). It ends at the same
-optimum as the simultaneous adjustment, but converges only linearly and knows no covariance between points and
-orientations: what it would call the precision of a point is the limiting precision.
+Direct orientation adjusts photographs (usually a pair) onto control points in one adjustment, without a model
+in between. Each photograph starts from a resection on its control points.
+
+Separate adjustment alternates between object points and orientations instead of solving for all unknowns
+together. Each round first adjusts every object point with the orientations held (3 x 3 systems). Then it
+adjusts all orientations with the points held, in one system of the exterior orientations and the interior
+parameters. It ends at the same optimum as the simultaneous adjustment, but converges only linearly. It gives
+no covariance between points and orientations, so its precision of a point would be the limiting precision.
 
 Source: document 000 of the project's sources, sec. 2.4; block coordinate descent in Nocedal and Wright,
 Numerical Optimization (2006), sec. 9.3.
@@ -31,24 +34,24 @@ from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust
 
-TOLERANCE = 1e-13  # relative decrease of v'Pv in a round at which the rounds end
-MIN_STEP_SHARE = 2.0**-12  # shortest share of a step that is tried
+TOLERANCE = 1e-13  # relative decrease of v'Pv per round at which the rounds stop
+MIN_STEP_SHARE = 2.0**-12  # smallest fraction of a step that is tried
 MAX_STEPS = 30
 MAX_LAST_STEP = 1e-12
-START_TOLERANCE = 0.1  # tangents: what a start may be off
+START_TOLERANCE = 0.1  # tangents: tolerated error of a start
 
 
 @dataclass(frozen=True)
 class DirectOrientation:
     """Photographs oriented to control in one adjustment, without a model in between."""
 
-    positions: FloatArray  # projection centres, control unit, (m, 3)
+    positions: FloatArray  # projection centres, unit of the control points, (m, 3)
     rotations: FloatArray  # R, image to object axes, (m, 3, 3)
-    points: FloatArray  # control as given, others intersected, control unit, (n, 3)
+    points: FloatArray  # control points as given, others adjusted, unit of the control points, (n, 3)
     residuals: FloatArray  # v = computed - measured, tangents, (k, 2)
     sigma0: float  # a posteriori standard deviation of an image coordinate, tangents
     redundancy: int  # 2 k - 6 m - 3 new points
-    covariance: FloatArray  # of X0 and w in R exp([w]x) of all photographs, (6 m, 6 m)
+    covariance: FloatArray  # covariance of X0 and w in R exp([w]x) of all photographs, (6 m, 6 m)
     converged: bool  # whether the last step was negligible
 
 
@@ -56,20 +59,20 @@ class DirectOrientation:
 def orient_direct(
     tangents: FloatArray, image: IntArray, point: IntArray, control: FloatArray
 ) -> DirectOrientation:
-    """Return photographs (usually two) oriented to control points, conjugate rays of new points included.
+    """Orient photographs (usually two) to control points, with the conjugate rays of new points.
 
     Args:
         tangents: u = -U/W, v = -V/W of each ray, free of distortion, shape (k, 2).
-        image: index of the photograph of each ray, shape (k,).
-        point: index of the point of each ray, shape (k,).
-        control: coordinates of all points, NaN where they are not control, shape (n, 3), control unit.
+        image: photograph index of each ray, shape (k,).
+        point: point index of each ray, shape (k,).
+        control: coordinates of the control points, NaN for all other points, shape (n, 3), any unit.
 
     Raises:
-        GeometryError: a photograph with fewer than four control points (its start), a new point without two
-            rays, or rays that do not determine the solution.
+        GeometryError: a photograph has fewer than four control points (its start needs them), a new point has
+            fewer than two rays, or the rays do not determine the solution.
 
-    Source: document 004, "direct orientation": the collinearity equations of both photographs, control points
-    fixed, new points as unknowns that are eliminated; Gauss-Newton.
+    Source: document 004, "direct orientation": the collinearity equations of both photographs, solved by
+    Gauss-Newton. Control points are fixed, and the new points are unknowns that are eliminated.
     """
     uv = np.ascontiguousarray(tangents, dtype=float)
     known = np.asarray(np.isfinite(control).all(axis=1))
@@ -120,7 +123,7 @@ def orient_direct(
 def _resected(
     uv: FloatArray, image: IntArray, point: IntArray, control: FloatArray, known: BoolArray, m: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Start of every photograph by resection on its control points."""
+    """Return start positions and rotations of all photographs, resected on their control points."""
     positions, rotations = np.empty((m, 3)), np.empty((m, 3, 3))
     for i, rows in enumerate(rows_of(image, m)):
         used = rows[known[point[rows]]]
@@ -140,7 +143,7 @@ def _observations(
     rotations: FloatArray,
     points: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (k, 2) and derivatives by the photograph (k, 2, 6) and the point (k, 2, 3)."""
+    """Return residuals (k, 2), and their derivatives by photograph (k, 2, 6) and point (k, 2, 3)."""
     R = rotations[image]
     UVW = np.einsum("kji,kj->ki", R, points[point] - positions[image])
     W = UVW[:, 2:]
@@ -157,7 +160,7 @@ def _observations(
 def _reduced(
     v: FloatArray, A: FloatArray, B: FloatArray, image: IntArray, point: IntArray, known: BoolArray, m: int
 ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
-    """Normal equations of the photographs with the new points eliminated, and the function for these."""
+    """Return the normal equations without the new points, and the function that solves for these points."""
     k = len(v)
     wide = np.zeros((k, 2, 6 * m))
     columns = 6 * image[:, None] + np.arange(6)
@@ -186,11 +189,11 @@ def _reduced(
 
 @dataclass(frozen=True)
 class SeparateAdjustment:
-    """Where the rounds ended."""
+    """The state after the last round."""
 
     estimate: Estimate  # adjusted interior and exterior orientation and points
     vPv: float  # weighted sum of squared residuals of the image points
-    rounds: int  # that were computed
+    rounds: int  # number of rounds computed
     converged: bool  # whether the last round decreased v'Pv by no more than the tolerance
 
 
@@ -198,24 +201,24 @@ class SeparateAdjustment:
 def adjust_separately(
     network: Network, estimate: Estimate, *, max_rounds: int = 2000, tolerance: float = TOLERANCE
 ) -> SeparateAdjustment:
-    """Return the adjustment of points and orientations in turn.
+    """Adjust points and orientations alternately.
 
-    Each round moves every object point by itself, the orientations held, then all orientations, the points
-    held. It ends at the optimum of `sfm.adjustment.solve.adjust`, but takes hundreds of rounds where that
-    takes a few steps, and gives no covariance. The control points of the network, fixed, are the datum if
-    there are any; else it stays where the start values put it.
+    Each round adjusts every object point by itself with the orientations held, then all orientations with the
+    points held. It ends at the optimum of `sfm.adjustment.solve.adjust`. But it takes hundreds of rounds
+    where `adjust` takes a few steps, and it gives no covariance. Control points, if there are any, are fixed
+    and define the datum. Otherwise the start values define it.
 
     Args:
         network: image points, and control points if any.
-        estimate: start values; photographs and points without (NaN) are held out.
-        max_rounds: rounds at most.
-        tolerance: relative decrease of v'Pv in a round at which the rounds end.
+        estimate: start values; photographs and points without start values (NaN) are left out.
+        max_rounds: largest number of rounds.
+        tolerance: relative decrease of v'Pv per round at which the rounds stop.
 
     Returns:
-        Adjusted values, v'Pv, and whether it converged.
+        Adjusted values, v'Pv, and whether the rounds converged.
 
     Raises:
-        GeometryError: scale bars or other observations, which join points to one another.
+        GeometryError: the network has scale bars or other observations that tie points to one another.
 
     Example:
         >>> adjust_separately(network, start).estimate.points  # doctest: +SKIP
@@ -244,13 +247,13 @@ def adjust_separately(
 
 
 def _points(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
-    """Step of the points, -V^-1 g, with the orientations held."""
+    """Return the step of the points with the orientations held, -V^-1 g."""
     dX = -np.linalg.solve(blocks.V, blocks.gp[:, :, None])[:, :, 0]
     return np.zeros(layout.reduced), np.where(layout.point_free, dX, 0.0)
 
 
 def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
-    """Step of exterior and interior orientation, -U^-1 g, with the points held."""
+    """Return the step of exterior and interior orientation with the points held, -U^-1 g."""
     m = len(layout.pose_free)
     U = np.zeros((layout.reduced, layout.reduced))
     g = np.zeros(layout.reduced)
@@ -274,7 +277,7 @@ def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatAr
 def _shorten(
     layout: Unknowns, state: State, weight: FloatArray, reduced: FloatArray, points: FloatArray, vPv: float
 ) -> tuple[State, float]:
-    """Return the state after the longest share of the step, by halves, that does not raise v'Pv."""
+    """Halve the step until v'Pv does not increase, and return the new state and its v'Pv."""
     share = 1.0
     while share >= MIN_STEP_SHARE:
         moved = step(layout, state, share * reduced, share * points)

@@ -1,4 +1,4 @@
-"""Correlation from coarse to fine, and along lines such as epipolar lines."""
+"""Cross-correlation from coarse to fine, and along lines such as epipolar lines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sfm.matching.correlation import (
 )
 from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of, grey_of_8_bit, odd_window
 
-FINE_REACH = 4  # a pixel of the level above is two here, and as much again for its error, px
+FINE_REACH = 4  # px: a pixel of the level above is 2 px here; doubled to allow for its error
 
 
 @checked_arguments(xy_left="k 2", xy_right="n 2")
@@ -39,23 +39,27 @@ def match_pyramid(
     levels: int = 3,
     min_correlation: float = 0.5,
 ) -> NccMatches:
-    """Look for templates from coarse to fine: the whole search window at the top, a few pixels below.
+    """Match templates from coarse to fine in image pyramids.
+
+    The top level searches the whole window. Every level below searches a few pixels around the match of the
+    level above.
 
     Args:
-        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
-        right: the other photograph.
+        left: left photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: right photograph, like the left one.
         xy_left: points in the left photograph, px, (k, 2).
         xy_right: centres of the search windows, px, (k, 2).
-        template_px: odd side of the template, the same on every level, px of that level.
+        template_px: odd side of the template on every level, px of that level.
         search_px: odd side of the search window, px of the photograph.
-        levels: photographs in the pyramid, each half the size of the one before.
+        levels: number of levels of the pyramid; each has half the size of the one before.
         min_correlation: smallest r of a match on any level.
 
     Returns:
-        The matches in the photographs of full size; those lost on the way carry the flag of their level.
+        The matches in the full-size photographs. A match that fails on a level carries the flag of that
+        level.
 
     Raises:
-        GeometryError: fewer than one level, or windows as in `match_ncc`.
+        GeometryError: there is no level, or `match_ncc` refuses the windows.
 
     Source: Luhmann et al. (2020), sec. 5.5.3 (image pyramids), levels by cv2.pyrDown; r as in `match_ncc`.
     """
@@ -78,7 +82,7 @@ def match_pyramid(
             search_px=side + 2 * (reach // 2 + 1),
             min_correlation=min_correlation,
         )
-        if matches is not None:  # what was lost above stays lost, with the reason of that level
+        if matches is not None:  # a match that failed on a level above keeps the flag of that level
             flag = np.where(matches.flag != 0, matches.flag, found.flag)
             found = replace(found, flag=flag, xy=np.where((flag == 0)[:, None], found.xy, np.nan))
         matches = found
@@ -89,7 +93,7 @@ def match_pyramid(
 
 
 def _pyramid(photograph: AnyArray, levels: int) -> list[AnyArray]:
-    """Photographs of half the size each; cv2.pyrDown keeps the centre of the top-left pixel where it is."""
+    """Return an image pyramid; cv2.pyrDown keeps the centre of the top-left pixel in position."""
     out: list[AnyArray] = [grey_of_8_bit(photograph)]
     for _ in range(levels - 1):
         out.append(cv2.pyrDown(out[-1]))
@@ -108,24 +112,24 @@ def match_along_line(
     min_correlation: float = 0.5,
     max_second: float = 1.0,
 ) -> NccMatches:
-    """Look for templates along lines of the right photograph, such as epipolar lines.
+    """Match templates along lines of the right photograph, such as epipolar lines.
 
     Args:
-        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
-        right: the other photograph.
+        left: left photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: right photograph, like the left one.
         xy_left: points in the left photograph, px, (k, 2).
-        lines: for each point the polygon along which it is looked for, px, k arrays (n_i, 2); with distortion
-            an epipolar line is curved. Parts outside the photograph are passed over.
-        template_px: odd side of the template.
-        width_px: how far from the line the best place may be, px.
+        lines: search line of each point as a polyline, px, k arrays (n_i, 2); distortion curves an epipolar
+            line. Parts outside the photograph are ignored.
+        template_px: odd side of the template, px.
+        width_px: largest distance of the match from the line, px.
         min_correlation: smallest r of a match.
         max_second: largest ratio of the second-best r to the best.
 
     Returns:
-        One result for each point.
+        One match for each point.
 
     Raises:
-        GeometryError: an even template, or points without a line each.
+        GeometryError: the template has an even side, or points and lines differ in number.
 
     Source: document 002, sec. II.1.2.1 (epipolar lines) with eq. 2.6 for r; precision as in `match_ncc`.
     """

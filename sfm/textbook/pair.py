@@ -1,17 +1,17 @@
-"""Pairs of photographs: dependent and independent relative orientation, normal images.
+"""Pairs of photographs: dependent and independent relative orientation, and normal images.
 
-Dependent: photograph 1 keeps its frame, photograph 2 gets by, bz (at a given bx) and omega, phi, kappa.
-Independent: the base is the X axis of the model, photograph 1 gets phi1, kappa1 (omega1 = 0), photograph 2
-omega2, phi2, kappa2; model coordinates are in units of the base.
+The dependent orientation keeps the frame of photograph 1. Its parameters are by, bz (for a given bx) and
+omega, phi, kappa of photograph 2. The independent orientation takes the base as the X axis of the model. Its
+parameters are phi1, kappa1 of photograph 1 (omega1 = 0) and omega2, phi2, kappa2 of photograph 2; model
+coordinates are in units of the base.
 
-Normal images of two oriented photographs: free of distortion, with epipolar lines along their rows.
-
-Both images have one rotation, whose x axis is the base, and one principal distance; conjugate points have
-the same y, and differ in x by the parallax c b / depth. Matching along a row is then matching along an
-epipolar line.
+Normal images of two oriented photographs are free of distortion, and their rows are epipolar lines. Both
+have the same rotation, with the base as x axis, and the same principal distance. Conjugate points have the
+same y, and their x differ by the parallax c b / depth. So matching along a row is matching along an epipolar
+line.
 
 Source: document 002, sec. II.1.2.1 (normalisation); Kraus (2007), Photogrammetry, sec. 4.3 and 6.8.4 (normal
-images); the rotation as Fusiello, Trucco and Verri (2000), Machine Vision and Applications 12, 16-22.
+images); Fusiello, Trucco and Verri (2000), Machine Vision and Applications 12, 16-22 (rotation).
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from sfm.kernels.sampling import resample
 from sfm.network import Estimate, Network
 from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
 
-BORDER_POINTS = 40  # on each side of a photograph, from which the format of its normal image is taken
-MAX_LARGER = 4.0  # area of a normal image over that of its photograph; beyond, the base is along the rays
-DIFFERENCE = 1e-6  # rad, of central differences: their error is some 1e-12 of the derivative
-NO_BX = 1e-6  # of the base: below it by and bz cannot be counted at a given bx
-FIVE_POINT_TOLERANCE = 0.01  # tangents: pairs that are farther off take no part in the five-point start
+BORDER_POINTS = 40  # points per side of a photograph that give the format of its normal image
+MAX_LARGER = 4.0  # largest area of a normal image over that of its photograph; beyond, the base is along rays
+DIFFERENCE = 1e-6  # rad, step of central differences: their error is about 1e-12 of the derivative
+NO_BX = 1e-6  # smallest |bx| over the base for which a given bx determines by and bz
+FIVE_POINT_TOLERANCE = 0.01  # tangents: the five-point start rejects pairs with larger residuals
 DEPENDENT = ("by", "bz", "omega", "phi", "kappa")
 INDEPENDENT = ("phi1", "kappa1", "omega2", "phi2", "kappa2")
 
 
 @dataclass(frozen=True)
 class PairOrientation:
-    """Five parameters of a pair by least squares on the coplanarity condition."""
+    """The five parameters of a pair, adjusted by least squares on the coplanarity condition."""
 
     kind: str  # dependent | independent
-    names: tuple[str, ...]  # of the five parameters, in order
+    names: tuple[str, ...]  # parameter names
     parameters: FloatArray  # by, bz in the unit of bx, angles in rad, (5,)
-    covariance: FloatArray  # of the parameters; NaN without redundancy, (5, 5)
+    covariance: FloatArray  # covariance of the parameters; NaN without redundancy, (5, 5)
     positions: FloatArray  # both projection centres in the frame of the pair, (2, 3)
     rotations: FloatArray  # R of both photographs, image axes to the frame of the pair, (2, 3, 3)
     residuals: FloatArray  # distance of each pair of rays from coplanarity, tangents, (n,)
@@ -61,17 +61,17 @@ def orient_dependent(
 
     Args:
         first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 5.
-        second: the conjugate rays of photograph 2, shape (n, 2).
+        second: tangents of the conjugate rays of photograph 2, shape (n, 2).
         bx: X component of the base, which sets the scale of the model.
-        start: approximate by, bz (in the unit of bx), omega, phi, kappa (rad), shape (5,); from the
-            five-point solution if not given (six pairs at least).
+        start: approximate by, bz (in the unit of bx), omega, phi, kappa (rad), shape (5,). Without a start
+            the five-point solution is taken, which needs at least six pairs.
 
     Returns:
         The five parameters with their covariance, and both photographs in the frame of photograph 1.
 
     Raises:
-        GeometryError: too few pairs, pairs that do not determine the parameters, no base, or a base without
-            X component.
+        GeometryError: there are too few pairs, the pairs do not determine the parameters, or the base is
+            undetermined or has no X component.
 
     Source: document 004, "dependent relative orientation"; Kraus (2007), sec. 4.3.
     """
@@ -98,19 +98,20 @@ def orient_dependent(
 def orient_independent(
     first: FloatArray, second: FloatArray, *, start: FloatArray | None = None
 ) -> PairOrientation:
-    """Return the independent relative orientation: phi1, kappa1, omega2, phi2, kappa2, base = X axis.
+    """Return the independent relative orientation phi1, kappa1, omega2, phi2, kappa2 in the base frame.
 
     Args:
         first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 5.
-        second: the conjugate rays of photograph 2, shape (n, 2).
-        start: approximate phi1, kappa1, omega2, phi2, kappa2, rad, shape (5,); from the five-point
-            solution if not given (six pairs at least).
+        second: tangents of the conjugate rays of photograph 2, shape (n, 2).
+        start: approximate phi1, kappa1, omega2, phi2, kappa2, rad, shape (5,). Without a start the five-point
+            solution is taken, which needs at least six pairs.
 
     Returns:
         The five parameters with their covariance, and both photographs in the frame of the base.
 
     Raises:
-        GeometryError: too few pairs, pairs that do not determine the parameters, or no base.
+        GeometryError: there are too few pairs, the pairs do not determine the parameters, or the base is
+            undetermined.
 
     Source: document 004, "independent relative orientation"; Kraus (2007), sec. 4.3.
     """
@@ -131,14 +132,14 @@ def orient_independent(
 
 
 def _base_frame(base: FloatArray) -> FloatArray:
-    """R1 = Ry(phi1) Rz(kappa1) that turns the base into the X axis: its first row is the base."""
+    """Return R1 = Ry(phi1) Rz(kappa1), which rotates the base to the X axis: its first row is the base."""
     phi = np.arcsin(np.clip(base[2], -1.0, 1.0))
     kappa = np.arctan2(-base[1], base[0])
     return rotation_from_angles(0.0, phi, kappa)
 
 
 def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Base and rotation from nothing; of a planar scene the solution with the smaller residuals."""
+    """Return base and rotation without start values; of a planar scene, the solution that fits better."""
     found = relative_orientations(first, second, tolerance=FIVE_POINT_TOLERANCE)
     if found[0].kind == "infinite":
         raise GeometryError(
@@ -159,13 +160,13 @@ def _pair(
     positions: FloatArray,
     rotations: FloatArray,
 ) -> PairOrientation:
-    """Parameters and their covariance from those of the turns of base and rotation."""
+    """Return the orientation; its covariance follows from that of small rotations of base and rotation."""
     J = np.empty((UNKNOWNS, UNKNOWNS))
     for k, step in enumerate(np.eye(UNKNOWNS) * DIFFERENCE):
         plus = parameters(*turned_pair(base, rotation, step))
         minus = parameters(*turned_pair(base, rotation, -step))
         change = plus - minus
-        # angles may pass +-180 deg between the two
+        # an angle may jump by 360 deg between the two
         change[-3:] = (change[-3:] + np.pi) % (2 * np.pi) - np.pi
         J[:, k] = change / (2 * DIFFERENCE)
     redundancy = len(residuals) - UNKNOWNS
@@ -186,44 +187,44 @@ def _pair(
 
 @dataclass(frozen=True)
 class NormalImages:
-    """The normal images of a pair, the photograph whose centre is on the left first."""
+    """The normal images of a pair; the left photograph comes first."""
 
     images: tuple[str, str]
     """names of the photographs"""
     cameras: tuple[Camera, Camera]
-    """of the normal images: without distortion; principal distance, format and y0 are those of both"""
+    """cameras of the normal images, without distortion; both share principal distance, format and y0"""
     position: FloatArray
     """projection centres, object unit, (2, 3)"""
     rotation: FloatArray
-    """R of both, image to object axes, (3, 3)"""
+    """common R, image to object axes, (3, 3)"""
     source: Estimate
     """interior and exterior orientation of the two photographs"""
 
     def normal_xy(self, side: int, xy: FloatArray) -> FloatArray:
-        """Return the places in a normal image of points of its photograph, px, (k, 2); NaN without one.
+        """Map points of a photograph to its normal image, px, (k, 2); NaN without an image.
 
         Args:
-            side: 0 or 1.
+            side: 0 for the left image, 1 for the right.
             xy: points in the photograph, px, (k, 2).
         """
         here = self.source
         return _seen_by(self.cameras[side], self.rotation, here.cameras[side], here.rotation[side], xy)
 
     def photograph_xy(self, side: int, xy: FloatArray) -> FloatArray:
-        """Return the places in a photograph of points of its normal image, px, (k, 2); NaN without one.
+        """Map points of a normal image to its photograph, px, (k, 2); NaN without an image.
 
         Args:
-            side: 0 or 1.
+            side: 0 for the left image, 1 for the right.
             xy: points in the normal image, px, (k, 2).
         """
         here = self.source
         return _seen_by(here.cameras[side], here.rotation[side], self.cameras[side], self.rotation, xy)
 
     def resample(self, side: int, photograph: AnyArray) -> FloatArray:
-        """Return the normal image of a photograph, intensities, (H, W); NaN outside the photograph.
+        """Resample a photograph to its normal image, intensities, (H, W); NaN outside the photograph.
 
         Args:
-            side: 0 or 1.
+            side: 0 for the left image, 1 for the right.
             photograph: intensities, (h, w).
         """
         width, height = self.cameras[side].size_px
@@ -234,18 +235,18 @@ class NormalImages:
 
 @checked_arguments()
 def make_normal_images(network: Network, estimate: Estimate, first: str, second: str) -> NormalImages:
-    """Return the normal images of two oriented photographs, large enough to show both of them whole.
+    """Return the normal images of two oriented photographs, large enough to show both photographs in full.
 
     Args:
-        network: has the photographs.
-        estimate: their orientation.
+        network: network that contains the photographs.
+        estimate: orientation of the photographs.
         first: name of one photograph.
-        second: name of the other.
+        second: name of the other photograph.
 
     Raises:
-        UnknownNameError: no photograph of that name.
-        GeometryError: a photograph without orientation, no base, or a base along the rays, by which a normal
-            image would have no end.
+        UnknownNameError: there is no photograph of that name.
+        GeometryError: a photograph is not oriented, the base is zero, or the base is along the rays, so that
+            a normal image would be infinite.
 
     Source: document 002, sec. II.1.2.1; Kraus (2007), sec. 6.8.4.
     """
@@ -316,6 +317,6 @@ def _border(camera: Camera) -> FloatArray:
 def _seen_by(
     camera: Camera, rotation: FloatArray, source: Camera, source_rotation: FloatArray, xy: FloatArray
 ) -> FloatArray:
-    """Return where a camera sees the rays of another one from the same place, px, (k, 2); NaN behind it."""
+    """Project the rays of one camera into another with the same centre, px, (k, 2); NaN behind it."""
     ray = ray_directions(tangents_from_pixel(source, xy), source_rotation)
     return project(camera, np.zeros(3), rotation, ray)

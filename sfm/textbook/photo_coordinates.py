@@ -1,7 +1,8 @@
-"""Photo coordinates: fiducial marks, corrections in their order with inverses, simulation.
+"""Photo coordinates: fiducial marks, corrections and their inverses, simulation.
 
-All corrections are radial or nearly so and are applied one after the other, from the measured point to
-the collinearity equations: principal point, radial distortion, decentring, refraction, earth curvature.
+The corrections lead from the measured point to the collinearity equations. They are applied one after the
+other: principal point, radial distortion, decentring, refraction, earth curvature. Each is reversed by
+fixed-point iteration.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from sfm.orientation.resection.least_squares import tangents_of
 SIMILARITY, AFFINE = "similarity", "affine"
 FEWEST = {SIMILARITY: 2, AFFINE: 3}
 MIN_SINGULAR_RATIO = 1e-9  # second singular value over the first
-EARTH_RADIUS_KM = 6372.2  # of the sphere of document 004
+EARTH_RADIUS_KM = 6372.2  # radius of the sphere in document 004
 INVERSE_STEPS = 100
 INVERSE_TOLERANCE_MM = 1e-13
 
@@ -35,31 +36,31 @@ class RadialTable:
 
 @dataclass(frozen=True)
 class PhotoCorrections:
-    """The corrections to be made; those left at their defaults are switched off."""
+    """The corrections to apply; a correction left at its default is switched off."""
 
     principal_point_mm: FloatArray = field(default_factory=lambda: np.zeros(2))  # x0, y0, (2,)
     radial_table: RadialTable | None = None  # subtracted: the measured point is displaced outwards
     radial: FloatArray = field(default_factory=lambda: np.zeros(3))  # K1, K2, K3 as in `brown` (added), (3,)
     decentring: FloatArray = field(default_factory=lambda: np.zeros(2))  # P1, P2 as in `brown` (added), (2,)
-    flying_height_km: float | None = None  # H of projection centre over the sea: refraction if given
-    terrain_height_km: float = 0.0  # h over the sea
-    curvature_height_km: float | None = None  # H over ground: earth curvature if given
+    flying_height_km: float | None = None  # H of the projection centre above sea level; corrects refraction
+    terrain_height_km: float = 0.0  # h of the terrain above sea level
+    curvature_height_km: float | None = None  # H above ground; corrects earth curvature
 
 
 @checked_arguments(xy_mm="... 2")
 def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
-    """Return photo coordinates to which the collinearity equations apply.
+    """Correct measured photo coordinates so that the collinearity equations apply.
 
     Args:
         xy_mm: measured photo coordinates (y up), shape (n, 2), mm.
-        corrections: what is to be corrected.
+        corrections: corrections to apply.
         c_mm: principal distance, mm.
 
     Returns:
         Corrected photo coordinates from the principal point, shape (n, 2), mm.
 
     Raises:
-        GeometryError: a point beyond the table of distortion, or a photograph below the terrain.
+        GeometryError: a point is beyond the distortion table, or the photograph is below the terrain.
 
     Source: document 004, "Corrections of photo coordinates": principal point, radial distortion, refraction,
     earth curvature; decentring after the radial part, as in Brown (1971).
@@ -72,18 +73,18 @@ def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
 
 @checked_arguments(xy_mm="... 2")
 def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
-    """Return the measured photo coordinates of ideal ones; inverse of `correct_photo_coordinates`.
+    """Compute measured photo coordinates from ideal ones; the inverse of `correct_photo_coordinates`.
 
     Args:
         xy_mm: ideal photo coordinates (y up) from the principal point, shape (n, 2), mm.
-        corrections: effects that the photograph has.
+        corrections: effects present in the photograph.
         c_mm: principal distance, mm.
 
     Returns:
         Measured photo coordinates, shape (n, 2), mm.
 
     Raises:
-        GeometryError: as `correct_photo_coordinates`, or a correction too strong to be inverted.
+        GeometryError: `correct_photo_coordinates` fails, or a correction is too strong to invert.
 
     Source: document 004; each correction is inverted by fixed-point iteration, the last one first.
     """
@@ -102,19 +103,19 @@ def compute_photo_coordinates(
     c_mm: float,
     corrections: PhotoCorrections | None = None,
 ) -> FloatArray:
-    """Return the photo coordinates at which object points are seen, for simulation.
+    """Simulate the measured photo coordinates of object points.
 
     Args:
         points: object points, shape (n, 3), object unit.
         position: projection centre X0, shape (3,), object unit.
         rotation: R, image to object axes, shape (3, 3).
         c_mm: principal distance, mm.
-        corrections: effects that the photograph has; none if not given.
+        corrections: effects present in the photograph; none if not given.
 
     Returns:
         Photo coordinates (y up), shape (n, 2), mm; NaN for points behind the camera.
 
-    Source: document 004, computation of photo coordinates: collinearity, then the corrections in reverse.
+    Source: document 004, computation of photo coordinates: collinearity, then the inverse corrections.
     """
     ideal = c_mm * tangents_of(position, rotation, points)
     return distort_photo_coordinates(ideal, corrections or PhotoCorrections(), c_mm=c_mm)
@@ -124,19 +125,20 @@ def compute_photo_coordinates(
 def photo_from_pixel(
     pixel: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
 ) -> FloatArray:
-    """Return photo coordinates (origin at the sensor centre, y up) of pixel coordinates (column, row).
+    """Convert pixel coordinates (column, row) to photo coordinates (origin at the sensor centre, y up).
 
     Args:
         pixel: column and row from the centre of the first pixel, shape (n, 2), px.
-        size_px: columns and rows of the photograph.
+        size_px: number of columns and rows of the photograph.
         pixel_mm: width and height of a pixel, shape (2,), mm.
-        rows: "down" as in eqs. 2.3-2.4 of document 002, "up" as in its table of points.
+        rows: direction in which rows count, "down" as in eqs. 2.3-2.4 of document 002, "up" as in its table
+            of points.
 
     Returns:
         Photo coordinates, shape (n, 2), mm.
 
     Raises:
-        GeometryError: rows is neither.
+        GeometryError: rows is neither "down" nor "up".
 
     Source: document 002, eqs. 2.3-2.4.
     """
@@ -148,19 +150,19 @@ def photo_from_pixel(
 def pixel_from_photo(
     photo_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
 ) -> FloatArray:
-    """Return pixel coordinates of photo coordinates; inverse of `photo_from_pixel`.
+    """Convert photo coordinates to pixel coordinates; the inverse of `photo_from_pixel`.
 
     Args:
         photo_mm: photo coordinates (origin at the sensor centre, y up), shape (n, 2), mm.
-        size_px: columns and rows of the photograph.
+        size_px: number of columns and rows of the photograph.
         pixel_mm: width and height of a pixel, shape (2,), mm.
-        rows: "down" or "up", as in `photo_from_pixel`.
+        rows: direction in which rows count, "down" or "up", as in `photo_from_pixel`.
 
     Returns:
         Column and row from the centre of the first pixel, shape (n, 2), px.
 
     Raises:
-        GeometryError: rows is neither.
+        GeometryError: rows is neither "down" nor "up".
 
     Source: document 002, eq. 2.5.
     """
@@ -170,7 +172,7 @@ def pixel_from_photo(
 
 @checked_arguments()
 def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
-    """Return the distortion dr at given radii by linear interpolation in a calibration certificate.
+    """Interpolate the distortion dr at given radii linearly in the table of a calibration certificate.
 
     Args:
         table: radii and distortions of the certificate.
@@ -180,7 +182,7 @@ def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
         dr, positive outwards, same shape, mm.
 
     Raises:
-        GeometryError: radii of the table that do not ascend from 0, or a radius beyond its end.
+        GeometryError: the radii of the table do not ascend from 0, or a radius is beyond its end.
 
     Source: document 004, radial distortion from a table.
     """
@@ -199,8 +201,8 @@ def refraction_coefficient(flying_height_km: float, terrain_height_km: float) ->
     """Return K of the refraction dr = K (r + r^3 / c^2), dimensionless.
 
     Args:
-        flying_height_km: height H of the projection centre over the sea, km.
-        terrain_height_km: height h of the terrain over the sea, km.
+        flying_height_km: height H of the projection centre above sea level, km.
+        terrain_height_km: height h of the terrain above sea level, km.
 
     Source: document 004 (US Air Force model of the atmosphere): K = (2410 H / (H^2 - 6 H + 250)
     - 2410 h^2 / ((h^2 - 6 h + 250) H)) 1e-6 with H and h in km.
@@ -216,11 +218,11 @@ def refraction_coefficient(flying_height_km: float, terrain_height_km: float) ->
 
 @checked_arguments()
 def curvature_displacement(radius_mm: FloatArray, *, height_km: float, c_mm: float) -> FloatArray:
-    """Return the displacement towards the centre by the curvature of the earth, same shape as the radii, mm.
+    """Return the displacement by earth curvature towards the centre, same shape as the radii, mm.
 
     Args:
         radius_mm: distances from the principal point, any shape, mm.
-        height_km: height H of the projection centre over the ground, km.
+        height_km: height H of the projection centre above ground, km.
         c_mm: principal distance, mm.
 
     Source: document 004: dr = H r^3 / (2 R c^2), R = 6372.2 km.
@@ -229,7 +231,7 @@ def curvature_displacement(radius_mm: FloatArray, *, height_km: float, c_mm: flo
 
 
 def _steps(corrections: PhotoCorrections, c: float) -> list[Callable[[FloatArray], FloatArray]]:
-    """The corrections that are switched on, in their order."""
+    """Return the corrections that are switched on, in order."""
     steps: list[Callable[[FloatArray], FloatArray]] = []
     table = corrections.radial_table
     if table is not None:
@@ -242,11 +244,11 @@ def _steps(corrections: PhotoCorrections, c: float) -> list[Callable[[FloatArray
         steps.append(lambda xy: xy + _decentring(xy, P1, P2))
     if corrections.flying_height_km is not None:
         K_air = refraction_coefficient(corrections.flying_height_km, corrections.terrain_height_km)
-        # rays are bent so that points appear outwards
+        # refraction displaces points outwards
         steps.append(lambda xy: _radially(xy, lambda r: -K_air * (r + r**3 / c**2)))
     if corrections.curvature_height_km is not None:
         H = corrections.curvature_height_km
-        # points of a curved earth appear inwards of their place on the tangential plane
+        # earth curvature displaces points inwards from their image on the tangential plane
         steps.append(lambda xy: _radially(xy, lambda r: curvature_displacement(r, height_km=H, c_mm=c)))
     return steps
 
@@ -265,7 +267,7 @@ def _decentring(xy: FloatArray, P1: float, P2: float) -> FloatArray:
 
 
 def _inverse(step: Callable[[FloatArray], FloatArray], target: FloatArray) -> FloatArray:
-    """Solve step(xy) = target by fixed-point iteration; corrections are small against the coordinates."""
+    """Solve step(xy) = target by fixed-point iteration; corrections are small compared with coordinates."""
     xy = target
     for _ in range(INVERSE_STEPS):
         miss = target - step(xy)
@@ -283,22 +285,22 @@ def _sign(rows: str) -> float:
 
 @dataclass(frozen=True)
 class FiducialTransformation:
-    """photo = matrix @ measured + shift, with its precision by the fiducial marks."""
+    """The transformation photo = matrix @ measured + shift, with its precision from the fiducial marks."""
 
     kind: str  # similarity (4 parameters) | affine (6 parameters)
     matrix: FloatArray  # [[a11, a12], [a21, a22]], mm per comparator unit, (2, 2)
     shift: FloatArray  # mm, (2,)
-    residuals: FloatArray  # v = computed - calibrated of the marks, mm, (n, 2)
+    residuals: FloatArray  # v = computed - calibrated coordinates of the marks, mm, (n, 2)
     sigma0: float  # a posteriori standard deviation of a mark coordinate, mm; NaN without redundancy
     redundancy: int  # 2 n - 4 or 2 n - 6
-    covariance: FloatArray  # of (a, b, tx, ty) or (a11, a12, tx, a21, a22, ty), (4, 4) or (6, 6)
+    covariance: FloatArray  # order (a, b, tx, ty) or (a11, a12, tx, a21, a22, ty), (4, 4) or (6, 6)
 
     def apply(self, measured: FloatArray) -> FloatArray:
-        """Return photo coordinates of measured ones, mm, shape (..., 2)."""
+        """Transform measured coordinates to photo coordinates, mm, shape (..., 2)."""
         return np.asarray(measured, dtype=float) @ self.matrix.T + self.shift
 
     def invert(self, photo: FloatArray) -> FloatArray:
-        """Return measured coordinates of photo coordinates, comparator unit, shape (..., 2)."""
+        """Transform photo coordinates to measured coordinates, comparator unit, shape (..., 2)."""
         return np.asarray((np.asarray(photo, dtype=float) - self.shift) @ np.linalg.inv(self.matrix).T)
 
     @property
@@ -313,7 +315,7 @@ class FiducialTransformation:
 
     @property
     def shear(self) -> float:
-        """Departure epsilon of the measured axes from a right angle, rad; 0 for a similarity."""
+        """Deviation epsilon of the measured axes from a right angle, rad; 0 for a similarity."""
         return float(np.arctan2(-self.matrix[0, 1], self.matrix[1, 1])) - self.rotation
 
 
@@ -321,11 +323,11 @@ class FiducialTransformation:
 def orient_fiducials(
     measured: FloatArray, calibrated: FloatArray, *, kind: str = AFFINE
 ) -> FiducialTransformation:
-    """Return the transformation that brings measured fiducial marks onto their calibrated coordinates.
+    """Return the transformation from measured fiducial marks to their calibrated coordinates.
 
     Args:
-        measured: comparator or pixel coordinates, shape (n, 2). For pixels (y down) only the affine
-            transformation can turn the y axis round.
+        measured: comparator or pixel coordinates, shape (n, 2). Pixel coordinates (y down) need the affine
+            transformation, because a similarity cannot reverse the y axis.
         calibrated: photo coordinates of the marks from the calibration certificate, shape (n, 2), mm.
         kind: similarity (x = a xm - b ym + tx, y = b xm + a ym + ty; 4 parameters) or affine (6 parameters).
 
@@ -333,7 +335,7 @@ def orient_fiducials(
         The transformation, with residuals (mm) and the covariance of its parameters.
 
     Raises:
-        GeometryError: unknown kind, too few marks, or marks that do not determine it.
+        GeometryError: the kind is unknown, there are too few marks, or they do not determine it.
 
     Source: document 004, eqs. 1.2-1.9; Kraus (2007), sec. 3.2.1.
     """
@@ -371,7 +373,7 @@ def orient_fiducials(
     sigma0 = float(np.sqrt(np.sum(v**2) / redundancy)) if redundancy > 0 else np.nan
     if kind == SIMILARITY:
         matrix, shift = np.array([[p[0], -p[1]], [p[1], p[0]]]), p[2:]
-        J = np.eye(4)  # from the shift at the centre of the marks to the one at the origin
+        J = np.eye(4)  # moves the shift from the centre of the marks to the origin
         J[2, :2] = -centre[0], centre[1]
         J[3, :2] = -centre[1], -centre[0]
     else:

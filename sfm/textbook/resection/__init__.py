@@ -1,10 +1,11 @@
-"""Space resection by other methods, and `by_method.resect`: any method by its name.
+"""Space resection by further methods. `by_method.resect` calls any method by its name.
 
-- `p4p` (points of a plane), `zeng_wang` (and Rampal's method): closed, without approximate values.
+- `p4p`: coplanar points, closed form, without approximate values.
+- `zeng_wang`: the methods of Zeng and Wang and of Rampal, without approximate values.
 - `church`: three points and an approximate position.
-- `dlt`: with the interior orientation, from six points on.
-- `unknown_noise`: the tolerance of random sample consensus found from the points.
-- `by_method.cylinder_distance`: whether three points determine the position well.
+- `dlt`: six or more points, together with the interior orientation.
+- `unknown_noise`: robust resection that finds its tolerance from the points.
+- `by_method.cylinder_distance`: how well three points determine the position.
 """
 
 METHODS = (
@@ -17,4 +18,4 @@ METHODS = (
     "robust",
     "least-squares",
 )
-"""The methods by their names, in the order in which they are shown side by side."""
+"""Names of the methods, in the order in which comparisons list them."""

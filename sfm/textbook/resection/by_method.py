@@ -1,4 +1,4 @@
-"""Resection by the name of a method, and the critical cylinder."""
+"""Resection by any method, chosen by its name, and the critical cylinder."""
 
 from __future__ import annotations
 
@@ -26,44 +26,44 @@ from sfm.textbook.resection.p4p import resect_p4p
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise
 from sfm.textbook.resection.zeng_wang import resect_rampal, resect_zeng_wang
 
-# Relative distance below which the error of the position grows more than tenfold.
+# Distance from the critical cylinder, in radii, below which the position error grows more than tenfold.
 MAX_RELATIVE_DISTANCE = 0.05
-START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
+START_TOLERANCE = 0.1  # tangents: tolerated error of the start of least squares
 ALL_POINTS = 3  # fewest points of any method
-ON_A_LINE = ("fischler-bolles", "zeng-wang")  # methods between whose solutions a fourth point decides
-ON_A_CYLINDER = ("fischler-bolles", "church", "zeng-wang", "rampal")  # methods of the first three points
+ON_A_LINE = ("fischler-bolles", "zeng-wang")  # methods with several solutions; a fourth point decides
+ON_A_CYLINDER = ("fischler-bolles", "church", "zeng-wang", "rampal")  # methods that use three points
 
 
 @dataclass(frozen=True)
 class Task:
     """Image and object points of one photograph, ready for any method."""
 
-    names: tuple[str, ...]  # of the points
+    names: tuple[str, ...]  # point names
     xy_mm: FloatArray  # measured image coordinates, mm, (n, 2)
-    tangents: FloatArray  # of the rays, interior orientation applied, (n, 2)
+    tangents: FloatArray  # ray tangents, interior orientation applied, (n, 2)
     points: FloatArray  # object points, object unit, (n, 3)
     c: float  # principal distance, mm
     start: FloatArray | None  # X0, Y0, Z0 [, omega, phi, kappa in rad], (3,) or (6,)
-    tolerance_mm: float | None = None  # of `robust`, mm; from the data if not given
+    tolerance_mm: float | None = None  # tolerance of `robust`, mm; found from the points if not given
 
 
 @dataclass(frozen=True)
 class ResectionResult:
-    """The result of one method; None where it gives nothing. Lengths in the object unit, angles in rad."""
+    """The result of one method; None where the method gives no value. Object unit and rad."""
 
     method: str
-    points: int  # how many were given
-    solutions: tuple[ResectionSolution, ...]  # the best first
-    sigma0_mm: float | None = None  # of an image coordinate, mm; NaN without redundancy
+    points: int  # number of given points
+    solutions: tuple[ResectionSolution, ...]  # best first
+    sigma0_mm: float | None = None  # standard deviation of an image coordinate, mm; NaN without redundancy
     redundancy: int | None = None
-    dispersion: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, (6, 6)
-    history: FloatArray | None = None  # the unknowns of each iteration
-    residuals_mm: FloatArray | None = None  # of the image points, mm, (n, 2)
-    interior: DirectLinearTransformation | None = None  # interior orientation, of the DLT
-    rejected: tuple[str, ...] | None = None  # names of the points
-    trials: int | None = None  # of the random sample consensus
-    line_fit: tuple[LineFit, ...] = ()  # of each solution, by which the true one is known
-    warning: str = ""  # where the three points hardly determine the position
+    dispersion: FloatArray | None = None  # covariance of X0, Y0, Z0, omega, phi, kappa, (6, 6)
+    history: FloatArray | None = None  # unknowns of each iteration
+    residuals_mm: FloatArray | None = None  # residuals of the image points, mm, (n, 2)
+    interior: DirectLinearTransformation | None = None  # DLT result with the interior orientation
+    rejected: tuple[str, ...] | None = None  # names of rejected points
+    trials: int | None = None  # number of trials of the random sample consensus
+    line_fit: tuple[LineFit, ...] = ()  # line fit of each solution, which identifies the true one
+    warning: str = ""  # says that the three points hardly determine the position
 
 
 @checked_arguments()
@@ -71,14 +71,14 @@ def resect(task: Task, method: str) -> ResectionResult:
     """Return the exterior orientation of a photograph by one of `resection.METHODS`.
 
     Args:
-        task: its points.
+        task: image and object points of the photograph.
         method: one of METHODS.
 
     Raises:
-        GeometryError: unknown method, or the points do not allow it.
+        GeometryError: the method is unknown, or fails with these points.
 
-    Source: of each method, in its module; the fourth point that decides between the solutions, document 001,
-    sec. 3.3.1 and 4.1.1.
+    Source: the module of each method names its source; document 001, sec. 3.3.1 and 4.1.1, for the fourth
+    point that decides between the solutions.
     """
     if method not in _FUNCTIONS:
         raise GeometryError(f"resect: method '{method}', expected one of {', '.join(_FUNCTIONS)}, all")
@@ -95,14 +95,14 @@ def resect(task: Task, method: str) -> ResectionResult:
 
 @checked_arguments()
 def resect_by_all(task: Task) -> dict[str, ResectionResult | GeometryError]:
-    """Return what each method finds, or why it finds nothing, by its name.
+    """Return the result of every method, or the error with which it fails, by the name of the method.
 
-    Church's method starts from what Fischler and Bolles find where no start is given.
+    Without a start, Church's method starts from the solution of Fischler and Bolles.
 
     Args:
-        task: the points of the photograph.
+        task: image and object points of the photograph.
 
-    Source: the comparison of the methods in document 001, sec. 4.1.
+    Source: document 001, sec. 4.1 (comparison of the methods).
     """
     found: dict[str, ResectionResult | GeometryError] = {}
     for method in _FUNCTIONS:
@@ -186,7 +186,7 @@ def _least_squares(task: Task) -> ResectionResult:
 
 
 def _start(task: Task) -> tuple[FloatArray, FloatArray]:
-    """Start of least squares: as given, with the rotation from the rays if need be, or by P3P."""
+    """Return the start of least squares: as given, with the rotation from the rays if missing, or by P3P."""
     if task.start is None:
         if len(task.points) == ALL_POINTS:
             solution = resect_fischler_bolles(task.tangents, task.points)[0]
@@ -214,7 +214,7 @@ _FUNCTIONS: dict[str, Callable[[Task], ResectionResult]] = {
 
 @checked_arguments(position="3", points="3 3")
 def cylinder_distance(position: FloatArray, points: FloatArray) -> float:
-    """Return how far a projection centre is from the critical cylinder of three points, in radii.
+    """Return the distance of a projection centre from the critical cylinder of three points, in radii.
 
     Args:
         position: projection centre, shape (3,), object unit.
@@ -227,7 +227,7 @@ def cylinder_distance(position: FloatArray, points: FloatArray) -> float:
         GeometryError: the points lie on one line.
 
     Source: Finsterwalder (1903); Thompson (1966), Photogramm. Record 5(27): the circular cylinder through the
-    three points with its axis at right angles to their plane.
+    three points whose axis is perpendicular to their plane.
     """
     A, B, C = np.asarray(points, dtype=float)
     b, c = B - A, C - A

@@ -1,4 +1,4 @@
-"""Space resection by Church: the face angles of image and object pyramid are equal, iterated."""
+"""Space resection by Church, which makes the face angles of image and object pyramid equal by iteration."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from sfm.orientation.resection.least_squares import ResectionSolution, checked_p
 
 MIN_POINTS = 3
 MAX_STEPS = 100
-MAX_LAST_STEP = 1e-12  # step relative to the distance of the points
+MAX_LAST_STEP = 1e-12  # last step relative to the distance of the points
 HALVINGS = 10
-NO_PYRAMID = 1e-12  # determinant of three unit vectors below which they lie in a plane
+NO_PYRAMID = 1e-12  # determinant of three unit vectors below which they count as coplanar
 _I, _J = np.array([0, 1, 2]), np.array([1, 2, 0])
 
 
 @dataclass(frozen=True)
 class ChurchResection(ResectionSolution):
-    """The solution that Church's iteration reaches from its start, and the way there."""
+    """The solution of Church's iteration, with the positions of every step."""
 
     history: FloatArray  # projection centre before the first and after every step, object unit, (s + 1, 3)
 
 
 @checked_arguments(tangents="k 2", points="n 3", position="3")
 def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray) -> ChurchResection:
-    """Return the exterior orientation that Church's method converges to from a start position.
+    """Return the exterior orientation to which Church's method converges from a start position.
 
     Args:
-        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3; the first three
-            are used, the others only judge.
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3; the first three give the
+            solution, the others only residuals.
         points: object points, shape (n, 3), object unit.
         position: approximate projection centre, shape (3,), object unit.
 
     Raises:
-        GeometryError: fewer than three points, points on one line, a start that coincides with a point, or
-            no convergence.
+        GeometryError: there are fewer than three points, they lie on one line, the start coincides with a
+            point, or the iteration does not converge.
 
-    Source: Church (1945) as in document 001, eqs. 2.47-2.63: cos AOB = cos aOb for the three pairs,
-    linearised for the position (I, J, A, B, C); the equations are solved as a system, a step halved while
-    it makes the angles worse. The rotation is the product of the two matrices of direction cosines.
+    Source: Church (1945) as given in document 001, eqs. 2.47-2.63: cos AOB = cos aOb for the three pairs,
+    linearised for the position (I, J, A, B, C). The equations are solved as a system, and a step is halved
+    while it makes the angles worse. The rotation is the product of the two matrices of direction cosines.
     """
     uv, xyz = checked_points("church", tangents, points, needed=MIN_POINTS)
     X = xyz[:MIN_POINTS]
@@ -75,7 +75,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray
     LMN = _directions(X, position)
     if abs(np.linalg.det(lmn)) < NO_PYRAMID:
         raise GeometryError("church: the three rays lie in one plane, direction cosines give no rotation")
-    # R l = L for the three rays; the factor beside the nearest rotation is rounding
+    # R l = L for the three rays; the nearest rotation removes rounding errors
     U, _, Vt = np.linalg.svd(LMN.T @ np.linalg.inv(lmn.T))
     if np.linalg.det(U @ Vt) < 0:
         raise GeometryError(
@@ -86,7 +86,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray
 
 
 def _directions(X: FloatArray, position: FloatArray) -> FloatArray:
-    """Direction cosines L, M, N of the rays to the object points, eq. 2.51, one per row."""
+    """Return the direction cosines L, M, N of the rays to the object points, eq. 2.51, one ray per row."""
     D = np.linalg.norm(X - position, axis=1, keepdims=True)
     if D.min() == 0:
         raise GeometryError("church: the start coincides with an object point")
@@ -99,7 +99,7 @@ def _cosines(X: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _step(X: FloatArray, position: FloatArray, k: FloatArray) -> FloatArray:
-    """Correction of the position: eqs. 2.52-2.58 with K in the place of k in I and J.
+    """Return the correction of the position, eqs. 2.52-2.58 with K instead of k in I and J.
 
     d cos / d X0 = L_i (K/D_i - 1/D_j) + L_j (K/D_j - 1/D_i).
     """

@@ -13,10 +13,10 @@ from sfm.errors import GeometryError
 
 PARAMETERS = 11
 DISTORTION = ("K1", "K2", "K3", "P1", "P2")
-# Thickness of the points over their extent below which the system is as good as singular.
+# Thickness of the points over their extent below which the system is nearly singular.
 MIN_THICKNESS = 1e-3
 MAX_STEPS = 100
-MAX_LAST_CHANGE = 1e-12  # change of the 11 parameters, relative
+MAX_LAST_CHANGE = 1e-12  # relative change of the parameters at which the iteration stops
 MIN_SINGULAR_RATIO = 1e-11  # smallest over largest singular value of the scaled equations
 
 
@@ -27,15 +27,15 @@ class DirectLinearTransformation:
     L: FloatArray  # L1 to L11, for image coordinates in mm and object coordinates in their unit, (11,)
     c: float  # principal distance of the y axis, mm
     affinity: float  # c of the x axis over c of the y axis, minus 1
-    shear: float  # of the image axes, rad
+    shear: float  # shear of the image axes, rad
     principal_point: FloatArray  # x0, y0, mm, (2,)
-    distortion: FloatArray  # K1, K2, K3, P1, P2 as in `brown`, 0 where not asked for, (5,)
+    distortion: FloatArray  # K1, K2, K3, P1, P2 as in `brown`, 0 where not requested, (5,)
     position: FloatArray  # projection centre X0, object unit, (3,)
     rotation: FloatArray  # R, image to object axes, (3, 3)
     residuals: FloatArray  # v = computed - measured, mm, (n, 2)
     sigma0: float  # a posteriori standard deviation of an image coordinate, mm; NaN without redundancy
     redundancy: int  # 2 n - 11 - distortion parameters
-    cofactors: FloatArray  # of L1 to L11 and the distortion parameters asked for, (11 + d, 11 + d)
+    cofactors: FloatArray  # L1 to L11 and the requested distortion parameters, (11 + d, 11 + d)
 
     @property
     def rms(self) -> float:
@@ -51,15 +51,15 @@ def resect_dlt(
 
     Args:
         xy_mm: measured image coordinates (y up), shape (n, 2), mm.
-        points: object points that are not in one plane, shape (n, 3), object unit.
-        distortion: which of K1, K2, K3, P1, P2 are determined with it; one point more for every two.
+        points: object points that are not coplanar, shape (n, 3), object unit.
+        distortion: parameters among K1, K2, K3, P1, P2 to determine as well; every two need one more point.
 
     Raises:
-        GeometryError: too few points, points in or near one plane, or no camera in front of them.
+        GeometryError: there are too few points, they are nearly coplanar, or no camera has them in front.
 
     Source: Abdel-Aziz, Karara (1971) and Marzan, Karara (1975): x + dx = (L1 X + L2 Y + L3 Z + L4)/A,
-    y + dy = (L5 X + L6 Y + L7 Z + L8)/A, A = L9 X + L10 Y + L11 Z + 1, dx = xb (K1 r2 + ...) + ...;
-    solved again with the weights 1/A and the principal point of the last step until nothing changes.
+    y + dy = (L5 X + L6 Y + L7 Z + L8)/A, A = L9 X + L10 Y + L11 Z + 1, dx = xb (K1 r2 + ...) + .... The
+    solution is repeated with the weights 1/A and the principal point of the last step until it is stable.
     """
     unknown = [name for name in distortion if name not in DISTORTION]
     if unknown:
@@ -82,7 +82,7 @@ def resect_dlt(
             "use p4p or robust with a known camera"
         )
     columns = [DISTORTION.index(name) for name in distortion]
-    # centred and scaled, so that the equations are well conditioned and no A is near zero
+    # centre and scale: the equations are then well conditioned and no A is near zero
     origin, extent = xyz.mean(axis=0), float(extents[0] / np.sqrt(n))
     X, size = (xyz - origin) / extent, float(np.abs(xy).max())
     g, k = _solve_linear(xy / size, X, columns)
@@ -96,7 +96,7 @@ def resect_dlt(
 
 
 def _centred(origin: FloatArray, extent: float) -> FloatArray:
-    """4x4 matrix from object coordinates to centred and scaled ones."""
+    """Return the 4x4 matrix from object coordinates to centred and scaled ones."""
     H = np.eye(4)
     H[:3] /= extent
     H[:3, 3] = -origin / extent
@@ -104,7 +104,7 @@ def _centred(origin: FloatArray, extent: float) -> FloatArray:
 
 
 def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[FloatArray, FloatArray]:
-    """Projection matrix (12,) and distortion (5,) in scaled coordinates by repeated linear solution."""
+    """Return projection matrix (12,) and distortion (5,) in scaled coordinates by repeated linear steps."""
     n = len(X)
     X1 = np.concatenate([X, np.ones((n, 1))], axis=1)
     k, g = np.zeros(5), np.zeros(12)
@@ -119,11 +119,11 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
             ],
             axis=1,
         )
-        # the distortion correction multiplies A, which is taken from the last step
+        # the distortion terms are multiplied by A of the last step
         rows = np.concatenate([left * weight[:, None, None], -B], axis=2).reshape(2 * n, -1)
         if step == 0:
             rows = rows[:, :12]
-        # unit norm of the 12 parameters: homogeneous, solved through the smallest singular vector
+        # homogeneous equations with 12 parameters of unit norm, solved by the smallest singular vector
         scale = np.linalg.norm(rows, axis=0)
         _, s, Vt = np.linalg.svd(rows / scale, full_matrices=len(rows) < rows.shape[1])
         if s[min(len(s), rows.shape[1] - 1) - 1] <= MIN_SINGULAR_RATIO * s[0]:
@@ -132,7 +132,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
         norm = np.linalg.norm(h[8:11])
         h /= norm * (np.sign(np.mean(X1 @ h[8:12])) or 1.0)
         A = X1 @ h[8:12]
-        # rows were divided by the last A: distortion parameters are relative to the new one
+        # rows were divided by the last A, but the distortion parameters refer to the new A
         new_k = np.zeros(5)
         if step > 0:
             new_k[columns] = h[12:] / np.mean(A * weight)
@@ -157,7 +157,7 @@ def _distortion_terms(xb: FloatArray) -> FloatArray:
 def _decompose(
     P: FloatArray, k: FloatArray, xy: FloatArray, xyz: FloatArray, columns: list[int]
 ) -> DirectLinearTransformation:
-    """Interior and exterior orientation of a projection matrix x ~ P X (image y up, camera along -z)."""
+    """Decompose a projection matrix x ~ P X (image y up, camera looks along -z) into the orientations."""
     P = P / np.linalg.norm(P[2, :3])
     position = -np.linalg.solve(P[:, :3], P[:, 3])
     if np.mean((xyz - position) @ P[2, :3]) > 0:

@@ -1,4 +1,7 @@
-"""Space resection from coplanar points by Fischler and Bolles (P4P): collineation and vanishing lines."""
+"""Space resection from coplanar points by Fischler and Bolles (P4P).
+
+A collineation maps the object plane to the image. Its two vanishing lines give the position over the plane.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,9 @@ from sfm.orientation.resection.least_squares import (
 )
 
 MIN_POINTS = 4
-# Thickness up to which points are taken as a plane; the residuals show what it costs.
+# Thickness up to which points count as coplanar; the residuals show the resulting error.
 MAX_COPLANAR_THICKNESS = 0.01
-# |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel.
+# |(a1, a2)| over |a3| of the vanishing line below which image and object plane are parallel.
 MAX_PARALLEL_RATIO = 1e-12
 
 
@@ -28,14 +31,15 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 4.
-        points: coplanar object points, shape (n, 3), object unit; no three of four on a line.
+        points: coplanar object points, shape (n, 3), object unit; no three of four may lie on a line.
 
     Returns:
-        The one solution. It is exact for four exact points; errors of the image points go into it without
-        adjustment (the collineation has two parameters more than the exterior orientation).
+        The only solution. It is exact for four exact points. Errors of the image points are not adjusted,
+        because the collineation has two more parameters than the exterior orientation.
 
     Raises:
-        GeometryError: fewer than four points, points that are not in one plane or three of four on a line.
+        GeometryError: there are fewer than four points, they are not coplanar, or three of four lie on a
+            line.
 
     Source: Fischler, Bolles (1981), appendix B; document 001, eqs. 2.19-2.30, with f = 1 (tangents).
     """
@@ -53,7 +57,7 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
     depth = np.concatenate([Q, np.ones((len(Q), 1))], axis=1) @ T[2]
     if not ((depth > 0).all() or (depth < 0).all()):
         raise GeometryError("p4p: the points lie on both sides of the camera, or three of them on one line")
-    if np.linalg.det(T) * depth[0] < 0:  # the camera sees the plane from behind: turn the normal
+    if np.linalg.det(T) * depth[0] < 0:  # the camera sees the plane from behind: reverse the normal
         axes[1:], Q = -axes[1:], Q * (1, -1)
         T = T * (1.0, -1.0, 1.0)
     position = origin + _position_over_plane(T) @ axes
@@ -62,7 +66,7 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
 
 
 def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:
-    """T with k (u, v, 1) = T (X, Y, 1), of unit norm: direct linear solution, eqs. 2.19-2.20."""
+    """Return T of unit norm with k (u, v, 1) = T (X, Y, 1), by direct linear solution, eqs. 2.19-2.20."""
     scale = np.sqrt(np.mean(Q**2))
     q = np.concatenate([Q / scale, np.ones((len(Q), 1))], axis=1)
     spread = np.sqrt(np.mean((uv - uv.mean(axis=0)) ** 2))
@@ -77,7 +81,7 @@ def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:
 
 
 def _position_over_plane(T: FloatArray) -> FloatArray:
-    """Projection centre in the axes of the plane, eqs. 2.21-2.30."""
+    """Return the projection centre in the axes of the plane, eqs. 2.21-2.30."""
     inverse = np.linalg.inv(T)
     a = inverse[2]  # vanishing line of the plane in the image
     b = T[2]  # vanishing line of the image in the plane
@@ -85,7 +89,7 @@ def _position_over_plane(T: FloatArray) -> FloatArray:
     DI_inverse = np.hypot(a[0], a[1]) / abs(a[2])
     foot = c[:2] / c[2]
     if DI_inverse < MAX_PARALLEL_RATIO:
-        # parallel planes: the distance is the scale, the square root of the ratio of areas
+        # parallel planes: the image scale, a square root of a ratio of areas, gives the distance
         scale = np.sqrt(abs(np.linalg.det(T[:2, :2]))) / abs(T[2, 2])
         return np.array([foot[0], foot[1], 1 / scale])
     theta = np.arctan(DI_inverse)

@@ -1,7 +1,8 @@
-"""Space resection from many points of which some are wrong, whatever their noise.
+"""Robust space resection from many points with gross errors and unknown noise.
 
-Right points have one standard deviation, wrong ones lie anywhere in the photograph. Which are right is what
-makes the measurements most likely; these are adjusted by least squares.
+The model has two kinds of points. Correct points share one unknown standard deviation. Wrong points lie
+anywhere in the photograph with equal probability. The points that count as correct are those that make the
+measurements most likely. Least squares adjusts them.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ from sfm.errors import GeometryError
 from sfm.orientation.resection.least_squares import UNKNOWNS, Resection, pose_normals, resect_least_squares
 from sfm.orientation.resection.ransac import SAMPLE, RobustResection, resect_robust
 
-# Tolerances that are tried, tangents: from a tenth of the principal distance down to what no camera reaches.
+# Tolerances to try, tangents: from a tenth of the principal distance to below the precision of any camera.
 TOLERANCES = 0.1 * 0.5 ** np.arange(17)
-# Smallest residual that counts, tangents: coordinates are given with so many digits.
+# Lower bound of a residual, tangents: the rounding error of typical input.
 LEAST_RESIDUAL = 1e-9
-ROUNDS = 20  # of least squares and new choice of the right points
+ROUNDS = 20  # rounds of least squares and a new selection of correct points
 
 
 @checked_arguments(tangents="k 2", points="n 3")
 def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int = 0) -> RobustResection:
-    """Return the exterior orientation that makes the measured points most likely, their noise unknown.
+    """Return the exterior orientation that makes the measured points most likely, whatever their noise.
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
         points: object points, shape (n, 3), object unit.
-        seed: of the choice of triples; the same seed gives the same result.
+        seed: seed for sampling triples; the same seed gives the same result.
 
     Returns:
-        The orientation by least squares over the right points, or the reason why there is none.
+        The orientation by least squares over the correct points, or the reason why there is none.
 
     Source: Torr and Zisserman (2000), MLESAC, CVIU 78, for the mixture; the standard deviation is integrated
     out, Box and Tiao (1973), Bayesian Inference in Statistical Analysis, sec. 2.7.
@@ -42,10 +43,10 @@ def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int 
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     field = max(float(np.prod(np.ptp(uv, axis=0))), LEAST_RESIDUAL) if len(uv) else 1.0
-    best, most = None, -(len(uv) - SAMPLE) * np.log(field)  # three points fit whatever they are
+    best, most = None, -(len(uv) - SAMPLE) * np.log(field)  # three points always fit
     failure = None
     for tolerance in TOLERANCES:
-        if best is not None and tolerance < best.sigma0:  # all that is tighter loses right points
+        if best is not None and tolerance < best.sigma0:  # tighter tolerances reject correct points
             break
         start = resect_robust(uv, xyz, tolerance=float(tolerance), seed=seed)
         failure = failure or start
@@ -63,7 +64,7 @@ def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int 
 def _settled(
     uv: FloatArray, xyz: FloatArray, start: RobustResection, field: float
 ) -> tuple[RobustResection, float]:
-    """Return the orientation by least squares over the right points, and ln of its likelihood."""
+    """Return the orientation by least squares over the correct points, and ln of its likelihood."""
     residuals = start.residuals
     used, likelihood = _right_points(residuals, field)
     X0, R, found = start.position, start.rotation, None
@@ -100,18 +101,18 @@ def _settled(
 
 
 def _right_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float]:
-    """Return which points are right, (n,), and ln of the likelihood.
+    """Return which points are correct, (n,), and ln of the likelihood.
 
     Args:
-        residuals: of all points, tangents, NaN behind the camera, shape (n, 2).
-        field: area over which wrong points are spread, squared tangents.
+        residuals: residuals of all points, tangents, NaN behind the camera, shape (n, 2).
+        field: area over which wrong points spread, squared tangents.
     """
     n = len(residuals)
     squares = np.sum(residuals**2, axis=1)
     squares = np.maximum(np.where(np.isfinite(squares), squares, np.inf), LEAST_RESIDUAL**2)
     order = np.argsort(squares, kind="stable")
     k = np.arange(SAMPLE + 1, n + 1)
-    half = k - UNKNOWNS / 2  # of the redundancy
+    half = k - UNKNOWNS / 2  # half the redundancy
     right = gammaln(half) - half * np.log(np.pi * np.cumsum(squares[order])[k - 1])
     choice = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
     likelihood = right - (n - k) * np.log(field) - choice
@@ -124,7 +125,7 @@ def _right_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float
 def _normals(
     uv: FloatArray, xyz: FloatArray, used: BoolArray, found: Resection
 ) -> tuple[FloatArray, FloatArray]:
-    """Return computed - measured of all points, tangents, NaN behind the camera, (n, 2), and N of some."""
+    """Return residuals of all points, tangents, NaN behind the camera, (n, 2), and N of the used points."""
     n = len(uv)
     N, residuals = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((n, 2))
     weights = np.ascontiguousarray(np.broadcast_to(np.eye(2), (n, 2, 2)))

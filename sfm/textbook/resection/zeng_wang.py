@@ -1,4 +1,9 @@
-"""Space resection by Zeng and Wang, and by Rampal."""
+"""Space resection by Zeng and Wang, and by Rampal.
+
+Both find the distances from the camera to three points, then the position by trilateration. Zeng and Wang
+solve a quartic and find all solutions. Rampal iterates the angles of the triangles that
+the camera forms with the points.
+"""
 
 from __future__ import annotations
 
@@ -31,24 +36,24 @@ from sfm.orientation.resection.least_squares import (
 
 MAX_STEPS = 100
 MAX_LAST_STEP = 1e-14  # rad
-MARGIN = 0.9  # part of the way to a flat triangle that one step may go
-SPAN = 0.02  # singular value, relative, from which on the points span a direction well
-MAX_SAME_DISTANCE = 1e-6  # distance of two positions, in extents of the points, below which they are one
+MARGIN = 0.9  # largest step, as a fraction of the step to a flat triangle
+SPAN = 0.02  # smallest relative singular value of a direction that the points span well
+MAX_SAME_DISTANCE = 1e-6  # largest distance of equal positions, in extents of the points
 MAX_TRIPLES = 20
 MIN_POINTS = 3
 
 
 @checked_arguments(tangents="k 2", points="n 3")
 def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
-    """Return the exterior orientations by Zeng and Wang, the one that the further points confirm first.
+    """Return the exterior orientations by Zeng and Wang; the best fit of all points comes first.
 
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3.
-        points: object points, shape (n, 3), object unit. The first three give the solutions; from four
-            points on the order of the solutions is meaningful.
+        points: object points, shape (n, 3), object unit. The first three give the solutions; the order of
+            the solutions has a meaning only with four or more points.
 
     Raises:
-        GeometryError: fewer than three points, points on one line, or no solution.
+        GeometryError: there are fewer than three points, they lie on one line, or there is no solution.
 
     Source: Zeng, Wang (1992), A general solution of a closed-form space resection, PE&RS 58(3);
     document 001, eqs. 2.64-2.93.
@@ -62,7 +67,7 @@ def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Resectio
 
 
 def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
-    """Return all exterior orientations of many triples by Zeng and Wang.
+    """Return all exterior orientations of many triples of points by Zeng and Wang.
 
     Args:
         rays: unit vectors in the image frame, shape (k, 3, 3).
@@ -90,7 +95,7 @@ def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
 
 @checked_arguments(rays="3 3")
 def direction_test(rays: FloatArray) -> float:
-    """Return the sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
+    """Return the sign of T = 1S . (12 x 13), which follows from the sense of rotation of the image points.
 
     Args:
         rays: unit vectors in the image frame, shape (3, 3).
@@ -98,8 +103,8 @@ def direction_test(rays: FloatArray) -> float:
     Returns:
         +1 or -1.
 
-    Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
-    order of the points is free.
+    Source: document 001, eq. 2.82, which takes the image points clockwise, so that T > 0. Here they can have
+    any order.
     """
     return float(_turning_sign(np.ascontiguousarray(rays)))
 
@@ -110,15 +115,16 @@ def trilaterate(points: FloatArray, distances: FloatArray, T: float) -> FloatArr
 
     Args:
         points: object points, shape (3, 3), object unit.
-        distances: of the point from them, shape (3,), object unit.
+        distances: distances of the new point from the three points, shape (3,), object unit.
         T: sign of the direction test, +1 or -1.
 
     Returns:
-        The point, shape (3,), object unit; in the plane of the points where the distances are too short.
+        The new point, shape (3,), object unit; in the plane of the three points if the distances are too
+        short.
 
     Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
-    differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
-    that can vanish is divided by.
+    differences of Y and Z, which may be zero. The axes of the triangle (x along 12, z along 12 x 13) avoid
+    this.
     """
     S = np.empty(3)
     _place(np.ascontiguousarray(points), np.ascontiguousarray(distances), float(T), S)
@@ -127,11 +133,11 @@ def trilaterate(points: FloatArray, distances: FloatArray, T: float) -> FloatArr
 
 @checked_arguments(rays="3 3", points="3 3", position="3")
 def pope_hinsken(rays: FloatArray, points: FloatArray, position: FloatArray) -> FloatArray:
-    """Return R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
+    """Return R from the unit vectors to the points in object and image axes, by the parameters d, a, b, c.
 
-    The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
-    product of two of them. Of the three rays and their cross products the pair with the longest product is
-    taken, so that rays near the axis do no harm.
+    The differences of corresponding vectors are perpendicular to the rotation axis g. So g is the cross
+    product of two differences. The vectors are the three rays and their cross products. The pair with the
+    longest product gives g, so rays near the axis do no harm.
 
     Args:
         rays: unit vectors in the image frame, shape (3, 3).
@@ -182,7 +188,7 @@ def _solve(
         x = roots[k]
         p2 = L2 / ((x - 1.0) ** 2 + 2.0 * x * g13)  # R1^2, from side 13
         p = np.sqrt(p2)
-        # R2 from side 12 (eq. 2.77 with L3, which the document misprints as L2), side 23 decides
+        # R2 from side 12 (eq. 2.77 with L3, which the document misprints as L2); side 23 picks the root
         radicand = L3 / p2 - g12 * (2.0 - g12)
         root = np.sqrt(radicand) if radicand > 0.0 else 0.0
         high, low = 1.0 - g12 + root, 1.0 - g12 - root
@@ -210,8 +216,9 @@ def _quartic(
 ) -> tuple[float, float, float, float, float]:
     """Return N5 to N1, the coefficients of 1 to n^4, from A^2 - D1 A B + B^2 C = 0.
 
-    Sides squared, gaps 1 - cos; m = R2/R1 = A/B by the difference of the equations of sides 12 and 23, with
-    q = n^2 - F1 n + 1: A = (K32 - K12) q + n^2 - 1, B = E1 n - D1, C = 1 - K32 q.
+    L1 to L3 are squared sides, and g12, g13, g23 are 1 - cos of the angles. The difference of the equations
+    of sides 12 and 23 gives m = R2/R1 = A/B. With q = n^2 - F1 n + 1, A = (K32 - K12) q + n^2 - 1,
+    B = E1 n - D1 and C = 1 - K32 q.
     """
     D1, F1, E1 = 2.0 * (1.0 - g12), 2.0 * (1.0 - g13), 2.0 * (1.0 - g23)
     K12, K32 = L1 / L2, L3 / L2
@@ -238,7 +245,7 @@ def _turning_sign(rays: FloatArray) -> float:
 
 @compiled
 def _place(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
-    """Fill the point S of `trilaterate`."""
+    """Fill S, the new point of `trilaterate`."""
     e, f, g, q = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for d in range(3):
         e[d] = points[1, d] - points[0, d]
@@ -301,7 +308,7 @@ def _fill_rotation(rays: FloatArray, points: FloatArray, S: FloatArray, rotation
         rotation[0, 0] = rotation[1, 1] = rotation[2, 2] = 1.0
         return
     g /= np.sqrt(best)
-    # angle from image to object vectors about g, by the sums of sines and cosines over all vectors
+    # angle about g from image to object vectors, from the sums of sines and cosines over all vectors
     sine, cosine = 0.0, 0.0
     for i in range(6):
         along_p = g[0] * p[i, 0] + g[1] * p[i, 1] + g[2] * p[i, 2]
@@ -326,25 +333,25 @@ def _fill_rotation(rays: FloatArray, points: FloatArray, S: FloatArray, rotation
 
 @checked_arguments(tangents="k 2", points="n 3")
 def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolution, ...]:
-    """Return the exterior orientation by Rampal, which needs no approximate values.
+    """Return the exterior orientation by Rampal's method, which needs no approximate values.
 
     Args:
-        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3. Three of them give
-            the distances, further points take part in the equations of the position.
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3. Three rays give the
+            distances; further points contribute equations for the position.
         points: object points, shape (n, 3), object unit.
 
     Returns:
-        The solutions reached from the angles of the photograph, that is from an image plane parallel to the
-        object: one from three points; from more points one for each triple as far as they differ, the
-        one that fits all points best first.
+        The solutions that the iteration reaches from the angles of the photograph, that is, from an image
+        plane parallel to the object. Three points give one solution. More points give the different solutions
+        of their triples, the best fit of all points first.
 
     Raises:
-        GeometryError: fewer than three points, points on one line, or no convergence.
+        GeometryError: there are fewer than three points, they lie on one line, or nothing converges.
 
     Source: Rampal (1979), A closed solution for space resection, PE&RS 45(9); document 001, eqs. 2.32-2.43.
-    In the triangles of the camera with the sides 12, 23, 31 the angles at the points are those of the
-    photograph plus and minus alpha, beta, gamma; equal distances from two triangles give three equations,
-    linearised and repeated.
+    The camera forms a triangle with each of the sides 12, 23, 31. The angles at the points are those of the
+    photograph plus or minus alpha, beta, gamma. Each distance is equal in two triangles, which gives three
+    equations. They are linearised and iterated.
     """
     uv, xyz = checked_points("rampal", tangents, points, needed=MIN_POINTS)
     found: list[ResectionSolution] = []
@@ -366,7 +373,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
 
 
 def _position_from(uv: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Projection centre with the distances of the first three points."""
+    """Return the projection centre from the distances of the first three points and of all others."""
     rays = rays_from_tangents(uv)
     S = _distances(uv[:MIN_POINTS], rays[:MIN_POINTS], xyz[:MIN_POINTS])
     for i in range(MIN_POINTS, len(xyz)):
@@ -375,7 +382,7 @@ def _position_from(uv: FloatArray, xyz: FloatArray) -> FloatArray:
 
 
 def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
-    """S1, S2, S3 by eqs. 2.32-2.39; row t of an array belongs to the triangle of points t and t + 1."""
+    """Return S1, S2, S3 by eqs. 2.32-2.39; row t of an array refers to the triangle of points t and t + 1."""
     j = [1, 2, 0]
     D = np.linalg.norm(X - X[j], axis=1)
     theta = 2 * np.arcsin(np.clip(np.linalg.norm(rays - rays[j], axis=1) / 2, 0, 1))
@@ -389,9 +396,9 @@ def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
     scale = D / np.sin(theta)
     for _ in range(MAX_STEPS):
         second = np.pi - theta - first
-        # distance of the first point of a side is opposite to the angle at the second, and vice versa
+        # the distance of the first point of a side is opposite the angle at the second, and vice versa
         near, far = scale * np.sin(second), scale * np.sin(first)
-        # S of point j[t]: far of triangle t equals near of triangle j[t]
+        # S of point j[t] is `far` of triangle t and `near` of triangle j[t]
         misfit = far - near[j]
         A = np.diag(scale * np.cos(first))
         A[[0, 1, 2], j] += scale[j] * np.cos(second[j])
@@ -415,7 +422,7 @@ def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
 
 
 def _further_distance(S: FloatArray, rays: FloatArray, X: FloatArray, i: int) -> float:
-    """Distance of point i from the triangles with points 1 and 2: of two roots the one that fits both."""
+    """Return the distance of point i from triangles with points 1 and 2, by the root that fits both best."""
     best, misfit = np.nan, np.inf
     for a, b in ((0, 1), (1, 0)):
         cosine = rays[a] @ rays[i]
@@ -430,10 +437,10 @@ def _further_distance(S: FloatArray, rays: FloatArray, X: FloatArray, i: int) ->
 
 
 def _position(S: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
-    """Projection centre from distances: differences of the spheres are linear in it, eqs. 2.40-2.43.
+    """Return the projection centre from distances by linear differences of spheres, eqs. 2.40-2.43.
 
-    Across the plane of coplanar points (and of three) the linear equations determine nothing; there the
-    spheres of the first three points close the solution.
+    For coplanar points (three points always are), the linear equations do not determine the component normal
+    to the plane. It comes from the spheres of the first three points.
     """
     closing = trilaterate(X[:3], S[:3], direction_test(rays[:3]))
     centre = X.mean(axis=0)
