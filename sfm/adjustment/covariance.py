@@ -209,7 +209,9 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     if datum is not None:
         resolved = datum.resolve(adjustment.network)
     if (resolved.kind == "control") != use_control:
-        raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
+        raise GeometryError(
+            "datum: adding or removing control is another adjustment, not an S-transformation"
+        )
     centroid = centroid_of(adjustment.network, adjustment.estimate)
     network, estimate = shifted(adjustment.network, adjustment.estimate, -centroid)
     layout, state = unknowns_of(

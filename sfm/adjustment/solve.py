@@ -95,8 +95,8 @@ def adjust(
             from Huber's result and rejects image points with weight 0) or "none".
         alpha: probability that the test of one image coordinate rejects a good one.
         rejected: image points that data snooping leaves out at the start, such as those rejected before,
-            (k,).
-            They return if they pass the test. The other options of `reject` start with all image points.
+            (k,). They return if they pass the test. The other options of `reject` start with all image
+            points.
         method: "gauss-newton" (line search) or "levenberg-marquardt" (ends with undamped Gauss-Newton).
         max_iterations: largest number of steps in each round of the robust test.
         tolerance: |A dx| / |v| at which the iteration has converged.
@@ -201,7 +201,7 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
             f"rejected of shape {rejected.shape}, expected one truth value for each of {k} image points"
         )
     if rejected.all():
-        raise GeometryError(f"rejected: all {counted(k, 'image point')}, expected some that are not")
+        raise GeometryError(f"rejected: all {counted(k, 'image point')}, expected fewer")
     return rejected
 
 

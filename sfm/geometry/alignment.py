@@ -313,7 +313,7 @@ def _refine(
         apart = float(np.sqrt(((T.apply(source) - target) ** 2).sum(axis=1).mean()))
         raise GeometryError(
             f"alignment: the best fit did not converge, measured and nominal points are {apart:.4g} apart "
-            "(RMS): another unit, other points, or a scale that is to be fitted"
+            "(RMS): check their units and names, or fit a scale"
         )
     d = (T.apply(source) - target).ravel()
     omega = float(d @ d) if weights == "equal" else float(d @ cho_solve(factor, d))
@@ -350,7 +350,7 @@ def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
     z = z / np.linalg.norm(z)
     across = x - (x @ z) * z
     if not np.linalg.norm(across) > 1e-9 * np.linalg.norm(x):
-        raise GeometryError(f"alignment {what}: the direction of X is that of Z")
+        raise GeometryError(f"alignment {what}: the directions of X and Z are parallel")
     across = across / np.linalg.norm(across)
     return np.stack([across, np.cross(z, across), z])
 

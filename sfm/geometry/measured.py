@@ -259,12 +259,12 @@ def with_hidden_point(
     Source: Luhmann et al. (2020), sec. 6.6.
     """
     if name in points.names:
-        raise GeometryError(f"hidden point {name}: there is a point of that name already")
+        raise GeometryError(f"hidden point {name}: a point of that name exists already")
     a, b = point_function(points, start), point_function(points, end)
     d = difference(a, b)
     length = float(np.linalg.norm(d.value))
     if not length > 0:
-        raise GeometryError(f"hidden point {name}: targets {start} and {end} are in one place")
+        raise GeometryError(f"hidden point {name}: targets {start} and {end} coincide")
     u = d.value / length
     along = distance * (np.eye(3) - np.outer(u, u)) / length
     found = joined([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
@@ -334,7 +334,7 @@ def distance(a: Function, b: Function) -> Function:
     d = b.value - a.value
     length = float(np.linalg.norm(d))
     if not length > 0:
-        raise GeometryError("distance: both points are in one place")
+        raise GeometryError("distance: both points coincide")
     u = d / length
     return joined([a, b]).times(np.concatenate([-u, u])[None], np.array([length]))
 
@@ -361,7 +361,7 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
     p, q = a.value, b.value
     lp, lq = float(np.linalg.norm(p)), float(np.linalg.norm(q))
     if not (lp > 0 and lq > 0):
-        raise GeometryError("angle: two of its points are in one place")
+        raise GeometryError("angle: two of its points coincide")
     u, v = p / lp, q / lq
     if undirected and u @ v < 0:
         v, lq = -v, -lq

@@ -292,8 +292,8 @@ def _best_pair(
 def _sum_of_squares(rays: _Rays, of_point: IntArray, X: FloatArray) -> float:
     """Return the sum of the squared image residuals of rays.
 
-    If this sum is below the limit of a single ray, no other point has smaller truncated squares than the
-    least-squares point of all rays, because giving up one ray costs the limit.
+    If this sum is below the limit of a single ray, the least-squares point of all rays has the smallest
+    truncated squares of all points, because rejecting one ray costs the limit.
     """
     total = 0.0
     for k in of_point:

@@ -133,7 +133,7 @@ def relative_orientations(
     if spatial is None:
         if not planar:
             raise GeometryError(
-                f"relative orientation: no plane and no spatial scene fits {counted(n, 'common point')}"
+                f"relative orientation: neither a plane nor a spatial scene fits {counted(n, 'common point')}"
             )
         return tuple(planar)
     if planar and _is_planar(H, uv1, uv2, spatial):

@@ -79,7 +79,7 @@ def orient_direct(
     m = int(image.max(initial=-1)) + 1
     if not m:
         raise GeometryError(
-            "direct orientation: no rays, at least four control points a photograph are needed"
+            "direct orientation: no rays, at least four control points per photograph are needed"
         )
     check_indices("orient_direct: image", image, m)
     check_indices("orient_direct: point", point, len(control))
@@ -91,7 +91,7 @@ def orient_direct(
     )
     if len(missing):
         raise GeometryError(
-            f"direct orientation: point {missing[0]} is not control and not seen by two photographs"
+            f"direct orientation: point {missing[0]} is neither control nor seen by two photographs"
         )
     converged = False
     for _ in range(MAX_STEPS):

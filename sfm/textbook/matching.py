@@ -137,7 +137,7 @@ def match_along_line(
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     if any(line.ndim != 2 or line.shape[1] != 2 for line in lines):
         raise GeometryError(
-            "match_along_line: a line is no array of shape (n, 2), expected its vertices in px"
+            "match_along_line: a line is not an array of shape (n, 2), expected its vertices in px"
         )
     if len(lines) != len(a):
         raise GeometryError(

@@ -76,7 +76,7 @@ def orient_dependent(
     Source: document 004, "dependent relative orientation"; Kraus (2007), sec. 4.3.
     """
     if bx == 0:
-        raise GeometryError("dependent pair: bx is 0, it sets the scale and cannot be")
+        raise GeometryError("dependent pair: bx is 0, but it sets the scale, expected another value")
     if start is None:
         b, R = _five_point(first, second)
     else:
@@ -143,7 +143,7 @@ def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, Floa
     found = relative_orientations(first, second, tolerance=FIVE_POINT_TOLERANCE)
     if found[0].kind == "infinite":
         raise GeometryError(
-            "relative orientation: a rotation explains the rays, there is no base to determine"
+            "relative orientation: a rotation alone explains the rays, there is no base to determine"
         )
     best = min(found, key=lambda one: one.rms)
     return best.base, best.rotation
@@ -256,7 +256,9 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
         raise GeometryError(f"normal images: {first} or {second} is not oriented")
     base = position[1] - position[0]
     if not np.linalg.norm(base) > 0:
-        raise GeometryError(f"normal images: {first} and {second} have one projection centre, needed a base")
+        raise GeometryError(
+            f"normal images: {first} and {second} share one projection centre, a base is needed"
+        )
     if base @ (rotation[0] + rotation[1])[:, 0] < 0:  # x of the images points the other way
         rows, position, rotation, base = rows[::-1], position[::-1], rotation[::-1], -base
     cameras = tuple(estimate.cameras[network.camera[i]] for i in rows)
@@ -282,7 +284,7 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
     if size[0] * size[1] > MAX_LARGER * area:
         raise GeometryError(
             f"normal images: {size[0]} x {size[1]} px for {first} and {second}, at most {MAX_LARGER:g} "
-            "times the photographs are made; the base is too nearly along the rays"
+            "times the area of the photographs is allowed; the base is nearly along the rays"
         )
     normal = []
     for k in range(2):

@@ -180,7 +180,7 @@ def test_refusals():
     uv1, uv2, *_ = two_photographs(rng, 10, "spatial")
     with pytest.raises(GeometryError, match="3 common points, at least 4"):
         relative_orientations(uv1[:3], uv2[:3], tolerance=TOLERANCE)
-    with pytest.raises(GeometryError, match="no plane and no spatial scene fits"):
+    with pytest.raises(GeometryError, match="neither a plane nor a spatial scene fits"):
         relative_orientations(uv1[:5], rng.uniform(-0.4, 0.4, (5, 2)), tolerance=1e-6)
     with pytest.raises(GeometryError, match="4 pairs, at least 5"):
         refine_coplanarity(uv1[:4], uv2[:4], np.array([1.0, 0, 0]), np.eye(3))

@@ -73,7 +73,7 @@ def test_direct_orientation_refusals():
         orient_direct(uv, seen.image, seen.point, control)
     control[ids[:6]] = truth.points[ids[:6]]
     only = (seen.image == 0) | (seen.point != ids[10])
-    with pytest.raises(GeometryError, match=f"point {ids[10]} is not control and not seen by two"):
+    with pytest.raises(GeometryError, match=f"point {ids[10]} is neither control nor seen by two"):
         keep = np.isin(seen.point, ids) & only
         orient_direct(uv[keep], seen.image[keep], seen.point[keep], control)
 

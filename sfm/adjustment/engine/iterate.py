@@ -7,8 +7,8 @@ last step may use the current gradient with the reduced matrix of the step befor
 that would bring a point behind a camera has an infinite sum of squares and is shortened or damped.
 
 The iteration has converged when the predicted change of the adjusted observations, |A dx| weighted, is at
-most `tolerance` times the residuals |v|, or at most MIN_SHIFT. In the latter case no unknown would move by
-more than that share of its a priori standard deviation.
+most `tolerance` times the residuals |v|, or at most MIN_SHIFT. With MIN_SHIFT no unknown would move by more
+than that fraction of its a priori standard deviation.
 
 Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
 veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear

@@ -391,8 +391,8 @@ def _hold_undetermined(
 ) -> tuple[BoolArray, IntArray, IntArray, tuple[str, ...], int]:
     """Hold poses and points with too few image points, repeatedly until none is left; clear their free flags.
 
-    Return which image points take part, their number for the pose of each photograph and for each point, the
-    held photographs and points in words, and the rank defect that these would have caused.
+    Return which image points take part, and their number for each photograph's pose and for each point. Also
+    return the held photographs and points in words, and the rank defect that they would have caused.
     """
     k = network.image_points
     n, poses = len(network.points), len(pose_free)

@@ -28,8 +28,8 @@ EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
 def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     """Return the rank defect of the normal equations without datum.
 
-    It counts the motions that the normal matrix maps to zero, its further null vectors, directions of object
-    points that their rays leave open, and unknowns held because of missing image points.
+    It counts the motions that the normal matrix maps to zero, and its further null vectors. It also counts
+    directions of object points that their rays leave open, and unknowns held for lack of image points.
 
     Args:
         optimum: undamped normal equations and their factor.

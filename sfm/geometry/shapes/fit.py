@@ -160,11 +160,11 @@ def _fit(
     for j in rows[~np.isfinite(points.xyz[rows]).all(axis=1)][:1]:
         raise GeometryError(f"point {points.names[j]} has no coordinates, expected numbers")
     if not all(np.isfinite(np.asarray(one, dtype=float)).all() for one in (offset, *hold.values())):
-        raise GeometryError("a value that is held, or the offset, is no number")
+        raise GeometryError("a held value or the offset is not a finite number")
     if weights not in WEIGHTS:
         raise GeometryError(f"weights '{weights}', expected one of {', '.join(WEIGHTS)}")
     if weights == "network" and points.covariance is None:
-        raise GeometryError('the standard deviations of the points are not known, expected weights = "equal"')
+        raise GeometryError('the standard deviations of the points are unknown, expected weights = "equal"')
     xyz = points.xyz[rows]
     if len(rows) < kind.min_points:
         raise GeometryError(f"{counted(len(rows), 'point')}, a {kind.name} needs {kind.min_points}")
@@ -295,12 +295,12 @@ def _held(
             free[:3] = False
         elif name == "direction":
             if not np.linalg.norm(numbers) > 0:
-                raise GeometryError(f"hold direction: found {value}, expected a vector that is not 0")
+                raise GeometryError(f"hold direction: found {value}, expected a non-zero vector")
             axis = numbers / np.linalg.norm(numbers)
             free[3:5] = False
         else:
             if not numbers > 0:
-                raise GeometryError(f"hold {name}: found {value}, expected more than 0")
+                raise GeometryError(f"hold {name}: found {value}, expected a positive number")
             k = kind.form.index(name)
             form[k] = float(numbers) / _lengths(kind, size)[k]
             free[6 + k] = False
@@ -308,7 +308,7 @@ def _held(
         form[0] = 0.0
         free[6] = False
     if not free.any():
-        raise GeometryError("everything is held, nothing is left to be fitted")
+        raise GeometryError("every parameter is held, nothing is left to fit")
     return free, origin, axis, form
 
 
@@ -340,7 +340,7 @@ def _best_start(
         if np.isfinite(cost) and np.isfinite(shape.form).all():
             found.append((cost, len(found), shape))
     if not found:
-        raise GeometryError(f"its points determine no {kind.name}")
+        raise GeometryError(f"its points do not determine a {kind.name}")
     return min(found, key=lambda one: one[:2])[2]
 
 

@@ -100,7 +100,7 @@ def refine_weighted(
             dp = np.full(len(N), np.nan)
         if not np.isfinite(dp).all():
             raise GeometryError(
-                "with the covariance of its points it diverges: they are too far from any "
+                "the fit diverges with the covariance of its points: they are too far from any "
                 f'{shape.kind.name}; expected weights = "equal"'
             )
         k = -solve(w + A @ dp)
@@ -219,8 +219,8 @@ def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
         return solve
     except LinAlgError as error:
         raise GeometryError(
-            "the covariance of its points is singular: what is held of a shape cannot be known of a free "
-            'network, or points are exactly known; expected weights = "equal"'
+            "the covariance of its points is singular: a free network does not determine the held values, or "
+            'points are exactly known; expected weights = "equal"'
         ) from error
 
 

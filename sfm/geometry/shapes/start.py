@@ -276,7 +276,7 @@ def robust_shape(
             if median < least:
                 best, least = shape, median
     if best is None:
-        raise GeometryError(f"its points determine no {kind.name}")
+        raise GeometryError(f"its points do not determine a {kind.name}")
     weight = np.ones(n)
     for _ in range(ROUNDS):
         length = _lengths(best, xyz, offset)

@@ -1,12 +1,13 @@
 """Photographs that fit worse than the others, and other solutions for a flat object.
 
-**Mirrored photographs.** If an object has little depth, a mirrored photograph finds a position behind it or
-at its side where most of its image points fit a wide tolerance. Near-duplicates of it are distorted with it.
-Turned over, it fits the others as well as they fit each other, once these are adjusted without it.
+**Mirrored photographs.** A mirrored photograph of an object with little depth finds a wrong position, behind
+or beside the object. Most of its image points fit a wide tolerance there. Near-duplicates of it are distorted
+with it. Once the other photographs are adjusted without it, it fits them when it is turned over, as well as
+they fit each other.
 
 **Reversed depth.** A flat object photographed at moderate angles looks almost the same with its depth
-reversed. A start tolerance of tens of pixels hardly separates the two solutions, for all photographs or some
-of them, and an adjustment ends in the nearest minimum. The reversal in depth of a first solution shows
+reversed. A start tolerance of tens of pixels hardly separates the two solutions, for all photographs or for
+some. An adjustment then ends in the nearest minimum. The reversal in depth of a first solution shows
 whether the solution is in doubt. With strong rays the reversal fits a hundred times worse, or not at all. A
 solution in doubt is also sought from smaller start tolerances, and the one with the smallest residuals is
 kept.
@@ -133,8 +134,7 @@ def bounded_costs(residuals_px: Sequence[FloatArray], image: IntArray) -> FloatA
 
     Each photograph has one vote, limited to BOUND times the median of the best solution. An undetermined
     photograph counts as much as a contradicting one, so a solution does not improve by leaving photographs
-    out.
-    And a single wrong photograph cannot win by distorting all others a little.
+    out. And a single wrong photograph cannot win by distorting all others a little.
 
     Args:
         residuals_px: lengths of all image residuals in each solution, inf where undetermined, px, (k,) each.

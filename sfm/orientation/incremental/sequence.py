@@ -162,7 +162,7 @@ def orient(
     except GeometryError as error:
         if with_given is not None:
             return with_given
-        raise GeometryError(f"{error}, neither from the given approximate values nor without them") from error
+        raise GeometryError(f"{error}, with and without the given approximate values") from error
     before = 0 if with_given is None else int(with_given.estimate.oriented.sum())
     now = int(without.estimate.oriented.sum())
     if with_given is not None:

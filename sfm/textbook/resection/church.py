@@ -67,7 +67,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray
         if np.linalg.norm(factor * step) <= MAX_LAST_STEP * distance:
             break
         if not np.isfinite(position).all() or distance > 1e12 * np.linalg.norm(X - X.mean(axis=0)):
-            raise GeometryError("church: the position runs away from this start, a nearer one is needed")
+            raise GeometryError("church: the position diverges from this start, a nearer one is needed")
     if misfit > 1e-9:
         raise GeometryError(
             f"church: no convergence in {MAX_STEPS} steps from this start, a nearer one is needed"

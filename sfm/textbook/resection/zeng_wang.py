@@ -62,7 +62,7 @@ def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Resectio
     poses = resect_triples_zeng_wang(rays_from_tangents(uv[:MIN_POINTS])[None], xyz[None, :MIN_POINTS])
     found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
     if not found:
-        raise GeometryError("zeng-wang: no camera sees the first three points under these angles")
+        raise GeometryError("zeng-wang: no camera sees the first three points at these angles")
     return ordered(found)
 
 
@@ -416,7 +416,7 @@ def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:
     if not np.allclose(sides, D, rtol=1e-9):
         raise GeometryError(
             f"rampal: the angles did not converge in {MAX_STEPS} steps; the photograph is tilted too much "
-            "against the points, use fischler-bolles"
+            "relative to the points, use fischler-bolles"
         )
     return np.asarray(S)
 

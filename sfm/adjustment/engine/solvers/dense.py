@@ -5,9 +5,9 @@ Q'dx = 0, which is an inner constraint and not damping. Directions that neither 
 determine are found as further null vectors and held in the same way. Everything else is still estimated, and
 the null vectors are reported.
 
-Y Y' is summed as a product of full rows Y' of the object points if most photographs see most points,
-otherwise pair by pair of rays (`fronts.Pairs`). The elements of S^-1 for marginal covariances are computed in
-the same way.
+If most photographs see most points, Y Y' is summed as a product of full rows Y' of the object points.
+Otherwise it is summed pair by pair of rays (`fronts.Pairs`). The elements of S^-1 for marginal covariances
+are computed in the same way.
 
 Source: Foerstner and Wrobel (2016), sec. 4.5, 15.2 and 15.2.5; Luhmann et al. (2020), sec. 4.4.3; Golub and
 Van Loan (2013), sec. 1.3 (products by blocks).

@@ -7,13 +7,13 @@ last. For a block of m photographs the factor has about m log m elements and tak
 matrix takes m^1.5 and m^2.
 
 The separator follows from distances in the graph, measured from four photographs at its far ends. Photographs
-are ordered by the difference of two distances, or of two sums of two, which splits a block across its
+are ordered by the difference of two distances, or of two sums of distances. This splits a block across its
 diagonals or along its sides.
 
-A front is the full matrix of a group of photographs from this dissection, with all later photographs that are
-connected to the group or to groups eliminated before it. All photographs that see an object point are in the
-front of the first of them to be eliminated. So an object point adds to one full matrix only, and one front
-contains all elements of the inverse that it needs.
+A front is a full matrix. Its rows are a group of photographs from this dissection, and all later photographs
+that are connected to the group or to groups eliminated before it. All photographs that see an object point
+are in the front of the first of them to be eliminated. So an object point adds to one full matrix only, and
+one front contains all elements of the inverse that it needs.
 
 `Pairs` is for sums over the pairs of rays of each object point, where a product of full rows would mostly
 multiply zeros. Y Y' and Y' Q need only the blocks of photographs that share a point. These are summed in

@@ -113,6 +113,6 @@ def refuse_what_does_not_fit(size: float, unknowns: str, *, limit: float) -> Non
     """
     if size > limit:
         raise GeometryError(
-            f"adjustment: {unknowns} need {size / 1e9:.0f} GB when they are factored and inverted, at most "
-            f"{limit / 1e9:.0f} GB are taken"
+            f"adjustment: {unknowns} need {size / 1e9:.0f} GB when they are factored and inverted, the "
+            f"limit is {limit / 1e9:.0f} GB"
         )
