@@ -46,8 +46,8 @@ class Camera:
     free: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """which parameters are to be adjusted; none by default, shape (n,)"""
     shared: tuple[str, ...] = ()
-    """of each parameter, the group of cameras that share its value, such as photographs of one camera that
-    differ in c only; "" = not shared, () = none shared, length n"""
+    """group of cameras that share the value of each parameter, such as photographs of one camera that differ
+    in c only; "" = not shared, () = none shared, length n"""
 
     def __post_init__(self) -> None:
         n = len(self.names)

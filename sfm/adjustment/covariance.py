@@ -145,7 +145,7 @@ class Marginal:
         if self.correlated is not None:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
-        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)  # fixed
+        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
         cofactor *= self.adjustment.sigma0**2

@@ -9,7 +9,7 @@ curved inside the matching windows. Sums of residuals over cells of a photograph
 half of it, show that. Their squares grow with the number of image points for independent errors, and with its
 square for common errors. Object points, orientations and cameras absorb a part of both, mostly of long waves.
 Simulation shows how much remains: random fields of known correlation length pass through the linearised
-adjustment. A field moves precise image points by as many px as others.
+adjustment. A field moves precise and imprecise image points by the same number of px.
 
 **Projection uncertainty.** It states how well a calibrated camera determines where a direction appears in the
 photograph. Errors of the interior orientation move the image of a distant point. The part that equals a

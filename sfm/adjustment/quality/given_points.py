@@ -30,7 +30,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vecto
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity, similarity_motions
 
-MAX_TRIPLES = 300  # tried similarities from three points; with half of the points right, 37 are right
+MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct
 MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten
 MAX_DECIMALS = 8  # most decimals of typed coordinates; computed ones have more
 SAME_DECIMAL = 1e-6  # deviation of a scaled number from a whole number that is due to binary rounding

@@ -1,7 +1,6 @@
 """Statistics of a finished adjustment: redundancy numbers, tests, reliability, significance, correlations.
 
-The global test compares v'Pv with the redundancy. The tests of single image coordinates by Baarda and Pope
-use
+The global test compares v'Pv with the redundancy. Baarda's and Pope's tests of single image coordinates use
 
     R = Q_vv P (redundancy numbers on its diagonal; their sum is the redundancy),
     w = (P v)_i / sqrt(sigma0'^2 (P Q_vv P)_ii)     with sigma0' a priori: Baarda's w ~ N(0, 1),

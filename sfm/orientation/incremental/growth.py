@@ -436,9 +436,8 @@ class Support:
     def doubtful(self) -> BoolArray:
         """Photographs with fewer than half of their image points where the network predicts them, (m,).
 
-        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be distinguished from its opposite
-            if
-        more than half of its data contradict it.
+        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: if more than half of the data contradict an
+        estimate, nothing distinguishes it from its opposite.
         """
         return np.asarray(self.confirmed < self.against)
 

@@ -1,6 +1,6 @@
 """Photographs that fit worse than the others, and other solutions for a flat object.
 
-**Mirrored photographs.** A mirrored photograph of an object with little depth finds a wrong position, behind
+**Mirrored photographs.** A mirrored photograph of an object with little depth gets a wrong position, behind
 or beside the object. Most of its image points fit a wide tolerance there. Near-duplicates of it are distorted
 with it. Once the other photographs are adjusted without it, it fits them when it is turned over, as well as
 they fit each other.

@@ -1,4 +1,4 @@
-"""Starting pair: the pair of photographs from which a network grows, with the right one of its solutions.
+"""Starting pair: the pair of photographs from which a network grows, with the correct one of its solutions.
 
 Pairs with many common points are oriented relatively. Each of their solutions becomes a model. The other
 photographs are resected on it, and the model that fits most image points is the start. If there is no third
@@ -32,7 +32,7 @@ AS_A_PLANE = 0.1  # tangents; largest displacement of points from a plane by the
 PAIR_POINTS = 1000  # common points of a pair that take part in its orientation
 MIN_MEDIAN_ANGLE_DEG = 5.0  # smallest median ray angle of a useful starting pair
 MIN_ANGLE_OF_TWO_DEG = 3.0  # the same in a survey of two photographs, which has no other pair
-TWOFOLD = 2.0  # ratio of two misfits above which the smaller one is right
+TWOFOLD = 2.0  # ratio of two misfits above which the smaller one is correct
 SCREEN_TRIALS = 200  # triples per photograph in the comparison of solutions
 SCREEN_POINTS = 30  # points per photograph in the comparison
 SCREEN_PHOTOGRAPHS = 40  # photographs per solution in the comparison

@@ -1,4 +1,4 @@
-"""Space resection by least squares, and criteria that distinguish the right orientation from others."""
+"""Space resection by least squares, and criteria that distinguish the correct orientation from others."""
 
 from __future__ import annotations
 

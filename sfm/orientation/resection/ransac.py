@@ -173,7 +173,7 @@ def expected_trials(w: float, n: int) -> tuple[float, float]:
     """Return expectation E(k) and standard deviation SD(k) of the trials until a sample is free of errors.
 
     Args:
-        w: probability that a point is right.
+        w: probability that a point is correct.
         n: number of points in a sample.
 
     Raises:

@@ -44,8 +44,9 @@ MIN_BENT_RATIO_OF_ONE = 10.0  # the same for one photograph, relative to the med
 FAR_OFF = 100.0  # median residuals; an image point beyond has no influence with any estimator
 MIN_ANGLE_DEG = 0.1  # between two rays of a point: a few pixels of parallax, needed to determine depth
 REWEIGHTINGS = 30
-MAX_VAGUE_WEIGHTS = 2  # successive reweightings without convergence; more helped in none of the 400 networks
-# with gross errors of tests.adjustment.test_studies
+# Successive reweightings without convergence; more helped in none of the 400 networks with gross errors of
+# tests.adjustment.test_studies.
+MAX_VAGUE_WEIGHTS = 2
 WEIGHT_TOLERANCE = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
