@@ -208,16 +208,6 @@ def measured_points(result: Solution) -> MeasuredPoints:
     )
 
 
-def with_covariance(points: MeasuredPoints, covariance: FloatArray | None) -> MeasuredPoints:
-    """Return the points with another covariance.
-
-    Args:
-        points: the points.
-        covariance: joint (3 n, 3 n), or of each point (n, 3, 3), object unit^2; None if unknown.
-    """
-    return replace(points, covariance=covariance)
-
-
 def coordinates_of(points: IntArray) -> IntArray:
     """Return the rows of X, Y, Z of points in a joint covariance, (3 m,), given their indices (m,)."""
     return np.asarray((3 * np.asarray(points)[:, None] + np.arange(3)).ravel())

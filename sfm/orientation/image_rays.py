@@ -144,15 +144,12 @@ def transfer_residuals(H: FloatArray, first: FloatArray, second: FloatArray) -> 
     return np.asarray(-mapped[:, :2] / W[:, None] - second)
 
 
-def decompose_homography(
-    H: FloatArray, first: FloatArray, second: FloatArray
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+def decompose_homography(H: FloatArray, first: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Return (base, rotation, normal) of the camera pairs that a homography describes.
 
     Args:
         H: r2 ~ H r1 for rays r = (u, v, -1), with the sign that makes depths positive, shape (3, 3).
         first: tangents u = -U/W, v = -V/W of rays of photograph 1 to points of the plane, shape (n, 2).
-        second: the conjugate rays of photograph 2, shape (n, 2).
 
     Returns:
         The solutions with the plane in front of photograph 1: two, one if they coincide, none for a pure

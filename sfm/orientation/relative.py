@@ -124,7 +124,7 @@ def relative_orientations(
                 return (infinite,)
         planar = [
             _evaluate("planar", base, R, normal, uv1, uv2, on_plane)
-            for base, R, normal in decompose_homography(H, uv1[on_plane], uv2[on_plane])
+            for base, R, normal in decompose_homography(H, uv1[on_plane])
         ]
     if spatial is None and n >= SPATIAL_POINTS:
         spatial = _spatial(uv1, uv2, tolerance, seed, max_trials)

@@ -92,7 +92,7 @@ def test_both_solutions_of_a_plane_fit_and_a_third_photograph_decides():
     uv1, uv2, base, R, points = two_photographs(rng, 4, "planar", sigma=0)
     H, used = fit_homography(uv1, uv2, tolerance=TOLERANCE)
     assert used.all()
-    both = decompose_homography(H, uv1, uv2)
+    both = decompose_homography(H, uv1)
     assert len(both) == 2
     for b, R2, normal in both:
         assert np.abs(coplanarity_residuals(uv1, uv2, b, R2)[0]).max() < 1e-12

@@ -193,7 +193,7 @@ def _fit(
     shape, cost, converged = refine_orthogonal(shape, x[used], free=free, offset=off, placed=placed)
     d, B, A = shape.design(x[used])
     A = A[..., free].reshape(d.size, -1)
-    _refuse_rank(kind, A, d.size)
+    _refuse_rank(A, d.size)
     redundancy = d.size - A.shape[1]
     n = len(rows)
     linear = np.zeros((A.shape[1], n, 3))
@@ -359,7 +359,7 @@ def _refuse_flat(kind: Kind, x: FloatArray, blocks: FloatArray, *, axis_held: bo
         )
 
 
-def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
+def _refuse_rank(A: FloatArray, constraints: int) -> None:
     """Refuse points that do not determine all parameters."""
     u = A.shape[1]
     if constraints < u:
