@@ -57,7 +57,7 @@ def run_survey(
         KolinearError: the survey cannot be run; the message states the remedy.
     """
     clock = StageClock(progress)
-    with _naming(survey), own_threads(jobs):
+    with _with_survey_name(survey), own_threads(jobs):
         survey, measured = _measure(survey, images_dir, jobs, store, clock)
         survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock)
         copies = find_copies(solution.adjustment)
@@ -111,7 +111,7 @@ def _measure(
 
 
 @contextmanager
-def _naming(survey: Survey) -> Iterator[None]:
+def _with_survey_name(survey: Survey) -> Iterator[None]:
     """Add the name of the survey to the message of a GeometryError."""
     try:
         yield

@@ -364,7 +364,7 @@ def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Loca
     order = None
     if len(network.points) >= MIN_SORTED_POINTS:
         order = along_curve(start.points)
-        local, start, datum = _renumbered(local, start, datum, order)
+        local, start, datum = _renumber_points(local, start, datum, order)
     return LocalNetwork(local, start, datum, network, centroid, order)
 
 
@@ -387,7 +387,7 @@ def along_curve(points: FloatArray) -> IntArray:
     return np.argsort(key, kind="stable")
 
 
-def _renumbered(
+def _renumber_points(
     network: Network, estimate: Estimate, datum: ResolvedDatum, order: IntArray
 ) -> tuple[Network, Estimate, ResolvedDatum]:
     """Return network, estimate and datum with the points in another order."""

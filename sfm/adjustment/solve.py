@@ -205,7 +205,7 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
     return rejected
 
 
-def _without_weight(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:
+def _small_weight_remarks(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:
     """Return the remark on photographs with small robust weights only, whose orientation is arbitrary."""
     seen = layout.active
     image = layout.observations.image
@@ -307,6 +307,6 @@ def _result(
         inflation=factor,
         observed=tuple(residuals_of_observed(one, layout, optimum, Q) for one in run.problem.observed),
         datum_points=run.problem.datum.points,
-        remarks=(*run.remarks, *_without_weight(layout, weight, network)),
+        remarks=(*run.remarks, *_small_weight_remarks(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),
     )

@@ -88,9 +88,9 @@ class Alignment:
         M = M.reshape(3 * n, 7)
         rows = coordinates_of(self.points)
         # (D + M F) Q (D + M F)' = D Q D' + M (F Q D') + (F Q D')' M' + M (F Q F') M'
-        cross = _right(self.linear @ Q[rows], D)
+        cross = _times_blocks(self.linear @ Q[rows], D)
         middle = self.linear @ Q[np.ix_(rows, rows)] @ self.linear.T + self.covariance_of_nominal
-        moved = _right(_right(Q, D).T, D)
+        moved = _times_blocks(_times_blocks(Q, D).T, D)
         half = M @ (cross + middle @ M.T / 2)
         return np.asarray(moved + half + half.T)
 
@@ -170,7 +170,7 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
         (Function(points.xyz[points.index(name)], np.array([points.index(name)]), np.eye(3)), False, axis)
         for name, axis in rows
     ]
-    return _defined("3-2-1", Similarity(1.0, rotation, t), entities)
+    return _align_by_coordinates("3-2-1", Similarity(1.0, rotation, t), entities)
 
 
 @checked_arguments()
@@ -202,7 +202,7 @@ def align_features(
         (origin, False, 1),
         (origin if on_plane is None else on_plane, False, 2),
     ]
-    return _defined("features", Similarity(1.0, rotation, -at), entities)
+    return _align_by_coordinates("features", Similarity(1.0, rotation, -at), entities)
 
 
 @checked_arguments()
@@ -247,7 +247,7 @@ def align_points(
         blocks = blocks + nominal.covariance[nominal_rows]
     used = np.ones(len(rows), dtype=bool)
     if robust:
-        used = _agreeing(points.xyz[rows], target, fixed, blocks if weights == "network" else None)
+        used = _agreeing_points(points.xyz[rows], target, fixed, blocks if weights == "network" else None)
     first = fit_similarity(points.xyz[rows[used]], target[used], scale=fixed)
     Qn = None if nominal.covariance is None else nominal.covariance[nominal_rows[used]]
     T, linear, of_nominal, omega = _refine(points, rows[used], target[used], Qn, first, scale, weights)
@@ -284,7 +284,7 @@ def _refine(
         # at the start, which is so close that the weights do not change; rotating Q takes most of the time
         D, M = T.scale * T.rotation, similarity_motions(T.apply(source), centre=np.zeros(3))
         M = M.reshape(3 * n, 7)[:, :u]
-        Qd = spread.copy() if Q is None else _right(_right(Q, D).T, D) + spread
+        Qd = spread.copy() if Q is None else _times_blocks(_times_blocks(Q, D).T, D) + spread
         unit = np.sqrt(np.trace(Qd) / len(Qd) / (M**2).mean(axis=0))
         Qd += (M * unit) @ (M * unit).T
         try:
@@ -304,7 +304,7 @@ def _refine(
         step = -pull @ d
         if not np.abs(step[3:]).max() < 1:
             break
-        T = _stepped(T, step)
+        T = _take_step(T, step)
         if np.abs(step[:3]).max() < CONVERGED * size and np.abs(step[3:]).max() < CONVERGED:
             break
     else:
@@ -318,19 +318,19 @@ def _refine(
     d = (T.apply(source) - target).ravel()
     omega = float(d @ d) if weights == "equal" else float(d @ cho_solve(factor, d))
     linear, of_nominal = np.zeros((7, 3 * n)), np.zeros((7, 7))
-    linear[:u] = -_right(pull, D.T)
+    linear[:u] = -_times_blocks(pull, D.T)
     of_nominal[:u, :u] = pull @ spread @ pull.T
     return T, linear, of_nominal, omega
 
 
-def _stepped(T: Similarity, step: FloatArray) -> Similarity:
+def _take_step(T: Similarity, step: FloatArray) -> Similarity:
     """Return a transformation after small shifts, rotations and a change of scale in the new system."""
     spin = rotation_from_vector(step[3:6])
     factor = 1 + (step[6] if len(step) > 6 else 0.0)
     return Similarity(T.scale * factor, spin @ T.rotation, factor * spin @ T.translation + step[:3])
 
 
-def _agreeing(
+def _agreeing_points(
     source: FloatArray, target: FloatArray, scale: float | None, blocks: FloatArray | None
 ) -> BoolArray:
     """Return the points that agree with most of the others, (n,)."""
@@ -355,7 +355,9 @@ def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
     return np.stack([across, np.cross(z, across), z])
 
 
-def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, int]]) -> Alignment:
+def _align_by_coordinates(
+    method: str, T: Similarity, entities: list[tuple[Function, bool, int]]
+) -> Alignment:
     """Return the alignment that holds one coordinate of each of six positions or directions.
 
     Args:
@@ -378,6 +380,6 @@ def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, in
     return Alignment(method, T, held.points, linear, np.zeros((7, 7)), False)
 
 
-def _right(matrix: FloatArray, D: FloatArray) -> FloatArray:
+def _times_blocks(matrix: FloatArray, D: FloatArray) -> FloatArray:
     """Return matrix diag(D, D, ...)', (k, 3 n)."""
     return np.asarray((matrix.reshape(len(matrix), -1, 3) @ D.T).reshape(matrix.shape))

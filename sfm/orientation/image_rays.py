@@ -52,7 +52,7 @@ def intersect_image_points(
     wide = np.array([one.wide_angle for one in estimate.cameras])[camera[image]]
     if wide.any():
         position = np.concatenate([position, position[image[wide]]])
-        rotation = np.concatenate([rotation, _along_rays(rotation[image[wide]], uv[wide])])
+        rotation = np.concatenate([rotation, _rotations_along_rays(rotation[image[wide]], uv[wide])])
         image = image.copy()
         image[wide] = len(estimate.position) + np.arange(int(wide.sum()))
         uv[wide] *= 0.0  # keeps NaN
@@ -67,7 +67,7 @@ def intersect_image_points(
     )
 
 
-def _along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
+def _rotations_along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
     """Return rotations with axis -z along the rays with tangents (u, v) under given rotations, (k, 3, 3)."""
     u, v = uv.T
     one = np.ones(len(uv))

@@ -114,11 +114,13 @@ def relative_orientations(
     spatial: RelativeOrientation | None = None
     planar: list[RelativeOrientation] = []
     if on_plane.sum() >= max(PLANAR_POINTS, PLANAR_SHARE * n):
-        infinite = _infinite(H, uv1, uv2, on_plane, tolerance)
+        infinite = _pure_rotation(H, uv1, uv2, on_plane, tolerance)
         if infinite is not None:
             # with a wide tolerance, a false base would fit all pairs of a small base
             spatial = (
-                _spatial(uv1, uv2, NARROW * tolerance, seed, max_trials) if n >= SPATIAL_POINTS else None
+                _spatial_orientation(uv1, uv2, NARROW * tolerance, seed, max_trials)
+                if n >= SPATIAL_POINTS
+                else None
             )
             if spatial is None or not BASE_EXPLAINS * spatial.sigma0 < infinite.sigma0:
                 return (infinite,)
@@ -127,7 +129,7 @@ def relative_orientations(
             for base, R, normal in decompose_homography(H, uv1[on_plane])
         ]
     if spatial is None and n >= SPATIAL_POINTS:
-        spatial = _spatial(uv1, uv2, tolerance, seed, max_trials)
+        spatial = _spatial_orientation(uv1, uv2, tolerance, seed, max_trials)
     if spatial is not None:
         spatial = _nearest_to_coplanar(spatial, planar, uv1, uv2, tolerance)
     if spatial is None:
@@ -157,7 +159,7 @@ def model_points(first: FloatArray, second: FloatArray, pair: RelativeOrientatio
     return np.where(pair.inliers[:, None], points, np.nan)
 
 
-def _infinite(
+def _pure_rotation(
     H: FloatArray, uv1: FloatArray, uv2: FloatArray, used: BoolArray, tolerance: float
 ) -> RelativeOrientation | None:
     """Return the rotation that explains the rays, None if a homography explains them better."""
@@ -202,7 +204,7 @@ def _is_planar(H: FloatArray, uv1: FloatArray, uv2: FloatArray, spatial: Relativ
     return bool(ratio <= fdtri(2 * n - 8, spatial.redundancy, CONFIDENCE))
 
 
-def _spatial(
+def _spatial_orientation(
     uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int, max_trials: int
 ) -> RelativeOrientation | None:
     """Return the orientation from a five-point start and coplanarity; None if fewer than six pairs fit."""
@@ -226,7 +228,7 @@ def _spatial(
         return None
     rotation = (D @ np.asarray(R, dtype=np.float64) @ D).T
     base = -rotation @ D @ np.asarray(t, dtype=np.float64).ravel()
-    return _adjusted(base / np.linalg.norm(base), rotation, uv1, uv2, used, tolerance)
+    return _adjust_spatial(base / np.linalg.norm(base), rotation, uv1, uv2, used, tolerance)
 
 
 def _nearest_to_coplanar(
@@ -242,12 +244,12 @@ def _nearest_to_coplanar(
     select either. An adjustment from the wrong one ends in another minimum, with larger residuals.
     """
     found = [spatial]
-    found += [_adjusted(one.base, one.rotation, uv1, uv2, one.inliers, tolerance) for one in planar]
+    found += [_adjust_spatial(one.base, one.rotation, uv1, uv2, one.inliers, tolerance) for one in planar]
     squares = [float(np.sum(np.minimum(one.residuals, tolerance) ** 2)) for one in found]
     return found[int(np.argmin(squares))]
 
 
-def _adjusted(
+def _adjust_spatial(
     base: FloatArray,
     rotation: FloatArray,
     uv1: FloatArray,

@@ -83,7 +83,7 @@ def orient_direct(
         )
     check_indices("orient_direct: image", image, m)
     check_indices("orient_direct: point", point, len(control))
-    positions, rotations = _resected(uv, image, point, control, known, m)
+    positions, rotations = _resect_photographs(uv, image, point, control, known, m)
     start = intersect(uv, image, point, positions, rotations, n_points=len(control)).points
     points = np.where(known[:, None], control, start)
     missing = np.flatnonzero(
@@ -95,8 +95,8 @@ def orient_direct(
         )
     converged = False
     for _ in range(MAX_STEPS):
-        v, A, B = _observations(uv, image, point, positions, rotations, points)
-        N, n_vector, solve_points = _reduced(v, A, B, image, point, known, m)
+        v, A, B = _linearise(uv, image, point, positions, rotations, points)
+        N, n_vector, solve_points = _eliminate_new_points(v, A, B, image, point, known, m)
         try:
             dx = np.asarray(np.linalg.solve(N, n_vector), dtype=float)
         except np.linalg.LinAlgError:
@@ -109,8 +109,8 @@ def orient_direct(
         if np.abs(step[:, :3]).max() < MAX_LAST_STEP * distance and np.abs(step[:, 3:]).max() < MAX_LAST_STEP:
             converged = True
             break
-    v, A, B = _observations(uv, image, point, positions, rotations, points)
-    N, _, _ = _reduced(v, A, B, image, point, known, m)
+    v, A, B = _linearise(uv, image, point, positions, rotations, points)
+    N, _, _ = _eliminate_new_points(v, A, B, image, point, known, m)
     new = np.unique(point[~known[point]])
     redundancy = 2 * len(uv) - 6 * m - 3 * len(new)
     sigma0 = float(np.sqrt(np.sum(v**2) / redundancy)) if redundancy > 0 else np.nan
@@ -120,7 +120,7 @@ def orient_direct(
     )
 
 
-def _resected(
+def _resect_photographs(
     uv: FloatArray, image: IntArray, point: IntArray, control: FloatArray, known: BoolArray, m: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return start positions and rotations of all photographs, resected on their control points."""
@@ -135,7 +135,7 @@ def _resected(
     return positions, rotations
 
 
-def _observations(
+def _linearise(
     uv: FloatArray,
     image: IntArray,
     point: IntArray,
@@ -157,7 +157,7 @@ def _observations(
     return u - uv, A, B
 
 
-def _reduced(
+def _eliminate_new_points(
     v: FloatArray, A: FloatArray, B: FloatArray, image: IntArray, point: IntArray, known: BoolArray, m: int
 ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
     """Return the normal equations without the new points, and the function that solves for these points."""
@@ -237,22 +237,22 @@ def adjust_separately(
     space = new_space(layout)
     for number in range(1, max_rounds + 1):
         before = vPv
-        for move in (_points, _orientations):
+        for move in (_point_step, _orientation_step):
             normals = normal_equations(layout, observed, state, weight, space=space)
             reduced, points = move(normals.blocks, layout)
-            state, vPv = _shorten(layout, state, weight, reduced, points, vPv)
+            state, vPv = _halve_step(layout, state, weight, reduced, points, vPv)
         if before - vPv <= tolerance * before:
             return SeparateAdjustment(estimate_of(state, estimate), vPv, number, True)
     return SeparateAdjustment(estimate_of(state, estimate), vPv, max_rounds, False)
 
 
-def _points(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
+def _point_step(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Return the step of the points with the orientations held, -V^-1 g."""
     dX = -np.linalg.solve(blocks.V, blocks.gp[:, :, None])[:, :, 0]
     return np.zeros(layout.reduced), np.where(layout.point_free, dX, 0.0)
 
 
-def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
+def _orientation_step(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Return the step of exterior and interior orientation with the points held, -U^-1 g."""
     m = len(layout.pose_free)
     U = np.zeros((layout.reduced, layout.reduced))
@@ -274,7 +274,7 @@ def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatAr
     return dx, np.zeros(layout.point_free.shape)
 
 
-def _shorten(
+def _halve_step(
     layout: Unknowns, state: State, weight: FloatArray, reduced: FloatArray, points: FloatArray, vPv: float
 ) -> tuple[State, float]:
     """Halve the step until v'Pv does not increase, and return the new state and its v'Pv."""

@@ -91,7 +91,7 @@ def orient_dependent(
         raise GeometryError("dependent pair: the base has no X component, use the independent pair")
     positions = np.stack([np.zeros(3), b * bx / b[0]])
     rotations = np.stack([np.eye(3), R])
-    return _pair("dependent", DEPENDENT, parameters, b, R, v, Q, positions, rotations)
+    return _pair_orientation("dependent", DEPENDENT, parameters, b, R, v, Q, positions, rotations)
 
 
 @checked_arguments(first="n 2", second="n 2", start="5")
@@ -128,7 +128,9 @@ def orient_independent(
     b, R, v, Q = refine_coplanarity(first, second, b, R)
     R1 = _base_frame(b)
     positions = np.array([[0.0, 0, 0], [1, 0, 0]])
-    return _pair("independent", INDEPENDENT, parameters, b, R, v, Q, positions, np.stack([R1, R1 @ R]))
+    return _pair_orientation(
+        "independent", INDEPENDENT, parameters, b, R, v, Q, positions, np.stack([R1, R1 @ R])
+    )
 
 
 def _base_frame(base: FloatArray) -> FloatArray:
@@ -149,7 +151,7 @@ def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, Floa
     return best.base, best.rotation
 
 
-def _pair(
+def _pair_orientation(
     kind: str,
     names: tuple[str, ...],
     parameters: Callable[[FloatArray, FloatArray], FloatArray],
@@ -208,7 +210,7 @@ class NormalImages:
             xy: points in the photograph, px, (k, 2).
         """
         here = self.source
-        return _seen_by(self.cameras[side], self.rotation, here.cameras[side], here.rotation[side], xy)
+        return _project_rays(self.cameras[side], self.rotation, here.cameras[side], here.rotation[side], xy)
 
     def photograph_xy(self, side: int, xy: FloatArray) -> FloatArray:
         """Map points of a normal image to its photograph, px, (k, 2); NaN without an image.
@@ -218,7 +220,7 @@ class NormalImages:
             xy: points in the normal image, px, (k, 2).
         """
         here = self.source
-        return _seen_by(here.cameras[side], here.rotation[side], self.cameras[side], self.rotation, xy)
+        return _project_rays(here.cameras[side], here.rotation[side], self.cameras[side], self.rotation, xy)
 
     def resample(self, side: int, photograph: AnyArray) -> FloatArray:
         """Resample a photograph to its normal image, intensities, (H, W); NaN outside the photograph.
@@ -273,7 +275,7 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
     c_px = float(np.mean([camera.c_px for camera in cameras]))
     centred = camera_from_values("centred", "brown", (1, 1), (1.0, 1.0), c_mm=c_px)
     seen = [
-        _seen_by(centred, R, camera, turned, _border(camera))
+        _project_rays(centred, R, camera, turned, _border(camera))
         for camera, turned in zip(cameras, rotation, strict=True)
     ]
     if not all(np.isfinite(part).all() for part in seen):
@@ -316,7 +318,7 @@ def _border(camera: Camera) -> FloatArray:
     return unit * (width - 1, height - 1)
 
 
-def _seen_by(
+def _project_rays(
     camera: Camera, rotation: FloatArray, source: Camera, source_rotation: FloatArray, xy: FloatArray
 ) -> FloatArray:
     """Project the rays of one camera into another with the same centre, px, (k, 2); NaN behind it."""

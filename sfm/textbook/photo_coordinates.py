@@ -235,25 +235,25 @@ def _steps(corrections: PhotoCorrections, c: float) -> list[Callable[[FloatArray
     steps: list[Callable[[FloatArray], FloatArray]] = []
     table = corrections.radial_table
     if table is not None:
-        steps.append(lambda xy: _radially(xy, lambda r: -radial_from_table(table, r)))
+        steps.append(lambda xy: _move_radially(xy, lambda r: -radial_from_table(table, r)))
     if np.any(corrections.radial):
         K = corrections.radial
-        steps.append(lambda xy: _radially(xy, lambda r: r**3 * (K[0] + r**2 * (K[1] + r**2 * K[2]))))
+        steps.append(lambda xy: _move_radially(xy, lambda r: r**3 * (K[0] + r**2 * (K[1] + r**2 * K[2]))))
     if np.any(corrections.decentring):
         P1, P2 = corrections.decentring
         steps.append(lambda xy: xy + _decentring(xy, P1, P2))
     if corrections.flying_height_km is not None:
         K_air = refraction_coefficient(corrections.flying_height_km, corrections.terrain_height_km)
         # refraction displaces points outwards
-        steps.append(lambda xy: _radially(xy, lambda r: -K_air * (r + r**3 / c**2)))
+        steps.append(lambda xy: _move_radially(xy, lambda r: -K_air * (r + r**3 / c**2)))
     if corrections.curvature_height_km is not None:
         H = corrections.curvature_height_km
         # earth curvature displaces points inwards from their image on the tangential plane
-        steps.append(lambda xy: _radially(xy, lambda r: curvature_displacement(r, height_km=H, c_mm=c)))
+        steps.append(lambda xy: _move_radially(xy, lambda r: curvature_displacement(r, height_km=H, c_mm=c)))
     return steps
 
 
-def _radially(xy: FloatArray, displacement: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _move_radially(xy: FloatArray, displacement: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Move points outwards by a displacement that depends on their radius."""
     r = np.hypot(xy[..., 0], xy[..., 1])
     factor = displacement(r) / np.where(r > 0, r, 1.0)

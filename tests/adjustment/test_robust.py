@@ -276,7 +276,7 @@ def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: 
 def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth = make_network(seed_of("broken"), images=10, points=30)
     clean = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
-    monkeypatch.setattr(rejection, "_plain", refuse)
+    monkeypatch.setattr(rejection, "_optimum_of_all", refuse)
     again = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
     assert again.converged
     np.testing.assert_array_equal(again.rejected, clean.rejected)

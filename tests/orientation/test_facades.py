@@ -11,7 +11,7 @@ from sfm.camera import project
 from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental import poor_photographs
 from sfm.orientation.incremental.growth import residual_lengths
-from sfm.orientation.incremental.poor_photographs import _Resected, bounded_costs
+from sfm.orientation.incremental.poor_photographs import _ResectionFit, bounded_costs
 from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity, reverse_depth
 from sfm.survey.orientation import refine
@@ -145,9 +145,11 @@ def test_what_fits_turned_over_by_chance_is_no_mirrored_picture(
     """Names of another scene: no resection as it is, and one of some points turned over."""
     monkeypatch.setattr(
         poor_photographs,
-        "_resected",
+        "_fit_resected",
         lambda *_, turned_over=False: (
-            _Resected(turned, fitting) if turned_over else _Resected(before, 20 if np.isfinite(before) else 0)
+            _ResectionFit(turned, fitting)
+            if turned_over
+            else _ResectionFit(before, 20 if np.isfinite(before) else 0)
         ),
     )
     monkeypatch.setattr(poor_photographs, "_medians_px", lambda _: np.array([np.nan, 0.1, 0.1, 0.2]))

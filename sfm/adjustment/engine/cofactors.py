@@ -62,7 +62,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     q = optimum.factor.inverse(b, cross=cross)
     first = 6 * len(b.U)
     limiting = _inverse_of_squares(b.L)
-    points = limiting + _twice_solved(b.L, q.core)
+    points = limiting + _solve_both_sides(b.L, q.core)
     for s, j in enumerate(layout.kept):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         points[j] = q.border[at, at]
@@ -253,7 +253,7 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     return rays, inner
 
 
-def _twice_solved(L: FloatArray, core: FloatArray) -> FloatArray:
+def _solve_both_sides(L: FloatArray, core: FloatArray) -> FloatArray:
     """Return L^-T core L^-1 of every point, (n, 3, 3)."""
     return solve_transposed(L, np.swapaxes(solve_transposed(L, core), 1, 2))
 

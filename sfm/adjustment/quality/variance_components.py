@@ -215,7 +215,7 @@ def estimate_common_part(
         redundancy = adjustment.redundancy_numbers[used].mean(axis=1)
         S = np.einsum("k,pkab,qkba->pq", redundancy, PV, PV)
         found = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
-        before, squares = squares, _not_negative(S, found)
+        before, squares = squares, _solve_nonnegative(S, found)
         change = np.sqrt(_median_trace(squares, parts) / _median_trace(before, parts)) - 1
         share = squares[1] / _median_trace(squares, parts) - before[1] / _median_trace(before, parts)
         if max(abs(change), abs(share)) <= LAST_CHANGE_OF_PARTS:
@@ -224,7 +224,7 @@ def estimate_common_part(
     return factor, max(common, MIN_SIGMA_PX)
 
 
-def _not_negative(S: FloatArray, found: FloatArray) -> FloatArray:
+def _solve_nonnegative(S: FloatArray, found: FloatArray) -> FloatArray:
     """Return the solution of two normal equations, (2,), with 0 instead of a negative value."""
     squares = np.linalg.solve(S, found)
     for one, other in ((0, 1), (1, 0)):

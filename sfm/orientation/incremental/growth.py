@@ -279,7 +279,7 @@ class Growth:
             return False
         self.adjusted = used
         part, start = reduce_network(self.network, self.estimate, images, points, fits)
-        staged = tuple(_staged(camera, part, index) for index, camera in enumerate(start.cameras))
+        staged = tuple(_free_by_stages(camera, part, index) for index, camera in enumerate(start.cameras))
         try:
             result = refine(part, replace(start, cameras=staged))
         except (GeometryError, np.linalg.LinAlgError):
@@ -391,7 +391,7 @@ def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
     return out
 
 
-def _staged(camera: Camera, network: Network, index: int) -> Camera:
+def _free_by_stages(camera: Camera, network: Network, index: int) -> Camera:
     """Free as many interior parameters as the photographs can determine: none, the first few, or all.
 
     The redundancy of the camera's image points after the exterior orientations must exceed its free
@@ -470,7 +470,7 @@ def photograph_support(
     known = estimate.determined[seen.point] & estimate.oriented[seen.image]
     alone = fits & ((rays[seen.point] >= 3) | fixed[seen.point])
     confirmed = _count(alone, seen.image, m) + _surplus_of_pairs(network, fits & ~alone)
-    against = ~fits & (known | _amidst(network, estimate))
+    against = ~fits & (known | _inside_network(network, estimate))
     fitting, known_count, against_count = (_count(rows, seen.image, m) for rows in (fits, known, against))
     return Support(fitting, known_count, confirmed, against_count)
 
@@ -485,7 +485,7 @@ def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
     return both.astype(np.int64)
 
 
-def _amidst(network: Network, estimate: Estimate) -> BoolArray:
+def _inside_network(network: Network, estimate: Estimate) -> BoolArray:
     """Return which image points lie inside the convex hull of the projected network, (k,)."""
     seen = network.image_points
     out = np.zeros(len(seen), dtype=bool)

@@ -65,7 +65,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         if not np.isfinite(waiting[i]):
             break
         looked_at[i] = True
-        if _resected(growth, i, turned_over=True).median_px < medians[i]:
+        if _fit_resected(growth, i, turned_over=True).median_px < medians[i]:
             with_it = growth.estimate
             growth.release(np.array([i]))
             growth.adjust(refine)
@@ -82,7 +82,7 @@ def _is_mirrored(growth: Growth, i: int) -> bool:
     At least as many of its image points must fit turned over. Image points of a plane alone also fit turned
     over, as if seen from behind.
     """
-    as_it_is, turned = _resected(growth, i), _resected(growth, i, turned_over=True)
+    as_it_is, turned = _fit_resected(growth, i), _fit_resected(growth, i, turned_over=True)
     before, after = as_it_is.median_px, turned.median_px
     others = np.delete(_medians_px(growth), i)
     mirrored = FAR_BETTER * after < before and bool(after < FAR_BETTER * np.nanmedian(others))
@@ -93,14 +93,14 @@ def _is_mirrored(growth: Growth, i: int) -> bool:
     return mirrored
 
 
-class _Resected(NamedTuple):
+class _ResectionFit(NamedTuple):
     """Fit of a photograph to the present points."""
 
     median_px: float  # median residual, infinite if it cannot be resected
     fitting: int  # number of image points within the tolerance
 
 
-def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected:
+def _fit_resected(growth: Growth, i: int, *, turned_over: bool = False) -> _ResectionFit:
     """Return the fit of a photograph after resection on the present points.
 
     Args:
@@ -115,10 +115,10 @@ def _resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Resected
     known = np.isfinite(uv).all(axis=1)
     found = growth.resection(i, rows[known], uv[known])
     if not found.found:
-        return _Resected(np.inf, 0)
+        return _ResectionFit(np.inf, 0)
     lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px
     median = float(np.median(np.where(np.isnan(lengths), np.inf, lengths)))
-    return _Resected(median, int(found.inliers.sum()))
+    return _ResectionFit(median, int(found.inliers.sum()))
 
 
 def _medians_px(growth: Growth) -> FloatArray:

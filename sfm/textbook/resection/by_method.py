@@ -118,7 +118,7 @@ def resect_by_all(task: Task) -> dict[str, ResectionResult | GeometryError]:
     return found
 
 
-def _closed(
+def _closed_form(
     method: str, function: Callable[[FloatArray, FloatArray], tuple[ResectionSolution, ...]]
 ) -> Callable[[Task], ResectionResult]:
     return lambda task: ResectionResult(method, len(task.points), function(task.tangents, task.points))
@@ -201,11 +201,11 @@ def _start(task: Task) -> tuple[FloatArray, FloatArray]:
 
 
 _FUNCTIONS: dict[str, Callable[[Task], ResectionResult]] = {
-    "fischler-bolles": _closed("fischler-bolles", resect_fischler_bolles),
-    "p4p": _closed("p4p", resect_p4p),
+    "fischler-bolles": _closed_form("fischler-bolles", resect_fischler_bolles),
+    "p4p": _closed_form("p4p", resect_p4p),
     "church": _church,
-    "zeng-wang": _closed("zeng-wang", resect_zeng_wang),
-    "rampal": _closed("rampal", resect_rampal),
+    "zeng-wang": _closed_form("zeng-wang", resect_zeng_wang),
+    "rampal": _closed_form("rampal", resect_rampal),
     "dlt": _dlt,
     "robust": _robust,
     "least-squares": _least_squares,

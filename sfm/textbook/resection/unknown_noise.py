@@ -43,7 +43,7 @@ def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int 
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     field = max(float(np.prod(np.ptp(uv, axis=0))), LEAST_RESIDUAL) if len(uv) else 1.0
-    best, most = None, -(len(uv) - SAMPLE) * np.log(field)  # three points always fit
+    best, best_likelihood = None, -(len(uv) - SAMPLE) * np.log(field)  # three points always fit
     failure = None
     for tolerance in TOLERANCES:
         if best is not None and tolerance < best.sigma0:  # tighter tolerances reject correct points
@@ -52,35 +52,35 @@ def resect_unknown_noise(tangents: FloatArray, points: FloatArray, *, seed: int 
         failure = failure or start
         if not start.found:
             continue
-        one, likelihood = _settled(uv, xyz, start, field)
-        if likelihood > most:
-            best, most = one, likelihood
+        refined, likelihood = _refine(uv, xyz, start, field)
+        if likelihood > best_likelihood:
+            best, best_likelihood = refined, likelihood
     assert failure is not None
     if best is not None:
         return best
     return replace(failure, reason=failure.reason or "its points fit no better than random ones")
 
 
-def _settled(
+def _refine(
     uv: FloatArray, xyz: FloatArray, start: RobustResection, field: float
 ) -> tuple[RobustResection, float]:
     """Return the orientation by least squares over the correct points, and ln of its likelihood."""
     residuals = start.residuals
-    used, likelihood = _right_points(residuals, field)
+    used, likelihood = _select_points(residuals, field)
     X0, R, found = start.position, start.rotation, None
     for _ in range(ROUNDS):
         try:
             trial = resect_least_squares(uv[used], xyz[used], X0, R)
         except GeometryError:
             break
-        others, normal_matrix = _normals(uv, xyz, used, trial)
-        again, better = _right_points(others, field)
-        if found is not None and better <= likelihood:
+        trial_residuals, trial_N = _residuals_and_normals(uv, xyz, used, trial)
+        selected, trial_likelihood = _select_points(trial_residuals, field)
+        if found is not None and trial_likelihood <= likelihood:
             break
-        found, residuals, likelihood, X0, R = trial, others, better, trial.position, trial.rotation
-        N = normal_matrix
-        taken, used = used, again
-        if (taken == again).all():
+        found, residuals, likelihood, N = trial, trial_residuals, trial_likelihood, trial_N
+        X0, R = trial.position, trial.rotation
+        inliers, used = used, selected
+        if (inliers == selected).all():
             break
     if found is None:
         return start, -np.inf
@@ -89,7 +89,7 @@ def _settled(
             start,
             position=found.position,
             rotation=found.rotation,
-            inliers=taken,
+            inliers=inliers,
             residuals=residuals,
             rms=found.rms,
             sigma0=found.sigma0,
@@ -100,7 +100,7 @@ def _settled(
     )
 
 
-def _right_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float]:
+def _select_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float]:
     """Return which points are correct, (n,), and ln of the likelihood.
 
     Args:
@@ -122,7 +122,7 @@ def _right_points(residuals: FloatArray, field: float) -> tuple[BoolArray, float
     return used, float(likelihood[at])
 
 
-def _normals(
+def _residuals_and_normals(
     uv: FloatArray, xyz: FloatArray, used: BoolArray, found: Resection
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals of all points, tangents, NaN behind the camera, (n, 2), and N of the used points."""

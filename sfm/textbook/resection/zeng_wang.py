@@ -127,7 +127,7 @@ def trilaterate(points: FloatArray, distances: FloatArray, T: float) -> FloatArr
     this.
     """
     S = np.empty(3)
-    _place(np.ascontiguousarray(points), np.ascontiguousarray(distances), float(T), S)
+    _fill_position(np.ascontiguousarray(points), np.ascontiguousarray(distances), float(T), S)
     return S
 
 
@@ -202,7 +202,7 @@ def _solve(
             if not fits or n == MAX_SOLUTIONS or is_known(R1, R2, R3, distances, n):
                 continue
             R123[0], R123[1], R123[2] = R1, R2, R3
-            _place(points, R123, _turning_sign(rays), S)
+            _fill_position(points, R123, _turning_sign(rays), S)
             distances[n] = R123
             position[n] = S
             _fill_rotation(rays, points, S, rotation[n])
@@ -244,7 +244,7 @@ def _turning_sign(rays: FloatArray) -> float:
 
 
 @compiled
-def _place(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
+def _fill_position(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
     """Fill S, the new point of `trilaterate`."""
     e, f, g, q = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for d in range(3):
@@ -359,7 +359,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
     for triple in islice(combinations(range(len(xyz)), 3), MAX_TRIPLES):
         order = [*triple, *(i for i in range(len(xyz)) if i not in triple)]
         try:
-            position = _position_from(uv[order], xyz[order])
+            position = _rampal_position(uv[order], xyz[order])
         except GeometryError as error:
             failure = error
             continue
@@ -372,7 +372,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
     return ordered(found)
 
 
-def _position_from(uv: FloatArray, xyz: FloatArray) -> FloatArray:
+def _rampal_position(uv: FloatArray, xyz: FloatArray) -> FloatArray:
     """Return the projection centre from the distances of the first three points and of all others."""
     rays = rays_from_tangents(uv)
     S = _distances(uv[:MIN_POINTS], rays[:MIN_POINTS], xyz[:MIN_POINTS])

@@ -82,14 +82,17 @@ class Fronts:
             vectors: bytes of the vectors used to find null vectors.
         """
         half, end = self.halves
-        first, second = self._eliminating(range(half), {}), self._eliminating(range(half, end), {})
-        last = self._eliminating(range(end, len(self.fronts)), first.waiting | second.waiting)
+        first, second = (
+            self._elimination_bytes(range(half), {}),
+            self._elimination_bytes(range(half, end), {}),
+        )
+        last = self._elimination_bytes(range(end, len(self.fronts)), first.waiting | second.waiting)
         factor = first.kept + second.kept + last.kept
         factoring = max(first.peak + second.peak, first.kept + second.kept + last.peak)  # both halves at once
         columns = BYTES * 6 * sum(front.pivots for front in self.fronts) * border
-        return max(factoring, factor + vectors, factor + self._inverting() + 2 * columns) + 2 * columns
+        return max(factoring, factor + vectors, factor + self._inversion_bytes() + 2 * columns) + 2 * columns
 
-    def _eliminating(self, some: range, waiting: dict[int, float]) -> _Memory:
+    def _elimination_bytes(self, some: range, waiting: dict[int, float]) -> _Memory:
         """Return the memory for eliminating some fronts; `waiting` are remainders of other fronts, bytes."""
         waiting = dict(waiting)
         kept = peak = 0.0
@@ -104,7 +107,7 @@ class Fronts:
             kept += factor
         return _Memory(kept, peak, waiting)
 
-    def _inverting(self) -> float:
+    def _inversion_bytes(self) -> float:
         """Return the peak memory of the inverse of all fronts, computed from the last to the first, bytes."""
         kept: dict[int, float] = {}
         needed = [len(front.children) for front in self.fronts]

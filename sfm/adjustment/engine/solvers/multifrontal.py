@@ -95,21 +95,21 @@ class MultifrontalSolver:
         )
         scale = equations.parts.scale
         Q = motions.orthonormal(scale)
-        fixed = _largest(Q)
+        fixed = _separating_rows(Q)
         border = self._border(equations)
-        factor = self._factored(equations, border, fixed)
+        factor = self._factor_with_held(equations, border, fixed)
         if damped or not (factor is None or factor.weak):
             return factor
         del factor  # only one factor at a time fits in memory
-        shifted = self._factored(equations, border, fixed, shift=SHIFT)
+        shifted = self._factor_with_held(equations, border, fixed, shift=SHIFT)
         if shifted is None:
-            return self._factored(equations, border, fixed)
+            return self._factor_with_held(equations, border, fixed)
         further = null_vectors(shifted, equations, self.layout, Q)
         del shifted
         if further.shape[1] == 0:
-            return self._factored(equations, border, fixed)
+            return self._factor_with_held(equations, border, fixed)
         # held together with the motions, so that no unknown is chosen for two null vectors
-        factor = self._factored(equations, border, _largest(np.hstack([Q, further])))
+        factor = self._factor_with_held(equations, border, _separating_rows(np.hstack([Q, further])))
         if factor is None:
             return None
         return replace(factor, further=refined(further, factor, equations, self.layout, Q))
@@ -129,7 +129,7 @@ class MultifrontalSolver:
         D[np.arange(len(D)), np.arange(len(D))] += equations.damping
         return Border(C, D)
 
-    def _factored(
+    def _factor_with_held(
         self,
         equations: Equations,
         border: Border,
@@ -173,7 +173,7 @@ class MultifrontalSolver:
                 F = self._front(equations, front, added, space)
                 for child in front.children:  # in this order for any number of threads
                     _extend(left.pop(child), fronts[child].into, F)
-                done = _eliminated(F, 6 * front.pivots)
+                done = _eliminate_pivots(F, 6 * front.pivots)
                 if done is None:
                     return False
                 found[g], left[g] = done
@@ -200,7 +200,7 @@ class MultifrontalSolver:
         return F
 
 
-def _eliminated(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray] | None:
+def _eliminate_pivots(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray] | None:
     """Return the factor of the first unknowns of a front, and the remainder of the front."""
     U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
     if info != 0:
@@ -213,7 +213,7 @@ def _eliminated(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray
     return EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
 
 
-def _largest(vectors: FloatArray) -> IntArray:
+def _separating_rows(vectors: FloatArray) -> IntArray:
     """Return as many rows as there are vectors, chosen so that the vectors are well separated there."""
     if vectors.shape[1] == 0:
         return np.zeros(0, dtype=np.int64)

@@ -68,18 +68,18 @@ def find_optimum(
     """
     weight = start_weights(run.problem.layout, state)
     if reject == "none":
-        return _plain(run, state, weight, without)
+        return _optimum_of_all(run, state, weight, without)
     wanted, run.tolerance = run.tolerance, max(run.tolerance, ROUND_TOLERANCE)
-    optimum, weight = _sound(run, state, weight, without)
+    optimum, weight = _undistorted_optimum(run, state, weight, without)
     run.remarks = ()  # remarks on estimators that only provided a start are dropped
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
         robust, factor = _reweight(run, optimum, weight, huber_weights)
-        if _bent_photographs(run, state, robust.state).any():
+        if _distorted_photographs(run, state, robust.state).any():
             robust, factor = optimum, weight
             if reject == "huber":
-                bends = _bending(run, optimum, weight)
+                bends = _distorting_points(run, optimum, weight)
                 robust, factor = _reweight(run, optimum, weight, huber_weights, out=bends)
         if reject == "tukey":
             robust, factor = _reweight(run, robust, factor, tukey_weights)
@@ -169,13 +169,17 @@ class Run:
         return optimum
 
 
-def _plain(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
+def _optimum_of_all(
+    run: Run, state: State, weight: FloatArray, without: BoolArray
+) -> tuple[Optimum, FloatArray]:
     """Return the optimum of all image points except those in `without`."""
     weight = np.where(without, 0.0, weight)
     return run.reinstate(run.start(state, weight), weight, without)
 
 
-def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
+def _undistorted_optimum(
+    run: Run, state: State, weight: FloatArray, without: BoolArray
+) -> tuple[Optimum, FloatArray]:
     """Return the optimum from which gross errors are judged: of all image points, unless they distort it.
 
     An error of hundreds of pixels can turn a photograph over or make the principal distance collapse. Then
@@ -193,7 +197,7 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
         return robust_scale(layout.observations, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
 
     try:
-        (optimum, plain), begun = _plain(run, state, weight, without), None
+        (optimum, plain), begun = _optimum_of_all(run, state, weight, without), None
     except GeometryError:
         begun = optimum_at(run.problem, state, weight)
         if begun is None:
@@ -203,7 +207,7 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
 
     def sound(found: Optimum) -> bool:
         fits = spread(found.state) <= MIN_BENT_RATIO * first
-        return found.converged and fits and not _bent_photographs(run, state, found.state).any()
+        return found.converged and fits and not _distorted_photographs(run, state, found.state).any()
 
     if sound(optimum):
         return optimum, plain
@@ -227,7 +231,7 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
     return optimum, plain
 
 
-def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
+def _distorted_photographs(run: Run, start: State, end: State) -> BoolArray:
     """Return the photographs with most image points fitting far worse at the end than at the start, (m,).
 
     They must fit worse than before and worse than the others. An error in one of six image points distorts
@@ -333,7 +337,7 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     return np.asarray((suspect & (rays > 1) & (apart < np.radians(MIN_ANGLE_DEG)))[o.point])
 
 
-def _bending(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
+def _distorting_points(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
     """Return the image points that a robust start left out and that have very large residuals, (k,).
 
     They distort their photograph even with the bounded influence of Huber's weights.
