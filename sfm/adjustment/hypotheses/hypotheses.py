@@ -162,8 +162,8 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
     """Return the cause that given points reveal: another camera in some photographs, or strained control.
 
     Image points alone reveal little about the cameras of a few photographs, or of many photographs of a
-    plane. Bent control is no cause. It also absorbs errors common to the targets of a plate, so it only
-    represents what no camera explains.
+    plane. Bent control is not reported as a cause, because it also absorbs errors common to the targets of a
+    plate. It only takes up what no camera explains.
 
     Args:
         final: finished adjustment in which most points are given.

@@ -446,7 +446,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         rows.append(("focus", "coordinate", shape.origin + form[0] * R[:, 2], by_focus))
     for k, name in enumerate(kind.form):
         if kind.name == "cone" and name == "radius":
-            continue  # the radius beside the centroid is not useful
+            continue  # its radius near the centroid is of no use
         derivatives = np.zeros((1, 6 + q))
         derivatives[0, 6 + k] = 1.0
         rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives))

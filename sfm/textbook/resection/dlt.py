@@ -52,7 +52,7 @@ def resect_dlt(
     Args:
         xy_mm: measured image coordinates (y up), shape (n, 2), mm.
         points: object points that are not coplanar, shape (n, 3), object unit.
-        distortion: parameters among K1, K2, K3, P1, P2 to determine as well; every two need one more point.
+        distortion: which of K1, K2, K3, P1, P2 to determine as well; every two of them need one more point.
 
     Raises:
         GeometryError: there are too few points, they are nearly coplanar, or no camera has them in front.

@@ -2,7 +2,7 @@
 
 **Data snooping** (`snoop`) rejects, round by round, the image points with the largest tau above the critical
 value. It rejects the largest of all, and others whose photograph and object point contain no larger one. So
-no image point is judged beside a larger error. In a photograph with many image points, an error affects the
+no image point is judged next to a larger error. In a photograph with many image points, an error affects the
 residuals of the others only by its leverage, a few hundredths of it. There all image points are rejected
 whose tau is not much smaller than the largest. A rejected image point is reinstated (`would_pass`) when it
 would clearly pass the test in the adjustment.
