@@ -179,12 +179,7 @@ def test_what_is_held_stays() -> None:
         ("sphere", [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 2, 0]], {}, "lie on a plane, a sphere needs"),
         ("plane", [[1, 1, 1]] * 3, {}, "its 3 points coincide"),
         ("ball", [[0, 0, 0]], {}, "kind 'ball', expected one of line, plane"),
-        (
-            "circle",
-            [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
-            {"weights": "network"},
-            "are unknown, expected weights",
-        ),
+        ("circle", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], {"weights": "network"}, "unknown, expected weights"),
         ("circle", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], {"hold": {"radius": -1}}, "expected a positive number"),
         ("circle", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], {"hold": {"colour": 1}}, "expected one of centre"),
         ("circle", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], {"robust": True}, "3 points, a robust fit"),
@@ -241,9 +236,7 @@ def test_a_diverging_fit_is_one_line() -> None:
     rng = np.random.default_rng(21)
     xyz = rng.standard_normal((20, 3)) * [100.0, 80.0, 60.0]
     A = 0.01 * rng.standard_normal((60, 60))
-    with pytest.raises(
-        GeometryError, match="diverges with the covariance of its points: they are too far from any cone"
-    ):
+    with pytest.raises(GeometryError, match=r"diverges .*: they are too far from any cone"):
         fit_shape(measured(xyz, A @ A.T), "cone")
 
 
