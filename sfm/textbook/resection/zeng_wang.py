@@ -1,6 +1,6 @@
 """Space resection by Zeng and Wang, and by Rampal.
 
-Both find the distances from the camera to three points, then the position by trilateration. Zeng and Wang
+Both find the distances from the camera to three points, then the position from the distances. Zeng and Wang
 solve a quartic and find all solutions. Rampal iterates the angles of the triangles that
 the camera forms with the points.
 """
