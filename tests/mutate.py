@@ -13,7 +13,8 @@ as rotations about any centre are the same motions, and the scale of the normals
 in displacements.py the redundancy from which F is chi-square; in fischler_bolles.py which of two legs is not
 polished by its misfit, which saves time, as no wrong one passes the polish; in rings.py the sense in which
 rings are sampled, as arcs are counted alike in a mirror; in given.py the length of a direction left open; in
-rigid_frames.py the singular values below which a step is cut, which only rounding needs.
+rigid_frames.py the singular values below which a step is cut, which only rounding needs; in intersection.py
+how much room there is for directions, of which there may be more.
 """
 
 from __future__ import annotations

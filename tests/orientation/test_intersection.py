@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import rotation_from_angles
 from sfm.network import Estimate, ImagePoints
+from sfm.orientation import intersection
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.intersection import intersect
 from tests.places import ROOT
@@ -136,3 +137,31 @@ def test_rays_of_wide_angle_cameras_count_by_their_angles() -> None:
     errors = found.points - points
     normed = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found.covariance), errors)
     assert normed.mean() == pytest.approx(3.0, rel=5 * np.sqrt(2 / (3 * n)))
+
+
+@pytest.mark.parametrize(("rays", "pairs"), [(29, 406), (41, 410)])
+def test_up_to_four_hundred_pairs_of_rays_are_tried(rays: int, pairs: int, monkeypatch) -> None:
+    """Every pair of 29 rays, every second one of the 820 of 41 rays; the same in Python as compiled."""
+    angle = np.linspace(-0.8, 0.8, rays)
+    positions = 5.0 * np.column_stack([np.sin(angle), 0.1 * angle, np.cos(angle)])
+    rotations = rotation_from_angles(np.zeros(rays), angle, np.zeros(rays))
+    rotations = np.moveaxis(rotations, -1, 0) if rotations.shape[0] == 3 else rotations
+    inside = np.einsum("mji,mj->mi", rotations, -positions)
+    uv = -inside[:, :2] / inside[:, 2:]
+    uv[0] += 0.05
+    arguments = uv, np.arange(rays), np.zeros(rays, dtype=int), positions, rotations
+    compiled = intersect(*arguments, tolerance=1e-3)
+    tried = 0
+
+    def nearest(rays_, of_point, direction, used, *more):
+        nonlocal tried
+        tried += int(used[of_point].sum() == 2)
+        return real(rays_, of_point, direction, used, *more)
+
+    real = intersection._nearest_to_rays
+    for name in ("_intersect_all", "_best_pair"):
+        monkeypatch.setattr(intersection, name, getattr(intersection, name).py_func)
+    monkeypatch.setattr(intersection, "_nearest_to_rays", nearest)
+    found = intersect(*arguments, tolerance=1e-3)
+    assert tried == pairs and not found.used[0] and found.used[1:].all()
+    np.testing.assert_allclose(found.points, compiled.points, atol=1e-12)

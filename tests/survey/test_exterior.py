@@ -15,6 +15,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, ObjectPoints
+from sfm.observations.pose import MountObservations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
 from sfm.report.findings.bundle_statistics import given_of
@@ -26,6 +27,7 @@ from sfm.result import SurveyResult
 from sfm.survey import placing
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey
+from tests.rigs import make_rig
 from tests.surveys import OBSERVED, remarks_on_given, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -362,3 +364,15 @@ def test_photographs_are_placed_by_their_observed_stations(tmp_path: Path) -> No
     )
     with pytest.raises(SurveyFileError, match=r"line 4: column image: .photo 9.png. is no photograph"):
         run_survey(read_survey(path))
+
+
+@pytest.mark.parametrize(("observed", "held"), [(True, False), (False, True), (False, False)])
+def test_mounts_that_are_observed_or_held_fixed_give_the_scale(observed: bool, held: bool) -> None:
+    network, truth = make_rig(seed_of("scale of mounts"), moments=2)
+    assert truth.mounts is not None
+    free = np.tile(~truth.mounts.at_reference[:, None], (1, 6)) & (not held)
+    truth = replace(truth, mounts=replace(truth.mounts, free=free))
+    if observed:
+        mount = truth.mounts.position[1:], np.zeros((1, 3)), np.eye(6)[None]
+        network = replace(network, observations=(MountObservations(np.array([1]), *mount),))
+    assert placing.mounts_give_scale(network, truth) is (observed or held)

@@ -316,3 +316,16 @@ def test_a_clear_cell_is_as_the_background_to_a_tenth_of_the_step(
     found[:3, np.flatnonzero(bits == 0)[0]] = share * step
     code, _ = rings._read_cells(found, family, 0.0)
     assert code == (family.number[5] if read else rings.UNREADABLE)
+
+
+def test_shading_across_a_ring_is_a_plane_with_a_prior() -> None:
+    """By 40 % to one side it is read; of the same levels in another order none is."""
+    family = code_family("ring12")
+    assert isinstance(family, rings.CodeFamily)
+    bits = ((71 >> np.arange(11, -1, -1)) & 1).astype(bool)
+    shaded = 1 + 0.4 * np.cos(2 * np.pi * (np.flatnonzero(bits) - 8) / 12)
+    found = np.zeros((7, 12))
+    found[:3, bits] = shaded
+    assert rings._read_cells(found, family, 0.0)[0] == family.number[family.pattern.tolist().index(71)]
+    found[:3, bits] = np.sort(shaded)[[0, 3, 1, 2]]
+    assert rings._read_cells(found, family, 0.0)[0] == rings.UNREADABLE
